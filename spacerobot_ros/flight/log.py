@@ -17,7 +17,7 @@ from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.scenario import Scenario
-from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantStatus
@@ -53,7 +53,7 @@ class FlightLog:
         self.covariances: list[tuple[int, Array]] = []
         self.refusals: list[tuple[float, str, Refusal]] = []
         self._period_ns = period_ns
-        self._thrusters = thrusters_in(plant)
+        self._thrusters = plant.thrusters
         self._propellant = np.zeros(1)
         true = {"pose": plant.pose, "twist": plant.twist, "q": plant.q, "qdot": plant.qdot}
         # Measurements of sensors without error are the true arrays.

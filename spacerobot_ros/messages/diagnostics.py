@@ -8,7 +8,7 @@ import numpy as np
 
 from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.status import latched_text
 from spacerobot_ros.simulation.time_modes import RealTime
@@ -113,8 +113,8 @@ class PlantDiagnostics:
         self._unmet_reported = 0
 
     def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
-        """Set the objects to report on."""
-        self._commands, self._plant, self._thrusters = commands, plant, thrusters_in(plant)
+        """Report on these from now on."""
+        self._commands, self._plant = commands, plant
 
     def note_refusal(self, source: CommandSource, refusal: Refusal) -> str:
         """Record a refused command, already counted by its validator; return a sentence about
@@ -133,8 +133,8 @@ class PlantDiagnostics:
             self._of_momentum(),
             self._of_faults(),
         ]
-        if self._thrusters is not None:
-            found.append(self.of_thrusters(self._thrusters))
+        if self._plant.thrusters is not None:
+            found.append(self._of_thrusters(self._plant.thrusters))
         if self._real_time is not None:
             found.append(
                 timing_record(self._node, self._plant.robot.description.name, self._real_time)
@@ -240,28 +240,28 @@ class PlantDiagnostics:
             | {f"disturbance_{i}": each for i, each in enumerate(disturbances, 1)},
         )
 
-    def of_thrusters(self, thrusters: ThrusterPlant) -> StatusRecord:
-        """Return propellant, pulses and unmet wrenches; a warning if there are new unmet
-        wrenches."""
-        unmet = thrusters.unmet_ticks > self._unmet_reported
-        self._unmet_reported = thrusters.unmet_ticks
-        sentences = [f"they cannot produce {thrusters.missing}"] if thrusters.missing else []
+    def _of_thrusters(self, thrusters: ThrusterPlant) -> StatusRecord:
+        """Return propellant, pulses and unmet wrenches; a warning for new unmet wrenches."""
+        modulator = thrusters.modulator
+        unmet = modulator.unmet_periods > self._unmet_reported
+        self._unmet_reported = modulator.unmet_periods
+        sentences = [f"they cannot produce {modulator.missing}"] if modulator.missing else []
         if unmet:
             sentences.append("the requested wrench exceeds their thrust")
-        force, torque = np.linalg.norm(thrusters.unmet[:3]), np.linalg.norm(thrusters.unmet[3:])
+        force, torque = np.linalg.norm(modulator.unmet[:3]), np.linalg.norm(modulator.unmet[3:])
         return self._record(
             "thrusters",
             _WARN if sentences else _OK,
             "; ".join(sentences) or "the requested wrench is produced",
             {
                 PROPELLANT_KEY: f"{thrusters.propellant:.9g}",
-                "pulses": int(thrusters.pulses.sum()),
-                "unmet_ticks": thrusters.unmet_ticks,
+                "pulses": int(modulator.pulses.sum()),
+                "unmet_ticks": modulator.unmet_periods,
                 "unmet_force_N": f"{force:.6g}",
                 "unmet_torque_Nm": f"{torque:.6g}",
                 **{
                     f"pulses.{name}": count
-                    for name, count in zip(thrusters.table.names, thrusters.pulses, strict=True)
+                    for name, count in zip(thrusters.table.names, modulator.pulses, strict=True)
                 },
             },
         )

@@ -21,13 +21,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model.description import Array, Inertia, Pose, RobotDescription
+from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES, symmetric_of_entries
 from spacerobot_ros.model.rotations import (
     cross,
     hat,
@@ -80,7 +80,7 @@ class Payload:
                 "link": self.link,
                 "mass": self.inertia.mass,
                 "com": self.inertia.com.tolist(),
-                "inertia": [float(about[i, j]) for i, j in _INERTIA_ENTRIES],
+                "inertia": [float(about[i, j]) for i, j in INERTIA_ENTRIES],
             }
         )
 
@@ -95,9 +95,7 @@ class Payload:
         """
         try:
             values = json.loads(text)
-            about = np.zeros((3, 3))
-            for (i, j), value in zip(_INERTIA_ENTRIES, values["inertia"], strict=True):
-                about[i, j] = about[j, i] = float(value)
+            about = symmetric_of_entries(values["inertia"])
             com = np.array([float(x) for x in values["com"]])
             if com.shape != (3,):
                 raise ValueError(f"its centre of mass has {com.size} numbers")
@@ -106,9 +104,6 @@ class Payload:
             raise RobotDescriptionError(
                 f"The string does not describe a payload: {error}."
             ) from error
-
-
-_INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
@@ -218,9 +213,6 @@ class BodyMotion:
         return inertia.mass * moving.v, self.R_WT @ inertia.about_com @ self.R_WT.T @ self.omega
 
 
-_Motion = TypeVar("_Motion", bound="RelativeMotion")
-
-
 @dataclass(frozen=True)
 class RelativeMotion:
     """Motion of one frame relative to another.
@@ -239,7 +231,7 @@ class RelativeMotion:
     rate: float
 
     @classmethod
-    def between(cls: type[_Motion], first: BodyMotion, second: BodyMotion) -> _Motion:
+    def between(cls, first: BodyMotion, second: BodyMotion) -> RelativeMotion:
         """Return the relative motion of two frames."""
         turn = quaternion_from_matrix(first.R_WT.T @ second.R_WT)
         return cls(

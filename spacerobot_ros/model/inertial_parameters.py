@@ -8,7 +8,7 @@ operations, one compilation per set of values) or entries of an argument ``p``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -28,6 +28,14 @@ NUMBERS_PER_BODY = 10
 
 INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Row and column of each of the six second moments in the (3, 3) matrix."""
+
+
+def symmetric_of_entries(entries: Iterable[float]) -> Array:
+    """Return the symmetric matrix (3, 3) of its six :data:`INERTIA_ENTRIES`."""
+    matrix = np.zeros((3, 3))
+    for (i, j), value in zip(INERTIA_ENTRIES, entries, strict=True):
+        matrix[i, j] = matrix[j, i] = float(value)
+    return matrix
 
 
 @dataclass(frozen=True)
@@ -103,9 +111,9 @@ class InertialParameters:
         by_inertia = by_mass if inertias is None else np.asarray(inertias, dtype=float)
         shape = np.broadcast_shapes(self.masses.shape, by_mass.shape, by_inertia.shape)
         return InertialParameters(
-            _broadcast(self.masses * by_mass, shape),
-            _broadcast(self.centers, (*shape, 3)),
-            _broadcast(self.inertias * by_inertia[..., None, None], (*shape, 3, 3)),
+            np.broadcast_to(self.masses * by_mass, shape),
+            np.broadcast_to(self.centers, (*shape, 3)),
+            np.broadcast_to(self.inertias * by_inertia[..., None, None], (*shape, 3, 3)),
         )
 
     def shifted(self, offsets: npt.ArrayLike) -> InertialParameters:
@@ -114,9 +122,9 @@ class InertialParameters:
         The inertias about the centres of mass do not change.
         """
         centers = self.centers + np.asarray(offsets, dtype=float)
-        shape = centers.shape[:-1]
+        masses = np.broadcast_to(self.masses, centers.shape[:-1])
         return InertialParameters(
-            _broadcast(self.masses, shape), centers, _broadcast(self.inertias, (*shape, 3, 3))
+            masses, centers, np.broadcast_to(self.inertias, (*centers.shape, 3))
         )
 
     def with_payload(self, body: int, payload: Inertia) -> InertialParameters:
@@ -309,8 +317,3 @@ def symmetric(matrix: ca.SX) -> ca.SX:
 def sparse_constant(array: Array) -> ca.DM:
     """Return constants for expressions, in which zeros cost no operations."""
     return ca.sparsify(ca.DM(array))
-
-
-def _broadcast(array: Array, shape: tuple[int, ...]) -> Array:
-    # numpy takes as long for an array that has the shape as for the arithmetic of a draw.
-    return array if array.shape == shape else np.broadcast_to(array, shape)

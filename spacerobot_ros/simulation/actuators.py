@@ -19,7 +19,7 @@ from spacerobot_ros.model import SpaceRobot, integration
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
 from spacerobot_ros.simulation import effort_plant
-from spacerobot_ros.simulation.capture import CapturePlant, Target, capture_in, load_target
+from spacerobot_ros.simulation.capture import CapturePlant, Target, load_target
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.faults import (
@@ -55,18 +55,16 @@ class ThrusterPlant(WrappedPlant):
         (6,) mean force (N) over torque (N m) of the thrusters in the last tick, at the base link
         origin, in base components.
     ``on_time``, ``duty``, ``thrust``
-        (m,) total on-time of each thruster (s), and its duty cycle and mean force (N) in the last
-        tick.
-    ``pulses``
-        (m,) pulse count of each thruster.
+        (m,) total on-time of each thruster (s), its duty cycle in the last tick, and its mean force
+        in the last tick (N).
     ``propellant``
-        Total consumption, kg. It does not change the robot mass.
-    ``unmet``, ``unmet_ticks``
-        (6,) part of the last commanded wrench that the thrusters could not produce, and the number
-        of ticks with such a part.
+        Total consumption, kg. It does not change the mass of the robot.
+    ``modulator``
+        The flight software that opens and closes the thrusters, and counts pulses and unmet
+        wrenches.
     ``thruster_health``, ``stuck_on``
-        (m,) ratio of actual to nominal thrust (1 unless set), and whether a thruster is stuck open.
-        The allocation ignores both; see :meth:`exclude`.
+        (m,) real over nominal thrust (1 unless set), and whether a thruster is stuck open. The
+        allocation ignores both; see :meth:`.ThrusterModulator.exclude`.
     ``wrench_fault``
         Factor (6,) on the thruster wrench, and wrench (6,) added to it; None: no fault. The
         modulation ignores it.
@@ -98,41 +96,20 @@ class ThrusterPlant(WrappedPlant):
         super().__init__(plant)
         self.table = table
         self._control_period = control_period
-        self._modulator = ThrusterModulator(table, control_period, excluded)
+        self.modulator = ThrusterModulator(table, control_period, excluded)
         self._wrenches, self._mass_flow = table.wrenches, table.mass_flow
         count = len(table.names)
         self.wrench = np.zeros(6)
         self.on_time, self.duty, self.thrust = (np.zeros(count) for _ in range(3))
-        self.pulses, self.unmet = self._modulator.pulses, self._modulator.unmet
         self.propellant = 0.0
         self.thruster_health = np.ones(count)
         self.stuck_on: npt.NDArray[np.bool_] = np.zeros(count, dtype=np.bool_)
         self.wrench_fault: tuple[Array, Array] | None = None
 
-    @property
-    def missing(self) -> str:
-        """Clause describing the wrenches that the enabled thrusters cannot produce; empty: none."""
-        return self._modulator.missing
-
-    @property
-    def unmet_ticks(self) -> int:
-        """Number of ticks in which the thrusters could not produce the full commanded wrench."""
-        return self._modulator.unmet_periods
-
-    def exclude(self, name: str) -> None:
-        """Exclude a thruster; the others take over its share of the wrench if possible.
-
-        Raises
-        ------
-        ParameterError
-            There is no thruster with that name.
-        """
-        self._modulator.exclude(name)
-
     def reset(self) -> None:
         """Return to the initial state with thrusters off; totals and counters continue."""
         super().reset()
-        self._modulator.reset()
+        self.modulator.reset()
         self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
 
     def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
@@ -152,7 +129,7 @@ class ThrusterPlant(WrappedPlant):
             if not np.all(np.isfinite(command)):
                 raise CommandError(f"A command is not finite: {np.asarray(command).tolist()}.")
         tick = self._control_period
-        on_time = self._modulator.fire(wanted)
+        on_time = self.modulator.fire(wanted)
         on_time[self.stuck_on] = tick
         self.duty[:] = on_time / tick
         works = self.thruster_health * self.duty
@@ -165,41 +142,6 @@ class ThrusterPlant(WrappedPlant):
         self.propellant += tick * float(self._mass_flow @ works)
         limited: bool = self.plant.step(effort, self.wrench)
         return limited
-
-
-def with_thrusters(plant: Plant, control_period: float, source: str, excluded: str = "") -> Plant:
-    """Add the thrusters of ``source`` to an effort-driven plant.
-
-    Parameters
-    ----------
-    plant
-        A plant that accepts any wrench.
-    control_period
-        Duration of a tick, s.
-    source
-        ``urdf``: the thrusters in the URDF; otherwise the path of a YAML file; empty: the plant is
-        returned unchanged.
-    excluded
-        Space-separated names of disabled thrusters.
-
-    Raises
-    ------
-    ParameterError
-        The file or one of its thrusters is invalid, or an excluded thruster is unknown.
-    RobotDescriptionError
-        A thruster in the URDF is invalid, or there is none.
-    """
-    if not source:
-        return plant
-    robot = plant.robot.description
-    return ThrusterPlant(plant, control_period, find_thrusters(source, robot), excluded.split())
-
-
-def thrusters_in(plant: Plant) -> ThrusterPlant | None:
-    """Return a plant's thrusters, looking through its wrappers; None: it has none."""
-    while isinstance(plant, WrappedPlant) and not isinstance(plant, ThrusterPlant):
-        plant = plant.plant
-    return plant if isinstance(plant, ThrusterPlant) else None
 
 
 class PlantWithFaults(WrappedPlant):
@@ -248,10 +190,12 @@ class PlantWithFaults(WrappedPlant):
         surroundings: Surroundings | None = None,
     ) -> None:
         super().__init__(plant)
-        self._thrusters = thrusters_in(plant)
-        self.capturing = capture_in(plant)
+        self.thrusters = plant if isinstance(plant, ThrusterPlant) else None
+        """The wrapped plant with thrusters; None: none are modelled."""
+        inner = plant if self.thrusters is None else self.thrusters.plant
+        self.capturing = inner if isinstance(inner, CapturePlant) else None
         """The plant that captures the target; None: there is no target."""
-        nozzles = self._thrusters.table.names if self._thrusters is not None else ()
+        nozzles = self.thrusters.table.names if self.thrusters is not None else ()
         self.timeline = fault_timeline(
             faults, FaultTargets(plant.robot.joint_names, wrench, nozzles)
         )
@@ -268,7 +212,8 @@ class PlantWithFaults(WrappedPlant):
         self._bias, self._noise, self._factor = np.zeros(n), np.zeros(n), np.ones(n)
         self._wrench_factor, self._wrench_held = np.ones(6), np.zeros(6)
         self._actuators_sound = True
-        self._seen: tuple[Fault, ...] = ()
+        self.active: tuple[Fault, ...] = ()
+        """Active faults; a new tuple object after every change."""
         self.disturbances: tuple[Disturbance, ...] = ()
         """Active disturbances; a new tuple object after every change."""
         self.injected: tuple[Fault | Disturbance, ...] = ()
@@ -286,11 +231,6 @@ class PlantWithFaults(WrappedPlant):
     def time(self) -> float:
         """Simulated time, s."""
         return self.tick * self._control_period
-
-    @property
-    def active(self) -> tuple[Fault, ...]:
-        """Active faults; a new tuple object after every change."""
-        return self._seen
 
     def inject(self, text: str) -> None:
         """Add faults, one per line, while the plant runs; ``clear`` removes all faults.
@@ -330,9 +270,9 @@ class PlantWithFaults(WrappedPlant):
         """Apply the faults that are active at the current time."""
         active = self.timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
         self._next_tick = self.timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
-        if active is self._seen:
+        if active is self.active:
             return
-        self._seen, self.injected = active, (*active, *self.disturbances)
+        self.active, self.injected = active, (*active, *self.disturbances)
         self._bias[:], self._noise[:], self._factor[:] = 0.0, 0.0, 1.0
         self._wrench_factor[:], self._wrench_held[:] = 1.0, 0.0
         wrench_faulty = False
@@ -358,11 +298,11 @@ class PlantWithFaults(WrappedPlant):
                 wrench_faulty = True
         self._noise[:] = np.sqrt(variances)
         self.plant.hold(held)
-        if self._thrusters is not None:
-            self._thrusters.wrench_fault = (
+        if self.thrusters is not None:
+            self.thrusters.wrench_fault = (
                 (self._wrench_factor, self._wrench_held) if wrench_faulty else None
             )
-            self._apply_nozzle_faults(self._thrusters, active)
+            self._apply_nozzle_faults(self.thrusters, active)
         self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
 
     def _begin_loads(self) -> None:
@@ -387,7 +327,7 @@ class PlantWithFaults(WrappedPlant):
         self._next_disturbance = timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
         if active is self.disturbances or loads is None:
             return
-        self.disturbances, self.injected = active, (*self._seen, *active)
+        self.disturbances, self.injected = active, (*self.active, *active)
         loads.in_link[:] = loads.in_world[:] = 0.0
         for each in active:
             wrenches = loads.in_link if each.in_link else loads.in_world
@@ -420,7 +360,7 @@ class PlantWithFaults(WrappedPlant):
         if self._noise.any():
             disturbed += self._noise * self._rng.standard_normal(self.robot.n)
         realised = [self._factor * disturbed]
-        if wrench and self._thrusters is None:
+        if wrench and self.thrusters is None:
             realised.append(self._wrench_factor * wrench[0] + self._wrench_held)
         elif wrench:  # The thrusters apply the faults of the wrench themselves.
             realised.append(wrench[0])
@@ -507,7 +447,9 @@ def build_plant(
         plant = mujoco_plant.build_mujoco_plant(robot, config, start, step, description)
     else:
         plant = _own_engine_plant(robot, config, start, step or kind.integration_step, description)
-    plant = with_thrusters(plant, control_period, config.thrusters, config.thrusters_excluded)
+    if config.thrusters:
+        table = find_thrusters(config.thrusters, robot.description)
+        plant = ThrusterPlant(plant, control_period, table, config.thrusters_excluded.split())
     return PlantWithFaults(
         plant,
         config.faults,

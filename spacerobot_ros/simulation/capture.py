@@ -39,7 +39,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.model.urdf import parse_robot, with_held_joints
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.config import CaptureConfig, PlantConfig, TargetConfig
+from spacerobot_ros.simulation.config import PlantConfig, TargetConfig
 from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.plant import Counts, Flags, InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
@@ -91,7 +91,9 @@ class Target:
     inertia
         Its mass properties in its root link frame T.
     grapple
-        Grapple frame pose in T.
+        Pose of the grapple frame in T.
+    initial
+        Its motion at the beginning.
     """
 
     def __init__(
@@ -112,14 +114,14 @@ class Target:
             raise ParameterError(f"The target is refused: {error}") from error
         except ValueError as error:
             raise ParameterError(f"Parameter 'target.orientation' is refused: {error}.") from None
-        self._initial = BodyMotion(
+        self.initial = BodyMotion(
             matrix_from_quaternion(quaternion),
             *(
                 np.array(values or (0.0, 0.0, 0.0))
                 for values in (config.position, config.velocity, config.angular_velocity)
             ),
         )
-        self._plant = VelocityPlant(self._model, period, self._start(self._initial), step)
+        self._plant = VelocityPlant(self._model, period, self._start(self.initial), step)
         self.pose, self.twist = self._plant.pose, self._plant.twist
         self.loads: PlantLoads | None = None
         """External loads on the target; None: none."""
@@ -137,7 +139,7 @@ class Target:
 
     def reset(self) -> None:
         """Return to the initial state."""
-        self.release(self._initial)
+        self.release(self.initial)
 
     def release(self, motion: BodyMotion) -> None:
         """Continue in free flight from a given motion."""
@@ -172,24 +174,6 @@ class Target:
             linear_momentum=p,
             angular_momentum=L,
         )
-
-
-class GrappleMotion(RelativeMotion):
-    """Grapple frame motion relative to the end-effector."""
-
-    def misses(self, limits: CaptureConfig) -> list[str]:
-        """Return a clause for each quantity beyond its limit; empty: a capture is possible."""
-        return [
-            f"{name} is {value:.4g} {unit}, {value - limit:.4g} {unit} more than "
-            f"'capture.{name}', {limit:g}"
-            for name, unit, value, limit in (
-                ("distance", "m", self.distance, limits.distance),
-                ("angle", "rad", self.angle, limits.angle),
-                ("speed", "m/s", self.speed, limits.speed),
-                ("rate", "rad/s", self.rate, limits.rate),
-            )
-            if not value <= limit
-        ]
 
 
 @dataclass(frozen=True)
@@ -368,11 +352,6 @@ class CapturePlant(WrappedPlant):
     # -- the plant ----------------------------------------------------------------------------
 
     @property
-    def present_robot(self) -> SpaceRobot:
-        """The integrated robot: alone, or with the target's mass properties."""
-        return self.plant.robot
-
-    @property
     def limit_counts(self) -> Mapping[str, Counts]:
         """Number of ticks in which each joint (n,) was limited, by kind of limit."""
         counts = self.plant.limit_counts
@@ -442,7 +421,7 @@ class CapturePlant(WrappedPlant):
         self._changed = None
         self._update()
         # What hinders a capture now did so before.
-        self._ready = bool(self.approach().misses(self._config))
+        self._ready = bool(self._config.misses(self.approach()))
 
     def _resume_dynamics(
         self, robot: SpaceRobot, motion: RobotMotion, momenta: Array, body: BodyMotion
@@ -458,7 +437,7 @@ class CapturePlant(WrappedPlant):
         """
         if self._config.mode == "automatic" and self.payload is None:
             far = self._distance() > self._config.distance
-            if far or self.approach().misses(self._config):
+            if far or self._config.misses(self.approach()):
                 self._ready = True
             elif self._ready:
                 self._capture(requested=False)
@@ -478,10 +457,10 @@ class CapturePlant(WrappedPlant):
 
     # -- captures -----------------------------------------------------------------------------
 
-    def approach(self) -> GrappleMotion:
-        """Return the current grapple frame motion relative to the end-effector."""
+    def approach(self) -> RelativeMotion:
+        """Return the present motion of the grapple frame relative to the end-effector."""
         end_effector = frame_motion(self.robot, self.link, self._motion())
-        return GrappleMotion.between(end_effector, self._body().at(self.target.grapple))
+        return RelativeMotion.between(end_effector, self._body().at(self.target.grapple))
 
     def capture(self) -> CaptureReport:
         """Capture the target; the next tick starts from the motion after the impact.
@@ -496,7 +475,7 @@ class CapturePlant(WrappedPlant):
                 f"'{self.link}' holds the target '{self.target.description.name}' already: call "
                 "'~/release' first."
             )
-        misses = self.approach().misses(self._config)
+        misses = self._config.misses(self.approach())
         if misses:
             raise CommandError(f"The target cannot be captured: its {'; its '.join(misses)}.")
         return self._capture(requested=True)
@@ -610,13 +589,6 @@ class CapturePlant(WrappedPlant):
         self.target_pose[3:] = quaternion_from_matrix(body.R_WT)
         self.target_twist[:3] = body.R_WT.T @ body.v
         self.target_twist[3:] = body.R_WT.T @ body.omega
-
-
-def capture_in(plant: Plant) -> CapturePlant | None:
-    """Return a plant's :class:`CapturePlant`, looking through its wrappers; None: no target."""
-    while isinstance(plant, WrappedPlant) and not isinstance(plant, CapturePlant):
-        plant = plant.plant
-    return plant if isinstance(plant, CapturePlant) else None
 
 
 def capturing_link(robot: RobotDescription, config: PlantConfig) -> str:

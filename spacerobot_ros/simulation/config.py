@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.grasp import RelativeMotion
 from spacerobot_ros.model.shared_parameters import DEFAULT_TICK_RATE, RobotConfig, WatchdogConfig
 from spacerobot_ros.parameters import group, nonnegative, parameter
 from spacerobot_ros.times import SECOND
@@ -149,6 +150,20 @@ class CaptureConfig:
         "joint impulse above which the capture event is a warning; 0: none",
         "N m s or N s",
     )
+
+    def misses(self, approach: RelativeMotion) -> list[str]:
+        """Return a clause for each quantity beyond its limit; empty: a capture is possible."""
+        return [
+            f"{name} is {value:.4g} {unit}, {value - limit:.4g} {unit} more than "
+            f"'capture.{name}', {limit:g}"
+            for name, unit, value, limit in (
+                ("distance", "m", approach.distance, self.distance),
+                ("angle", "rad", approach.angle, self.angle),
+                ("speed", "m/s", approach.speed, self.speed),
+                ("rate", "rad/s", approach.rate, self.rate),
+            )
+            if not value <= limit
+        ]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 from spacerobot_ros.errors import ParameterError
 
@@ -300,18 +300,6 @@ Refusal = Callable[[str], ParameterError]
 """Function that returns the error for an invalid line, given the reason as a clause."""
 
 
-class Timed(Protocol):
-    """An entry that is active from ``start`` s until just before ``end`` s."""
-
-    @property
-    def start(self) -> float:
-        """Begin, s."""
-
-    @property
-    def end(self) -> float:
-        """End, s; infinite: never."""
-
-
 def line_refusal(line: str, noun: str) -> Refusal:
     """Return the error for an invalid line; its message quotes the line."""
     return lambda reason: ParameterError(f"The {noun} '{line.strip()[:80]}' is refused: {reason}.")
@@ -382,7 +370,7 @@ def format_times(start: float, end: float) -> str:
     return f"at {start:.12g}{until}"
 
 
-Entry = TypeVar("Entry", bound=Timed)
+Entry = TypeVar("Entry", Fault, Disturbance)
 
 
 class Timeline(Generic[Entry]):
@@ -402,7 +390,8 @@ class Timeline(Generic[Entry]):
     def __init__(
         self, lines: Iterable[str], parse: Callable[[str, float], Entry], noun: str
     ) -> None:
-        self._parse, self._noun = parse, noun
+        self._parse: Callable[[str, float], Entry] = parse
+        self._noun = noun
         self.entries: list[Entry] = []
         self.active: tuple[Entry, ...] = ()
         """Active entries; a new tuple object after every change."""
@@ -437,18 +426,14 @@ class Timeline(Generic[Entry]):
             As :meth:`read`.
         """
         if text.strip() == "clear":
-            self.clear()
+            self.entries.clear()
+            self.next_change = -math.inf
         else:
             self.read(text.splitlines(), now)
 
     def copy_from(self, other: Timeline[Entry]) -> None:
         """Replace the entries with those of another timeline."""
         self.entries, self.next_change = list(other.entries), -math.inf
-
-    def clear(self) -> None:
-        """Remove all entries, including future ones."""
-        self.entries.clear()
-        self.next_change = -math.inf
 
     def at(self, time: float) -> tuple[Entry, ...]:
         """Return the entries active at a time (s), which must not decrease between calls."""

@@ -204,8 +204,9 @@ class MujocoPlant:
             self._update()
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all others."""
-        for joint in np.flatnonzero(joints & ~self._held | (joints & (self._locked() == 0))):
+        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        locked = self._held & (self._data.eq_active[self._locks] != 0)
+        for joint in np.flatnonzero(joints & ~locked):
             self._model.eq_data[self._locks[joint], 0] = self._data.qpos[self._q[joint]]
         self._data.eq_active[self._locks] = joints
         self._held = joints.copy()
@@ -306,9 +307,6 @@ class MujocoPlant:
         data.qvel[rate + 3 : rate + 6] = motion.R_WT.T @ motion.omega
 
     # -- a tick -------------------------------------------------------------------------------
-
-    def _locked(self) -> npt.NDArray[np.uint8]:
-        return np.asarray(self._data.eq_active[self._locks])
 
     def _effort_bounds(self) -> tuple[Array, Array]:
         """Return the least and the largest efforts (n,); a wheel at its largest rate gets no
@@ -432,19 +430,12 @@ class MujocoPlant:
 
 
 class MujocoTarget(Target):
-    """The target as a body of a :class:`MujocoPlant`, which integrates its motion.
-
-    Attributes
-    ----------
-    initial
-        Its initial motion.
-    """
+    """The target as a body of a :class:`MujocoPlant`, which integrates its motion."""
 
     def __init__(
         self, description: RobotDescription, config: TargetConfig, robot: SpaceRobot
     ) -> None:
         super().__init__(description, config, 1.0, 1.0, robot)
-        self.initial = self._initial
         self.plant: MujocoPlant | None = None
 
     @property
@@ -481,37 +472,21 @@ class MujocoCapturePlant(CapturePlant):
         config: PlantConfig,
     ) -> None:
         self._engine = plant
-        self._joined: SpaceRobot | None = None
         target.plant = plant
         target.step()
         super().__init__(lambda *_: plant, plant.robot, plant.initial, target, config)
 
-    @property
-    def present_robot(self) -> SpaceRobot:
-        """The robot alone, or with the target's mass properties."""
-        return self._joined or self._alone.robot
-
-    def reset(self) -> None:
-        """Return the robot and the target to their initial states."""
-        self._joined = None
-        super().reset()
-
     def _continue(self, robot: SpaceRobot, motion: RobotMotion, momenta: Array) -> None:
         engine = self._engine
-        if robot is self._alone.robot:
-            self._joined = None
-        else:
-            self._joined = robot
+        if robot is not self._alone.robot:
             engine.weld()
         engine.expected_momenta[:] = momenta
 
     def _resume_dynamics(
         self, robot: SpaceRobot, motion: RobotMotion, momenta: Array, body: BodyMotion
     ) -> None:
-        held = self.payload is not None
-        self._engine.go_on(motion, body, welded=held)
+        self._engine.go_on(motion, body, welded=self.payload is not None)
         self._engine.expected_momenta[:] = momenta
-        self._joined = robot if held else None
         self.target.step()
 
     def _body(self) -> BodyMotion:

@@ -16,7 +16,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_rotvec,
     quaternion_multiply,
 )
-from spacerobot_ros.simulation.actuators import PlantWithFaults, thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.capture import CapturePlant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
@@ -249,7 +249,6 @@ class ReportedState:
         named = [(index, Pose()) for index in _link_indices(robot, config.end_effectors)]
         self._named_links = LinkPlacement(count, named) if named else None
         self._link_poses = robot.buffered("link_poses") if named else None
-        self._thrusters = thrusters_in(plant)
         capturing = plant.capturing
         self.target = None if capturing is None else capturing.target.description
         """The target; None: there is none."""
@@ -271,9 +270,9 @@ class ReportedState:
         ]
 
     def names(self, topic: Topic) -> tuple[str, ...]:
-        """Return the entry names of a topic's arrays: joints or thrusters."""
-        if topic.array_entries_of == "thrusters" and self._thrusters is not None:
-            return tuple(self._thrusters.table.names)
+        """Return the names of the entries of a topic's arrays: joints or thrusters."""
+        if topic.array_entries_of == "thrusters" and self._plant.thrusters is not None:
+            return tuple(self._plant.thrusters.table.names)
         return tuple(self._plant.robot.joint_names)
 
     @property
@@ -306,7 +305,7 @@ class ReportedState:
         return True
 
     def _quantities(self) -> dict[str, Array]:
-        plant, thrusters = self._plant, self._thrusters
+        plant, thrusters = self._plant, self._plant.thrusters
         measured = self.sensors if self._sensors_used else plant
         quantities = {
             "pose": plant.pose,

@@ -29,11 +29,6 @@ class Lockstep:
         self.waits = False
         """Whether the plant was waiting in the same tick at the last two checks."""
 
-    @property
-    def may_step(self) -> bool:
-        """Whether all commands for this tick have arrived."""
-        return self._commands.complete
-
     def must_step_at_check(self, tick: int, *, pose_lost: bool) -> bool:
         """Return whether a plant that checks periodically must step.
 
@@ -42,7 +37,7 @@ class Lockstep:
         waiting in the same tick at the previous check.
         """
         self.waits, self._looked_at = self._looked_at == tick, tick
-        return (self.waits and pose_lost) or self.may_step
+        return (self.waits and pose_lost) or self._commands.complete
 
 
 @dataclass(frozen=True)

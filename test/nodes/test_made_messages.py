@@ -45,7 +45,7 @@ from spacerobot_ros.nodes.common.fly_to import GoalClient, NavigateToPoseAction
 from spacerobot_ros.nodes.common.messages import goal_of, interface_class, message_class, shape_of
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation.actuators import build_plant, thrusters_in
+from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 
@@ -275,7 +275,7 @@ def test_limits_are_a_warning_once(diagnosed: Diagnosed) -> None:
 def test_what_thrusters_could_not_give_is_a_warning_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     diagnosed = Diagnosed("servicer", actuation="effort", thrusters="urdf")
-    thrusters = thrusters_in(diagnosed.plant)
+    thrusters = diagnosed.plant.thrusters
     assert thrusters is not None
     none = np.zeros(diagnosed.plant.robot.n)
     for _ in range(3):
@@ -285,7 +285,7 @@ def test_what_thrusters_could_not_give_is_a_warning_once(monkeypatch: pytest.Mon
     assert float(values["propellant_kg"]) == pytest.approx(thrusters.propellant) != 0.0
     counts = [int(values[f"pulses.{name}"]) for name in thrusters.table.names]
     assert max(counts) > 1
-    assert int(values["pulses"]) == sum(counts) == thrusters.pulses.sum()
+    assert int(values["pulses"]) == sum(counts) == thrusters.modulator.pulses.sum()
     assert int(values["unmet_ticks"]) == 3
     assert float(values["unmet_force_N"]) == pytest.approx(1e3, rel=0.2)
     assert float(values["unmet_torque_Nm"]) == pytest.approx(1e2, rel=0.2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,13 @@ from spacerobot_ros.errors import CommandError, ParameterError, RobotDescription
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import (
     PlantWithFaults,
     ThrusterPlant,
     build_plant,
-    thrusters_in,
-    with_thrusters,
 )
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
@@ -443,9 +443,8 @@ def flying(
 ) -> ThrusterPlant:
     start = initial or InitialState(joint_positions=SHAPE)
     plant = EffortPlant(robot or robot_of(SERVICER), TICK, start)
-    thrusters = thrusters_in(with_thrusters(plant, TICK, "urdf", excluded))
-    assert thrusters is not None
-    return thrusters
+    table = find_thrusters("urdf", plant.robot.description)
+    return ThrusterPlant(plant, TICK, table, excluded.split())
 
 
 def wanted(rng: np.random.Generator) -> Array:
@@ -476,8 +475,8 @@ def test_momenta_are_what_the_thrusters_put_in() -> None:
     assert plant.propellant == pytest.approx(used, rel=1e-12)
     assert plant.propellant == pytest.approx(on_time.sum() * 10.0 / (9.80665 * 290.0), rel=1e-12)
     np.testing.assert_allclose(plant.on_time, on_time, rtol=1e-12)
-    assert 24 < plant.pulses.sum() < 300 * 6
-    assert plant.unmet_ticks == 0
+    assert 24 < plant.modulator.pulses.sum() < 300 * 6
+    assert plant.modulator.unmet_periods == 0
 
 
 @pytest.mark.slow
@@ -541,14 +540,14 @@ def test_propellant_is_what_the_thrust_took_whatever_was_commanded() -> None:
 def test_allocation_that_knows_of_a_dead_thruster_gives_the_whole_wrench() -> None:
     push = np.array([15.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     plant = flying(excluded="plus_x_1 plus_y_3")
-    plant.exclude("minus_z_2")
-    assert plant.missing == ""
+    plant.modulator.exclude("minus_z_2")
+    assert plant.modulator.missing == ""
     impulse = np.zeros(6)
     for _ in range(100):
         plant.step(np.zeros(6), push)
         impulse += TICK * plant.wrench
     np.testing.assert_allclose(impulse, push, atol=6 * 0.2)
-    assert plant.unmet_ticks == 0
+    assert plant.modulator.unmet_periods == 0
     names = plant.table.names
     dead = [names.index(name) for name in ("plus_x_1", "plus_y_3", "minus_z_2")]
     assert plant.on_time[dead].tolist() == [0.0] * 3
@@ -558,9 +557,9 @@ def test_too_much_is_counted_and_reset_keeps_what_was_used() -> None:
     plant = flying()
     for _ in range(10):
         plant.step(np.zeros(6), [0.0, 0.0, 500.0, 0.0, 0.0, 0.0])
-    assert plant.unmet_ticks > 5
+    assert plant.modulator.unmet_periods > 5
     # Four thrusters of 10 N push along z.
-    assert plant.unmet[2] == pytest.approx(460.0)
+    assert plant.modulator.unmet[2] == pytest.approx(460.0)
     used, on_time = plant.propellant, plant.on_time.copy()
     plant.reset()
     assert plant.wrench.tolist() == [0.0] * 6
@@ -579,21 +578,19 @@ def test_commands_that_are_not_finite_are_refused_before_anything_fires() -> Non
 
 
 def test_where_thrusters_come_from(tmp_path: Path) -> None:
-    plant = EffortPlant(robot_of(SERVICER), TICK)
-    assert with_thrusters(plant, TICK, "") is plant
-    assert thrusters_in(plant) is None
+    robot = robot_of(SERVICER)
     table = tmp_path / "one.yaml"
     one = {"name": "main", "position": [-0.6, 0, 0], "force": 22, "isp": 230}
     table.write_text(yaml.safe_dump({"thrusters": [one]}), encoding="utf-8")
-    thrusters = with_thrusters(plant, TICK, str(table))
-    assert isinstance(thrusters, ThrusterPlant)
-    assert "negative force along x" in thrusters.missing
-    assert thrusters_in(PlantWithFaults(thrusters, (), TICK, wrench=True)) is thrusters
+    config = PlantConfig(actuation="effort", thrusters=str(table))
+    thrusters = build_plant(robot, config).thrusters
+    assert thrusters is not None
+    assert "negative force along x" in thrusters.modulator.missing
     with pytest.raises(ParameterError, match="no thruster 'nose'"):
-        with_thrusters(plant, TICK, str(table), "nose")
+        build_plant(robot, dataclasses.replace(config, thrusters_excluded="nose"))
     bare = SERVICER.replace("<thruster", "<!--").replace("</thruster>", "-->")
     with pytest.raises(RobotDescriptionError, match="has no <thruster> elements"):
-        with_thrusters(EffortPlant(robot_of(bare), TICK), TICK, "urdf")
+        build_plant(robot_of(bare), PlantConfig(actuation="effort", thrusters="urdf"))
 
 
 def test_faults_of_the_wrench_act_on_the_thrusters_and_not_on_what_is_asked_of_them() -> None:

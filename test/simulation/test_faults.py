@@ -16,13 +16,13 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import (
     PlantWithFaults,
+    ThrusterPlant,
     build_plant,
-    thrusters_in,
-    with_thrusters,
 )
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
@@ -147,7 +147,7 @@ def test_so_many_faults_that_none_could_look_through_them_are_refused() -> None:
         timeline.read(["joint_stuck elbow_pitch"] * 2)
     assert len(timeline.entries) == 999
     timeline.read(["joint_stuck elbow_pitch"])
-    timeline.clear()
+    timeline.inject("clear", 0.0)
     timeline.read(["joint_stuck elbow_pitch"])
 
 
@@ -424,7 +424,7 @@ def test_the_momentum_is_what_the_faulty_thrusters_gave(
 def test_nozzles_stay_open_closed_and_weak() -> None:
     robot = robot_of(urdf("servicer"))
     plant = PlantWithFaults(
-        with_thrusters(EffortPlant(robot, 0.1), 0.1, "urdf", ""),
+        ThrusterPlant(EffortPlant(robot, 0.1), 0.1, find_thrusters("urdf", robot.description)),
         [
             "nozzle_open plus_x_1",
             "nozzle_closed minus_x_1 until 1",
@@ -433,7 +433,7 @@ def test_nozzles_stay_open_closed_and_weak() -> None:
         0.1,
         wrench=True,
     )
-    thrusters = thrusters_in(plant)
+    thrusters = plant.thrusters
     assert thrusters is not None
     opened, other = (thrusters.table.names.index(name) for name in ("plus_x_1", "minus_x_1"))
     back = np.array([-40.0, 0.0, 0.0, 0.0, 0.0, 0.0])

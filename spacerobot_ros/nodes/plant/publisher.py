@@ -26,7 +26,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.nodes.common.messages import message_class, transform_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
-from spacerobot_ros.simulation.actuators import thrusters_in
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.commands import (
     NO_STAMP,
     CommandSource,
@@ -57,9 +57,9 @@ class PlantReport:
         self._node, name = node, node.get_fully_qualified_name()
         self._diagnostics = PlantDiagnostics(name, node.plant, node.commands, real_time)
         self._stream = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        thrusters = thrusters_in(node.plant)
-        if thrusters is not None and thrusters.missing:
-            node.get_logger().warning(f"The thrusters cannot produce {thrusters.missing}.")
+        missing = "" if plant.thrusters is None else plant.thrusters.modulator.missing
+        if missing:
+            node.get_logger().warning(f"The thrusters cannot produce {missing}.")
 
     def observe_plant(self) -> None:
         """Report on the present plant of the node from now on."""
@@ -271,7 +271,8 @@ class ClearancePublisher:
 
     def __init__(
         self,
-        node: PlantNode,
+        node: FlightNode,
+        plant: PlantWithFaults,
         monitor: ClearanceMonitor,
         stream: Publisher | None = None,
     ) -> None:
@@ -282,7 +283,8 @@ class ClearancePublisher:
     @classmethod
     def of(
         cls,
-        node: PlantNode,
+        node: FlightNode,
+        plant: PlantWithFaults,
         described: RobotDescription,
         before: ClearancePublisher | None = None,
         *,
@@ -300,12 +302,16 @@ class ClearancePublisher:
             described,
             tuple(node.plant.robot.link_names),
             None if before is None else before._monitor,
-            capturing=node.plant.capturing,
+            capturing=plant.capturing,
             has_contact_forces=has_contact_forces,
         )
         if monitor is None:
             return None
-        return cls(node, monitor, None if before is None else before._stream)
+        return cls(node, plant, monitor, None if before is None else before._stream)
+
+    def observe(self, plant: PlantWithFaults) -> None:
+        """Measure another plant of the same robot from now on."""
+        self._plant = plant
 
     def look(self, time_ns: int, *, publishes: bool) -> tuple[str, ...] | None:
         """Report contacts that have begun or ended; return the current ones, or None if unchanged.
