@@ -31,9 +31,6 @@ from spacerobot_ros.simulation.commands import (
     CommandSource,
     CommandValidator,
     Refusal,
-    joint_order,
-    require_frame,
-    require_values,
 )
 from spacerobot_ros.times import HEADER_STAMP, LATEST_NS, SECOND, unpack_stamp
 
@@ -149,11 +146,9 @@ class TemplateReader:
         self._fixed_spans: list[tuple[slice, bytes]] = []
         self._value_spans: dict[str, tuple[int, int]] = {}
         self._layout: Layout | None = None
-        self.layout_changes = 0
-        """Number of layout changes."""
 
-    def accept(self, raw: bytes) -> None:
-        """Read from ``raw`` from now on.
+    def accept(self, raw: bytes) -> bool:
+        """Read from ``raw`` from now on; return whether it has another layout, or other texts.
 
         Raises
         ------
@@ -161,11 +156,12 @@ class TemplateReader:
             The bytes are not a message of the type; the previous message is kept.
         """
         if raw is self.raw:
-            return
+            return False
         if len(raw) == self._size and all(raw[place] == text for place, text in self._fixed_spans):
             self.raw = raw
-            return
+            return False
         self._learn_layout(raw)
+        return True
 
     def floats(self, path: str) -> Array:
         """Return a read-only view of the values at ``path``."""
@@ -220,7 +216,6 @@ class TemplateReader:
             count = leaf.shape[0] if wanted is None else wanted
             if count:
                 self._value_spans[path] = leaf.offset, count
-        self.layout_changes += 1
 
 
 def _as_little_endian(raw: bytes, type_name: str) -> bytes:
@@ -271,11 +266,8 @@ class JointReader:
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
         spans: dict[str, int | None] = dict.fromkeys(quantities)
         self._reader = TemplateReader(JOINT_STATE, spans, max_size)
-        self._known_layout = 0
         self._problem = ""
-        self._last_accepted: bytes | None = None
-        """Last accepted message: publishers often repeat the same bytes."""
-        self._order = JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
+        self._order = _JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._missing = ""
         """A joint missing in measured states with this layout; empty: none."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
@@ -352,18 +344,12 @@ class JointReader:
         MissingJointError
             A measured state lacks a joint.
         """
-        if raw is self._last_accepted:
-            return
-        self._last_accepted = None
-        self._reader.accept(raw)
-        if self._reader.layout_changes != self._known_layout:
-            self._known_layout = self._reader.layout_changes
+        if self._reader.accept(raw):
             self._check_names_and_lengths()
         if self._problem:
             raise CommandError(self._problem)
         if self._missing:
             raise MissingJointError(f"joint '{self._missing}' is missing")
-        self._last_accepted = raw
 
     @property
     def stamp_ns(self) -> int:
@@ -374,13 +360,13 @@ class JointReader:
         names = self._reader.texts("name")
         self._problem = self._missing = ""
         try:
-            self._order = JointOrder.of(
-                self._joints, names, self._followers, partial=self._measured
-            )
+            self._order = self._order_of(names)
             for i, quantity in enumerate(self._quantities):
                 count = self._reader.value_count(quantity)
-                if count or i == 0:
-                    require_values(names, quantity, count)
+                if count != len(names) and (count or i == 0):
+                    raise CommandError(
+                        f"{len(names)} joint(s) are named but {count} {quantity} value(s) given"
+                    )
         except CommandError as error:
             self._problem = str(error)
             return
@@ -390,60 +376,45 @@ class JointReader:
             for values in self.values.values():
                 values[:] = 0.0
 
+    def _order_of(self, named: Sequence[str]) -> _JointOrder:
+        """Return the order of named joints; a measured state may lack joints and name others, if it
+        names any of the model.
+        """
+        joints = {name: i for i, name in enumerate(self._joints)}
+        places = [i for i, name in enumerate(named) if name in joints]
+        others = [name for name in named if name not in joints]
+        whole = not self._measured or (joints and not places)
+        if whole and others:
+            known = ", ".join(joints)
+            raise CommandError(f"joint '{others[0]}' is unknown; the robot has {known}")
+        if len(set(named)) != len(named):
+            raise CommandError(f"a joint is named twice in {list(named)}")
+        if whole and len(named) < len(joints):
+            missing = next(name for name in joints if name not in named)
+            raise CommandError(f"joint '{missing}' is missing: a message must name all joints")
+        return _JointOrder(
+            np.array(places, dtype=np.intp),
+            np.array([joints[named[i]] for i in places], dtype=np.intp),
+            tuple(
+                f"joint '{name}' {'follows another' if name in self._followers else 'is unknown'}"
+                for name in others
+            ),
+        )
+
 
 class MissingJointError(CommandError):
     """A measured state lacks a joint, which another message may contain."""
 
 
 @dataclass(frozen=True)
-class JointOrder:
-    """Mapping from message joints to model joints.
-
-    Attributes
-    ----------
-    of_message, of_model
-        Indices of the common joints, in the message and in the model.
-    ignored
-        Descriptions of message joints that are not in the model.
+class _JointOrder:
+    """Indices of the joints that a message and a model have in common, in each of them, and
+    descriptions of the other joints of the message.
     """
 
     of_message: npt.NDArray[np.intp]
     of_model: npt.NDArray[np.intp]
     ignored: tuple[str, ...] = ()
-
-    @classmethod
-    def of(
-        cls,
-        joints: Sequence[str],
-        named: Sequence[str],
-        followers: Collection[str] = (),
-        *,
-        partial: bool = False,
-    ) -> JointOrder:
-        """Return the order of named joints; ``partial`` messages may lack joints and name others.
-
-        Raises
-        ------
-        CommandError
-            A joint is named twice, or is unknown or missing. Partial messages may have unknown and
-            missing joints if they name at least one model joint.
-        """
-        known = [name for name in named if name in joints] if partial else list(named)
-        if not partial or (joints and not known):
-            order = joint_order(joints, named)
-            return cls(np.arange(len(named), dtype=np.intp), order)
-        if len(set(named)) != len(named):
-            raise CommandError(f"a joint is named twice in {list(named)}")
-        places = [i for i, name in enumerate(named) if name in joints]
-        others = [name for name in named if name not in joints]
-        return cls(
-            np.array(places, dtype=np.intp),
-            np.array([list(joints).index(name) for name in known], dtype=np.intp),
-            tuple(
-                f"joint '{name}' {'is a mimic joint' if name in followers else 'is unknown'}"
-                for name in others
-            ),
-        )
 
 
 class MessageDecoder:
@@ -555,17 +526,18 @@ class _WrenchReader:
 
     def __init__(self, base_link: str, frame_prefix: str) -> None:
         self.values: Array = np.zeros(6)
-        self._base_link, self._prefix = base_link, frame_prefix
+        self._base_link, self._accepted = base_link, ("", base_link, frame_prefix + base_link)
         self._reader = TemplateReader(WRENCH, {_WRENCH_PATH: 6})
-        self._known_layout = 0
+        self._frame = ""
 
     def accept(self, raw: bytes) -> int:
         reader = self._reader
-        reader.accept(raw)
-        if reader.layout_changes != self._known_layout:
-            # Messages of one layout name the same frame.
-            require_frame(reader.text("header.frame_id"), self._base_link, self._prefix)
-            self._known_layout = reader.layout_changes
+        if reader.accept(raw):
+            self._frame = reader.text("header.frame_id")
+        if self._frame not in self._accepted:
+            raise CommandError(
+                f"the wrench is in frame '{self._frame}'; it must be in '{self._base_link}'"
+            )
         self.values[:] = reader.floats(_WRENCH_PATH)
         return reader.stamp_ns
 

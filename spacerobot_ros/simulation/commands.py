@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal
@@ -84,59 +83,6 @@ class Refusal:
     reason: Reason
     clause: str
     latches: bool = False
-
-
-def joint_order(joints: Sequence[str], named: Sequence[str]) -> npt.NDArray[np.intp]:
-    """Return the indices, among the robot's joints, of the joints named in a message.
-
-    Parameters
-    ----------
-    joints
-        Joint names of the robot.
-    named
-        Names in the message: every joint, in any order.
-
-    Raises
-    ------
-    CommandError
-        A joint is unknown, missing or named twice.
-    """
-    index = {name: i for i, name in enumerate(joints)}
-    unknown = [name for name in named if name not in index]
-    if unknown:
-        raise CommandError(f"joint '{unknown[0]}' is unknown; the robot has {', '.join(joints)}")
-    if len(set(named)) != len(named):
-        raise CommandError(f"a joint is named twice in {list(named)}")
-    if len(named) < len(index):
-        missing = next(name for name in index if name not in named)
-        raise CommandError(f"joint '{missing}' is missing: a message must name all joints")
-    return np.array([index[name] for name in named], dtype=np.intp)
-
-
-def require_values(named: Sequence[str], quantity: str, count: int) -> None:
-    """Check that a message has one value per joint.
-
-    Raises
-    ------
-    CommandError
-        The number of values is wrong.
-    """
-    if count != len(named):
-        raise CommandError(f"{len(named)} joint(s) are named but {count} {quantity} value(s) given")
-
-
-def require_frame(frame: str, base_link: str, prefix: str = "") -> None:
-    """Check that a wrench is in the base link frame; an empty name selects that frame.
-
-    The name may include the robot's frame prefix.
-
-    Raises
-    ------
-    CommandError
-        The wrench is in another frame.
-    """
-    if frame not in ("", base_link, prefix + base_link):
-        raise CommandError(f"the wrench is in frame '{frame}'; it must be in '{base_link}'")
 
 
 class CommandSource:

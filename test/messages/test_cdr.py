@@ -294,18 +294,17 @@ def test_a_reader_learns_a_layout_once(
             taken |= set(range(start, start + struct.calcsize("<" + FORMATS[typename])))
         for place in set(range(len(raw))) - taken:
             raw[place] = random.randrange(256)
-        reader.accept(bytes(raw))
+        assert not reader.accept(bytes(raw))
         check_reads(reader, message)
-    assert reader.layout_changes == 1
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_a_reader_sees_that_a_name_of_equal_length_has_changed(quantity: str) -> None:
     reader = TemplateReader(JOINT_STATE, {quantity: None})
-    for names, changes in ((["a", "b"], 1), (["a", "b"], 1), (["b", "a"], 2), (["b", "a"], 2)):
+    changes = ((["a", "b"], True), (["a", "b"], False), (["b", "a"], True), (["b", "a"], False))
+    for names, changed in changes:
         numbers: dict[str, Any] = {q: [1.0, 2.0] for q in QUANTITIES}
-        reader.accept(serialize_message(JointState(name=names, **numbers)))
-        assert reader.layout_changes == changes
+        assert reader.accept(serialize_message(JointState(name=names, **numbers))) is changed
         assert reader.texts("name") == names
         np.testing.assert_array_equal(reader.floats(quantity), [1.0, 2.0])
 
@@ -315,9 +314,8 @@ def test_a_reader_sees_that_numbers_have_moved_from_one_field_to_the_next() -> N
     reader = TemplateReader(JOINT_STATE, spans)
     for position, velocity in (([1.0, 2.0], [3.0]), ([1.0], [2.0, 3.0]), ([1.0, 2.0], [3.0])):
         message = JointState(name=["a"], position=position, velocity=velocity, effort=[0.0])
-        reader.accept(serialize_message(message))
+        assert reader.accept(serialize_message(message))
         check_reads(reader, message)
-    assert reader.layout_changes == 3
 
 
 def test_a_name_without_its_final_zero_is_whole_as_in_other_readers() -> None:

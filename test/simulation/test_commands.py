@@ -10,6 +10,8 @@ import pytest
 from support.wheels import wheeled_robot
 
 from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.messages.layout import encode
+from spacerobot_ros.messages.readers import JOINT_STATE, WRENCH, CommandReader, JointReader
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
@@ -18,9 +20,6 @@ from spacerobot_ros.simulation.commands import (
     CommandValidator,
     Reason,
     Refusal,
-    joint_order,
-    require_frame,
-    require_values,
 )
 from spacerobot_ros.simulation.config import PlantConfig
 
@@ -409,8 +408,13 @@ def test_a_limit_is_named_beside_what_is_beyond_it() -> None:
 
 
 def test_names_and_lengths() -> None:
-    joints = ("a", "b", "c")
-    assert joint_order(joints, ["c", "a", "b"]).tolist() == [2, 0, 1]
+    reader = JointReader(("a", "b", "c"), ["effort"])
+
+    def read(named: list[str], efforts: list[float]) -> list[float]:
+        reader.accept(encode(JOINT_STATE, {"name": named, "effort": efforts}))
+        return reader.values["effort"].tolist()
+
+    assert read(["c", "a", "b"], [3.0, 1.0, 2.0]) == [1.0, 2.0, 3.0]
     for named, words in (
         (["c", "x"], "'x' is unknown"),
         (["a", "b"], "'c' is missing: a message must name all joints"),
@@ -418,14 +422,20 @@ def test_names_and_lengths() -> None:
         (["a", "a", "b"], "named twice"),
     ):
         with pytest.raises(CommandError, match=words):
-            joint_order(joints, named)
-    require_values(["a", "b"], "effort", 2)
-    with pytest.raises(CommandError, match=r"2 joint\(s\) are named but 3 effort"):
-        require_values(["a", "b"], "effort", 3)
-    require_frame("", "base")
-    require_frame("base", "base")
-    with pytest.raises(CommandError, match="in frame 'world'"):
-        require_frame("world", "base")
+            read(named, [0.0] * len(named))
+    with pytest.raises(CommandError, match=r"3 joint\(s\) are named but 2 effort"):
+        read(["a", "b", "c"], [1.0, 2.0])
+
+
+def test_a_wrench_is_in_the_frame_of_the_base_link() -> None:
+    base = SLIDERS.base_link
+    reader = CommandReader(CommandSource("base_wrench", "wrench", np.full(6, np.inf)), SLIDERS)
+    for frame in ("", base):
+        _, values = reader.read(encode(WRENCH, {"header": {"frame_id": frame}}))
+        assert not isinstance(values, CommandError)
+    for _ in range(2):
+        _, refused = reader.read(encode(WRENCH, {"header": {"frame_id": "world"}}))
+        assert str(refused) == f"the wrench is in frame 'world'; it must be in '{base}'"
 
 
 def test_wheels_keep_their_rates_where_commands_end_until_a_reset() -> None:
