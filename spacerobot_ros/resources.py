@@ -16,6 +16,16 @@ _ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml", ".sdf", ".world", ".mjcf")
 """Suffixes of robot descriptions, including unsupported formats."""
 
 
+def installed_share_directory(package: str) -> Path | None:
+    """Return the folder ``share/PACKAGE`` of a package in the ROS environment; None: not there."""
+    try:
+        from ament_index_python.packages import get_package_share_directory
+
+        return Path(get_package_share_directory(package))
+    except (ImportError, LookupError, OSError, ValueError):
+        return None
+
+
 @lru_cache(maxsize=1)
 def share_directory() -> Path:
     """Return the folder with ``urdf/`` and ``config/``: the checkout's, or the installed one.
@@ -28,13 +38,9 @@ def share_directory() -> Path:
     checkout = Path(__file__).resolve().parent.parent
     if (checkout / "package.xml").is_file() and (checkout / "urdf").is_dir():
         return checkout
-    candidates = [Path(sys.prefix) / "share" / _PACKAGE]
-    try:
-        from ament_index_python.packages import get_package_share_directory
-
-        candidates.insert(0, Path(get_package_share_directory(_PACKAGE)))
-    except (ImportError, LookupError, OSError):
-        pass  # Without an ament index (plain pip), the data files are below the prefix.
+    # Without an ament index (plain pip), the data files are below the prefix.
+    found = installed_share_directory(_PACKAGE)
+    candidates = [*filter(None, [found]), Path(sys.prefix) / "share" / _PACKAGE]
     for candidate in candidates:
         if (candidate / "urdf").is_dir():
             return candidate

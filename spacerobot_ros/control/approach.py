@@ -245,7 +245,7 @@ def plan_approach(
     in_the_way = False
     for start in [0.0] if moving else starts.tolist():
         first = round(start / _SAMPLE_PERIOD)
-        begin = RelativeMotionOverTime.between(grapple.between_samples(first, first + 1), at_rest)
+        begin = RelativeMotionOverTime.between(grapple.rows(slice(first, first + 1)), at_rest)
         for duration, (way, (standoff, closing)) in product(_outward_durations(), enumerate(ways)):
             if not way:
                 in_the_way = False
@@ -260,7 +260,7 @@ def plan_approach(
             # Few samples refuse most of the paths.
             for every in (_COARSE_STRIDE, 1):
                 times = _SAMPLE_PERIOD * np.arange(first, last, every)
-                motion = grapple.between_samples(first, last, every).with_relative_motion(
+                motion = grapple.rows(slice(first, last, every)).with_relative_motion(
                     plan.relative(times)
                 )
                 share = _largest_limit_share(motion, limits, axes)

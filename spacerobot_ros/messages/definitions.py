@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from rosbags.interfaces import Nodetype
 
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.resources import installed_share_directory
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -210,13 +211,8 @@ class _InterfaceName:
 
 
 def _share_folder(package: str) -> Path:
-    try:
-        from ament_index_python.packages import get_package_share_directory
-
-        return Path(get_package_share_directory(package))
-    except (ImportError, LookupError, OSError, ValueError):
-        # Packages from pip are below the environment's prefix and set no search path.
-        folder = Path(sys.prefix) / "share" / package
+    # Packages from pip are below the environment's prefix and set no search path.
+    folder = installed_share_directory(package) or Path(sys.prefix) / "share" / package
     if not folder.is_dir():
         raise RecordingError(
             f"The message package {package} is neither on AMENT_PREFIX_PATH nor in "

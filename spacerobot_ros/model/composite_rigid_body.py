@@ -53,18 +53,6 @@ from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
 
-def inertia_matrix(mass: float | ca.SX, D: ca.SX, D_q: ca.SX, D_qq: ca.SX) -> ca.SX:
-    """Return ``H+`` (6 + n, 6 + n) from its blocks, eq. (15)."""
-    n = D_qq.shape[0]
-    return ca.blockcat(
-        [
-            [mass * ca.SX.eye(3), ca.SX(3, 3), ca.SX(3, n)],
-            [ca.SX(3, 3), D, D_q],
-            [ca.SX(n, 3), D_q.T, D_qq],
-        ]
-    )
-
-
 @dataclass(frozen=True)
 class SpatialInertia:
     """Inertia about the system's centre of mass: ``mass`` (kg), ``h`` (3,) first moment of mass
@@ -123,8 +111,9 @@ class Composites:
     """Composite rigid bodies outboard of each joint, base components; see the module for symbols.
 
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
-    the unit-rate motion of the joint that carries body j, ``P[j]`` (6,) the momentum of its
-    composite (both zero for the base); ``rotational`` (3, 3) is the system's rotational inertia.
+    the motion at unit rate of the joint that carries body j, ``P[j]`` (6,) the momentum of its
+    composite (both zero for the base); ``D`` (3, 3) is the locked inertia about the system's centre
+    of mass, kg m^2 (paper 4, eq. 16a).
     ``composite[k]`` is the inertia of body k and of all bodies that it carries.
     """
 
@@ -133,17 +122,7 @@ class Composites:
     composite: tuple[SpatialInertia, ...]
     S: tuple[ca.SX, ...]
     P: tuple[ca.SX, ...]
-    rotational: ca.SX
-
-    @property
-    def mass(self) -> float | ca.SX:
-        """System mass, kg."""
-        return self.kin.total_mass
-
-    @property
-    def D(self) -> ca.SX:
-        """Locked inertia (3, 3) about the system's centre of mass, kg m^2 (paper 4, eq. 16a)."""
-        return self.rotational
+    D: ca.SX
 
     @property
     def D_q(self) -> ca.SX:
@@ -163,14 +142,21 @@ class Composites:
             carriers = self.kin.ancestors(j)
             for i in range(1, j + 1):
                 carried = ca.dot(self.S[i], self.P[j]) if i in carriers else 0
-                shared = ca.dot(self.P[i][3:], self.P[j][3:]) / self.mass
+                shared = ca.dot(self.P[i][3:], self.P[j][3:]) / self.kin.total_mass
                 D_qq[i - 1, j - 1] = D_qq[j - 1, i - 1] = carried - shared
         return self.kin.gather(self.kin.gather(D_qq).T)
 
     @property
     def H_plus(self) -> ca.SX:
         """Inertia matrix (6 + n, 6 + n) of ``[v_cm; omega; qdot]`` (paper 4, eq. 15)."""
-        return inertia_matrix(self.mass, self.D, self.D_q, self.D_qq)
+        n, D_q = self.kin.n, self.D_q
+        return ca.blockcat(
+            [
+                [self.kin.total_mass * ca.SX.eye(3), ca.SX(3, 3), ca.SX(3, n)],
+                [ca.SX(3, 3), self.D, D_q],
+                [ca.SX(n, 3), D_q.T, self.D_qq],
+            ]
+        )
 
 
 def composites(kin: TreeKinematics) -> Composites:
@@ -221,7 +207,7 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
     """Eliminate the base from the composites."""
     parts = composites(kin)
     S, P, n = parts.S, parts.P, kin.moving_body_count
-    D = SymmetricFactor(parts.rotational)
+    D = SymmetricFactor(parts.D)
     B = [ca.vertcat(D.solve(p[:3]), p[3:] * kin.per_mass) for p in P]
     K = ca.SX(n, n)
     for j in range(1, n + 1):
@@ -331,7 +317,7 @@ def joint_efforts(
     the efforts. ``loads`` are external loads, if any.
     """
     parts = composites(kin)
-    D = SymmetricFactor(parts.rotational)
+    D = SymmetricFactor(parts.D)
     relative = -(parts.D_q @ qdot) if L_B is None else L_B - parts.D_q @ qdot
     f = motion_forces(parts, D.solve(relative), qdot, qddot)
     if loads is not None:

@@ -149,7 +149,7 @@ def base_twist(
     else:
         omega = solve_positive_definite(inertia.D, excess)
     c = kin.r_BC_B
-    v = p_B / inertia.mass - ca.cross(omega, c) - ca.jtimes(c, kin.q, qdot)
+    v = p_B / kin.total_mass - ca.cross(omega, c) - ca.jtimes(c, kin.q, qdot)
     return v, omega
 
 
@@ -162,14 +162,6 @@ def connection(kin: TreeKinematics, inertia: Composites) -> ca.SX:
     A_omega = solve_positive_definite(inertia.D, inertia.D_q)
     A_v = ca.skew(kin.r_BC_B) @ A_omega + ca.jacobian(kin.r_BC_B, kin.q)
     return ca.vertcat(A_v, A_omega)
-
-
-def body_bracket(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Return the se(3) bracket of two body twists ``[v; omega]``, each (6,)."""
-    return ca.vertcat(
-        ca.cross(a[3:], b[:3]) + ca.cross(a[:3], b[3:]),
-        ca.cross(a[3:], b[3:]),
-    )
 
 
 def curvature(A: ca.SX, q: ca.SX) -> list[list[ca.SX]]:
@@ -186,6 +178,10 @@ def curvature(A: ca.SX, q: ca.SX) -> list[list[ca.SX]]:
     K = [[ca.SX(6, 1) for _ in range(n)] for _ in range(n)]
     for i in range(n):
         for j in range(i + 1, n):
-            K[i][j] = dF[j][:, i] - dF[i][:, j] + body_bracket(F[:, i], F[:, j])
+            a, b = F[:, i], F[:, j]
+            bracket = ca.vertcat(
+                ca.cross(a[3:], b[:3]) + ca.cross(a[:3], b[3:]), ca.cross(a[3:], b[3:])
+            )
+            K[i][j] = dF[j][:, i] - dF[i][:, j] + bracket
             K[j][i] = -K[i][j]
     return K

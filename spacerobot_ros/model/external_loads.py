@@ -33,61 +33,35 @@ from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
-@dataclass(frozen=True)
 class LoadLayout:
-    """Layout of a load vector.
+    """Slices of a vector of loads of a robot with L links.
 
     Attributes
     ----------
-    links
-        Number L of robot links.
+    in_link, in_world
+        Force (N) over torque (N m) at the origin of every link, in its frame and in components of
+        W: (6 L,) each.
+    mean_motion
+        Mean motion of the orbit, rad/s; zero: no gravity gradient.
+    quaternion_WO
+        Attitude (x, y, z, w) of the orbital frame in W at time zero.
+    gravity_W
+        Uniform acceleration (3,), m/s^2.
+    friction
+        Viscous friction of every body over its momentum, 1/s.
+    time
+        Time at the beginning of the tick, s.
+    size
+        Length of the vector.
     """
 
-    links: int
-
-    @property
-    def in_link(self) -> slice:
-        """Force (N) over torque (N m) at every link origin, in the link frame: (6 L,)."""
-        return slice(0, 6 * self.links)
-
-    @property
-    def in_world(self) -> slice:
-        """The same in components of W: (6 L,)."""
-        return slice(6 * self.links, 12 * self.links)
-
-    @property
-    def mean_motion(self) -> slice:
-        """Mean motion of the orbit, rad/s; zero disables the gravity gradient."""
-        return self._after_wrenches(0, 1)
-
-    @property
-    def quaternion_WO(self) -> slice:
-        """Attitude (x, y, z, w) of the orbital frame in W at time zero."""
-        return self._after_wrenches(1, 4)
-
-    @property
-    def gravity_W(self) -> slice:
-        """Uniform acceleration (3,), m/s^2."""
-        return self._after_wrenches(5, 3)
-
-    @property
-    def friction(self) -> slice:
-        """Viscous friction on every body per unit of its momentum, 1/s."""
-        return self._after_wrenches(8, 1)
-
-    @property
-    def time(self) -> slice:
-        """Time at the start of the tick, s."""
-        return self._after_wrenches(9, 1)
-
-    @property
-    def size(self) -> int:
-        """Length of the vector."""
-        return self.time.stop
-
-    def _after_wrenches(self, start: int, count: int) -> slice:
-        start += 12 * self.links
-        return slice(start, start + count)
+    def __init__(self, links: int) -> None:
+        ends = np.cumsum([6 * links, 6 * links, 1, 4, 3, 1, 1]).tolist()
+        self.in_link, self.in_world, self.mean_motion, self.quaternion_WO, *rest = map(
+            slice, [0, *ends], ends
+        )
+        self.gravity_W, self.friction, self.time = rest
+        self.size: int = ends[-1]
 
 
 @dataclass(frozen=True)

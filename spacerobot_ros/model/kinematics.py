@@ -120,10 +120,6 @@ class TreeKinematics:
             k = self.parent(k)
         return chain[::-1]
 
-    def outboard(self, j: int) -> list[int]:
-        """Return the bodies outboard of joint j, body j first."""
-        return [k for k in range(len(self.robot.bodies)) if j == 0 or j in self.ancestors(k)]
-
     def frame(self, link: str) -> tuple[ca.SX, ca.SX, int]:
         """Return the attitude (3, 3), position (3,) in B, and body index of a link frame."""
         body, pose = self.robot.frames[link]

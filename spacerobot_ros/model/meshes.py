@@ -26,11 +26,11 @@ from xml.etree.ElementTree import ParseError, tostring
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import MeshError, SpaceRobotError, reason
+from spacerobot_ros.errors import MeshError, reason
 from spacerobot_ros.files import read_regular
 from spacerobot_ros.model.description import Array, Pose, Shape, editable_root
 from spacerobot_ros.model.xacro_files import package_around
-from spacerobot_ros.resources import share_directory
+from spacerobot_ros.resources import installed_share_directory, share_directory
 
 _MAX_MESH_BYTES = 100_000_000
 _MAX_TRIANGLES = 2_000_000
@@ -136,24 +136,14 @@ def mesh_file(resource: str) -> Path | None:
     """
     url = urlparse(resource)
     if url.scheme == "package":
-        folder = _package_folder(url.netloc)
+        own = url.netloc == "spacerobot_ros"
+        folder = share_directory() if own else installed_share_directory(url.netloc)
         path = None if folder is None else folder / unquote(url.path).lstrip("/")
     elif url.scheme in ("file", ""):
         path = Path(unquote(url.path))
     else:
         return None
     return path if path is not None and path.is_file() else None
-
-
-def _package_folder(name: str) -> Path | None:
-    if name == "spacerobot_ros":
-        return share_directory()
-    try:
-        from ament_index_python.packages import get_package_share_directory
-
-        return Path(get_package_share_directory(name))
-    except (ImportError, LookupError, OSError, ValueError, SpaceRobotError):
-        return None
 
 
 def shape_mesh(shape: Shape, most: int = _MAX_TRIANGLES) -> TriangleMesh:

@@ -193,9 +193,8 @@ class ModelFunctions:
     def _momentum_derivatives(self) -> ca.Function:
         symbols = [self._kin.q, *(ca.SX.sym(k, d) for k, d in (("omega", 3), ("qdot", self.n)))]
         symbols.append(ca.SX.sym("eta", 3))
-        found = momentum_derivatives(self._inertia, *symbols[1:])
-        results = [found.by_q, found.by_q_q, found.by_q_qdot, found.by_q_omega]
-        return ca.Function("momentum_derivatives", symbols, ca.cse(results))
+        results = momentum_derivatives(self._inertia, *symbols[1:])
+        return ca.Function("momentum_derivatives", symbols, ca.cse([*results]))
 
     def _link_poses(self) -> ca.Function:
         frames = [self._kin.frame(link) for link in self.link_names]

@@ -33,35 +33,17 @@ Dynamics Algorithms, 2008, section 2.9.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 
 from spacerobot_ros.model.composite_rigid_body import Composites
 
 
-@dataclass(frozen=True)
-class MomentumDerivatives:
-    """Derivatives of the angular momentum L (3,) at ``omega`` and ``qdot``, and of ``eta' L``.
-
-    Attributes
-    ----------
-    by_q
-        ``dL/dq`` (3, n).
-    by_q_q, by_q_qdot, by_q_omega
-        Second derivatives of ``eta' L``: (n, n), (n, n) and (n, 3).
-    """
-
-    by_q: ca.SX
-    by_q_q: ca.SX
-    by_q_qdot: ca.SX
-    by_q_omega: ca.SX
-
-
 def momentum_derivatives(
     parts: Composites, omega: ca.SX, qdot: ca.SX, eta: ca.SX
-) -> MomentumDerivatives:
-    """Return the derivatives at a configuration, for zero linear momentum.
+) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    """Return the derivatives in a configuration, at zero linear momentum: ``dL/dq`` (3, n) of the
+    angular momentum L, and those of ``eta' L`` by q and q (n, n), q and qdot (n, n), and q and
+    omega (n, 3).
 
     Parameters
     ----------
@@ -111,7 +93,7 @@ def momentum_derivatives(
     def columns(of: dict[int, ca.SX]) -> ca.SX:
         return ca.horzcat(ca.SX(3, 0), *(of[k][:3] for k in joints))
 
-    return MomentumDerivatives(
+    return (
         kin.gather(columns(y2).T).T,
         kin.gather(kin.gather(by_q_q).T),
         kin.gather(kin.gather(by_q_qdot).T).T,

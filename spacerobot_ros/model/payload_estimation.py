@@ -26,7 +26,7 @@ from scipy.optimize import least_squares, minimize
 
 from spacerobot_ros.model.description import Array, Inertia
 from spacerobot_ros.model.grasp import BodyMotion, Payload
-from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
+from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES, symmetric_of_entries
 from spacerobot_ros.model.rotations import hat
 
 PAYLOAD_PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
@@ -100,13 +100,6 @@ class PayloadEstimate:
         com = h / mass
         about_com = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
         return Payload(self.link, Inertia(float(mass), com, about_com))
-
-
-def payload_parameters(inertia: Inertia) -> Array:
-    """Return the parameters (10,) of a body, in the order of :data:`PAYLOAD_PARAMETERS`."""
-    com, mass = inertia.com, inertia.mass
-    about = inertia.about_com + mass * (com @ com * np.eye(3) - np.outer(com, com))
-    return np.array([mass, *(mass * com), *(about[i, j] for i, j in INERTIA_ENTRIES)])
 
 
 def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
@@ -330,10 +323,7 @@ def _most_physical_parameters(fit: _Fit) -> Array:
 
 def _mass_moment_inertia(x: Array) -> tuple[float, Array, Array]:
     """Return mass, first moment (3,) and inertia (3, 3) of parameters (10,)."""
-    about = np.zeros((3, 3))
-    for value, (i, j) in zip(x[4:], INERTIA_ENTRIES, strict=True):
-        about[i, j] = about[j, i] = value
-    return float(x[0]), x[1:4], about
+    return float(x[0]), x[1:4], symmetric_of_entries(x[4:])
 
 
 def _pseudo_inertia(x: Array) -> Array:

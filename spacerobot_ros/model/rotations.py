@@ -221,21 +221,3 @@ def quaternion_from_matrix(R: Array) -> Array:
         case _:
             q = (xz + zx) * s, (yz + zy) * s, largest * s, (yx - xy) * s
     return np.array(q)
-
-
-def rotation_angles(R: Array) -> Array:
-    """Return the angles (...), rad, from 0 to pi, of rotation matrices (..., 3, 3).
-
-    They are computed from sine and cosine, so small angles stay precise.
-    """
-    twice_axis = np.stack(
-        [
-            R[..., 2, 1] - R[..., 1, 2],
-            R[..., 0, 2] - R[..., 2, 0],
-            R[..., 1, 0] - R[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    sine = 0.5 * np.linalg.norm(twice_axis, axis=-1)
-    cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
-    return np.asarray(np.arctan2(sine, cosine))

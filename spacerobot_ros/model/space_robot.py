@@ -276,13 +276,6 @@ class SpaceRobot:
         stacked = self._call_function("curvature", q)[0]
         return stacked.reshape((6, self.n, self.n), order="F")
 
-    def lie_brackets(self, q: npt.ArrayLike) -> Array:
-        """Return ``w`` (3, n, n), ``w[:, i, j] = omega_[Fi,Fj]``: paper 1's brackets, eq. (7).
-
-        The brackets are minus the angular part of :meth:`curvature`.
-        """
-        return -self.curvature(q)[3:]
-
     def momentum(
         self,
         quaternion_WB: npt.ArrayLike,
@@ -333,14 +326,6 @@ class SpaceRobot:
         robot = copy.copy(self)
         robot._buffers, robot._compiles = {}, False
         return robot
-
-    def velocity_step(self, substeps: int) -> BufferedFunction:
-        """Return the step under held joint velocities ``(x, qdot, L_W, h) -> x``.
-
-        ``x = [q; quaternion_WB]``; the step of ``h`` seconds is taken in ``substeps``
-        Runge-Kutta attitude steps (see :mod:`spacerobot_ros.model.integration`).
-        """
-        return self.buffered(f"velocity_step:{substeps}")
 
     def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
         """Return a buffered function that ``build`` composes from MX model functions.

@@ -58,17 +58,13 @@ class FrameMotion:
     a: Array
     alpha: Array
 
-    def between_samples(self, first: int, last: int, every: int = 1) -> FrameMotion:
-        """Return the motion at all times except the last."""
-        return self.rows(slice(first, last, every))
-
     def rows(self, chosen: slice | npt.NDArray[np.int64]) -> FrameMotion:
         """Return the motion at selected times."""
         return FrameMotion(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
-    def body_motion(self, k: int = 0) -> BodyMotion:
-        """Return the motion at the k-th time without accelerations."""
-        return BodyMotion(self.R[k], self.r[k], self.v[k], self.omega[k])
+    def body_motion(self) -> BodyMotion:
+        """Return the motion at the first time without accelerations."""
+        return BodyMotion(self.R[0], self.r[0], self.v[0], self.omega[0])
 
     def with_relative_motion(self, path: RelativeMotionOverTime) -> FrameMotion:
         """Return the motion of a frame that moves relative to this one."""

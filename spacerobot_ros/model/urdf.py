@@ -40,7 +40,11 @@ from spacerobot_ros.model.description import (
     leading_limit,
     weld_links,
 )
-from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES, TRIANGLE_SLACK
+from spacerobot_ros.model.inertial_parameters import (
+    INERTIA_ENTRIES,
+    TRIANGLE_SLACK,
+    symmetric_of_entries,
+)
 from spacerobot_ros.model.meshes import mesh_beside, mesh_file, with_mesh_files
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
@@ -382,11 +386,10 @@ def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
 
 
 def _read_inertia(moments: Element | None, where: str) -> Array:
-    about = np.zeros((3, 3))
-    for row, column in INERTIA_ENTRIES:
-        entry = _read_number(moments, f"i{'xyz'[row]}{'xyz'[column]}", where)
-        about[row, column] = about[column, row] = entry
-    return about
+    return symmetric_of_entries(
+        _read_number(moments, f"i{'xyz'[row]}{'xyz'[column]}", where)
+        for row, column in INERTIA_ENTRIES
+    )
 
 
 def describe_inertia_flaw(about: Array) -> str:

@@ -33,7 +33,6 @@ from spacerobot_ros.model.payload_estimation import (
     PayloadEstimate,
     estimate_payload,
     momentum_regressor,
-    payload_parameters,
 )
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
@@ -346,7 +345,7 @@ def test_all_ten_parameters_follow_from_motion_in_space() -> None:
     off = POINTS - center
     about = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(MASSES, off, strict=True))
     np.testing.assert_allclose(payload.inertia.about_com, about, atol=1e-10)
-    np.testing.assert_allclose(payload_parameters(payload.inertia), true_parameters(), atol=1e-10)
+    assert payload.inertia.mass == pytest.approx(MASSES.sum(), rel=1e-10)
 
 
 def test_noise_is_averaged_and_the_deviations_say_how_well() -> None:
@@ -512,7 +511,9 @@ def integrated_attitude(seed: int, spinning: bool) -> Array:
 
 
 def step(robot: SpaceRobot, case: Case, spinning: bool, substeps: int) -> Array:
-    (x,) = robot.velocity_step(substeps)(case.x, case.qdot, case.L_W(spinning), DURATION)
+    (x,) = robot.buffered(f"velocity_step:{substeps}")(
+        case.x, case.qdot, case.L_W(spinning), DURATION
+    )
     return np.asarray(x)
 
 
@@ -549,7 +550,7 @@ def test_shape_is_exact(seed: int, substeps: int) -> None:
 
 def test_two_steps_are_one_of_twice_the_substeps() -> None:
     case = random_case(70)
-    buffer, x = case.robot.velocity_step(2), case.x
+    buffer, x = case.robot.buffered("velocity_step:2"), case.x
     for _ in range(2):
         (x,) = buffer(x, case.qdot, case.spin_W, DURATION / 2)
     assert_agrees(x, step(case.robot, case, spinning=True, substeps=4), tolerance=1e-14)
@@ -557,7 +558,9 @@ def test_two_steps_are_one_of_twice_the_substeps() -> None:
 
 def test_joints_at_rest_and_no_momentum_leave_everything_as_it_is() -> None:
     case = random_case(71)
-    (x,) = case.robot.velocity_step(2)(case.x, np.zeros(case.robot.n), np.zeros(3), DURATION)
+    (x,) = case.robot.buffered("velocity_step:2")(
+        case.x, np.zeros(case.robot.n), np.zeros(3), DURATION
+    )
     np.testing.assert_allclose(x, case.x, rtol=0.0, atol=1e-15)
 
 

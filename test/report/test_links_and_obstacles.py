@@ -24,7 +24,7 @@ from spacerobot_ros.errors import MeshError
 from spacerobot_ros.flight.series import SentGoal, Signal, goal_at_end, reported_goal
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
-from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotation_angles
+from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
@@ -198,14 +198,6 @@ def test_charts_have_limits_on_logarithmic_axes_where_these_have_them(hands: Fli
     first, second = charts_of(hands, [figure]).data["charts"]["charts"]
     assert first["limits"] == [[0, pytest.approx(-2.0)]]
     assert second["limits"] == [[0, 0.01]]
-
-
-def test_angles_of_rotations_keep_their_digits() -> None:
-    axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    angles = np.array([0.0, 1e-9, 0.3, 2.0, np.pi])
-    R = Rotation.from_rotvec(angles[:, np.newaxis] * axis).as_matrix()
-    np.testing.assert_allclose(rotation_angles(R), angles, rtol=1e-7, atol=1e-15)
-    assert rotation_angles(R[2]) == pytest.approx(0.3)
 
 
 def test_a_status_names_goals_of_links_and_of_the_base() -> None:

@@ -71,7 +71,7 @@ class BasePrediction:
         self._robot = robot
         self._control_period = control_period
         substeps = count_steps(control_period, integration_step)
-        self._step = robot.velocity_step(substeps)
+        self._step = robot.buffered(f"velocity_step:{substeps}")
 
     def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:
         """Return the attitude (N + 1, 4) at every tick for the shapes ``positions`` (N + 1, n)."""

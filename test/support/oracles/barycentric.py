@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from spacerobot_ros.model.composite_rigid_body import inertia_matrix
 from spacerobot_ros.model.dynamics import bias, point_jacobian, solve_positive_definite
 from spacerobot_ros.model.kinematics import TreeKinematics
 
@@ -35,7 +34,8 @@ class BarycentricInertia:
     @property
     def H_plus(self) -> ca.SX:
         """The inertia matrix (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, eq. (15)."""
-        return inertia_matrix(self.mass, self.D, self.D_q, self.D_qq)
+        turning = ca.blockcat([[self.D, self.D_q], [self.D_q.T, self.D_qq]])
+        return ca.diagcat(self.mass * ca.SX.eye(3), turning)
 
 
 def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
@@ -44,7 +44,7 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
     """
     bodies = range(kin.moving_body_count + 1)
     M = kin.total_mass
-    outboard = [set(kin.outboard(k)) for k in bodies]
+    outboard = [set(_outboard(kin, k)) for k in bodies]
     # towards[i][j]: vector from the mass centre of i to its joint with neighbour j, and the mass
     # beyond that joint.
     towards: list[dict[int, tuple[ca.SX, float | ca.SX]]] = [{} for _ in bodies]
@@ -86,7 +86,7 @@ def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
 
     # E_ij couples the rotation of body i and the slide j: sum_k m_k v_ik x ds_k/dq_j, where
     # sum_k m_k v_ik = 0 leaves only the bodies that the slide carries.
-    outboard = [kin.outboard(j) for j in bodies]
+    outboard = [_outboard(kin, j) for j in bodies]
     slides = [j for j in bodies[1:] if not kin.is_revolute(j)]
     turns = [j for j in bodies[1:] if kin.is_revolute(j)]
     E = {
@@ -136,3 +136,8 @@ def forward_dynamics(kin: TreeKinematics) -> ca.Function:
     H = ca.blockcat([[inertia.D, inertia.D_q], [inertia.D_q.T, inertia.D_qq]])
     z0ddot = ca.vertcat(force[:3] / inertia.mass, solve_positive_definite(H, force[3:]))
     return ca.Function("barycentric", [kin.q, *symbols], [z0ddot])
+
+
+def _outboard(kin: TreeKinematics, j: int) -> list[int]:
+    """Return the bodies outboard of joint j, body j first."""
+    return [k for k in range(len(kin.robot.bodies)) if j == 0 or j in kin.ancestors(k)]
