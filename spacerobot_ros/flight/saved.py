@@ -241,7 +241,8 @@ def _clearance_streams(flight: FlightData) -> Iterator[_Stream]:
     """Yield the clearances, where distances are exact, as those of the plant's node are."""
     if flight.clearance is None or not flight.clearance.geometry.exact:
         return
-    statuses = flight.clearance.statuses(max(1, flight.scenario.plant.clearance_ticks))
+    plant = flight.scenario.plant
+    statuses = flight.clearance.statuses(max(1, plant.ticks_of(plant.clearance_period)))
     yield _Stream.of(
         TOPICS["clearance"],
         (

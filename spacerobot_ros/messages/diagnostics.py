@@ -268,21 +268,21 @@ class PlantDiagnostics:
 
 
 def timing_record(node: str, robot: str, real_time: RealTime) -> StatusRecord:
-    """Return the delays of plant ticks and of the commander's commands."""
-    timing = real_time.report()
+    """Return the delays of a plant's ticks and of its commander's commands."""
+    tick_rate, worse = real_time.report()
     return _record(
         diagnostic_name(node, "timing"),
-        _WARN if timing.worse else _OK,
-        "deadlines were missed" if timing.worse else "in time",
+        _WARN if worse else _OK,
+        "deadlines were missed" if worse else "in time",
         {
-            "tick_rate_Hz": f"{timing.tick_rate:.6g}",
-            "ticks": timing.ticks,
-            "ticks_late": timing.ticks_late,
-            "worst_tick_ms": f"{timing.worst_tick * _MILLISECONDS:.3f}",
-            "commands": timing.commands,
-            "commands_late": timing.commands_late,
-            "worst_command_ms": f"{timing.worst_command * _MILLISECONDS:.3f}",
-            "command_age_s": f"{timing.command_age:.6g}",
+            "tick_rate_Hz": f"{tick_rate:.6g}",
+            "ticks": real_time.ticks,
+            "ticks_late": real_time.ticks_late,
+            "worst_tick_ms": f"{real_time.worst_tick * _MILLISECONDS:.3f}",
+            "commands": real_time.commands,
+            "commands_late": real_time.commands_late,
+            "worst_command_ms": f"{real_time.worst_command * _MILLISECONDS:.3f}",
+            "command_age_s": f"{real_time.command_age:.6g}",
         },
         robot,
     )

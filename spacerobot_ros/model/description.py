@@ -312,14 +312,7 @@ class RobotDescription:
         Each is multiplied by an independent factor, drawn uniformly from
         ``[1 - error, 1 + error]``, two per link in link order. Inertia tensors stay
         physical, since their principal moments keep their ratios; centres of mass do not change.
-
-        Raises
-        ------
-        ValueError
-            ``error`` is not in [0, 1).
         """
-        if not 0.0 <= error < 1.0:
-            raise ValueError(f"a relative error of {error} is not in [0, 1)")
         factors = np.random.default_rng(seed).uniform(1 - error, 1 + error, (len(self.links), 2))
         links = []
         for link, (mass, moment) in zip(self.links, factors, strict=True):

@@ -179,7 +179,7 @@ class ModelFunctions:
         self, name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]
     ) -> ca.Function:
         """Return a function of the model; symbolic mass properties become its last input."""
-        return dense_function(name, inputs | self._kin.mass_properties.inputs, outputs)
+        return dense_function(name, inputs | self.mass_inputs, outputs)
 
     def _shape_function(self, name: str, *outputs: ca.SX) -> ca.Function:
         names = ["result"] if len(outputs) == 1 else [f"result_{i}" for i in range(len(outputs))]
@@ -267,7 +267,7 @@ class ModelFunctions:
         K = curvature(self._connection, self._kin.q)
         # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
         stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
-        inputs = {"q": self._kin.q} | self._kin.mass_properties.inputs
+        inputs = {"q": self._kin.q} | self.mass_inputs
         # It has few common subexpressions, and looking for them takes several times as long.
         names = [*inputs], ["result"]
         return ca.Function("curvature", [*inputs.values()], [ca.densify(stacked)], *names)
@@ -298,21 +298,11 @@ class ModelFunctions:
     def _velocity_step(self, substeps: str) -> ca.Function:
         count = int(substeps)
         step = attitude_step(self._locked_inertia())
-        inputs = {
-            "x": ca.MX.sym("x", self.n + 4),
-            "qdot": ca.MX.sym("qdot", self.n),
-            "L_W": ca.MX.sym("L_W", 3),
-            "h": ca.MX.sym("h"),
-            **{
-                name: ca.MX.sym(name, p.numel())
-                for name, p in self._kin.mass_properties.inputs.items()
-            },
-        }
-        x0, qdot, L_W, h, *p = inputs.values()
-        x = repeat_step(step, count)(x0, qdot, L_W, h / count, *p)
-        return ca.Function(
-            f"velocity_step_{count}", list(inputs.values()), [x], list(inputs), ["x_next"]
-        )
+        x, qdot = ca.MX.sym("x", self.n + 4), ca.MX.sym("qdot", self.n)
+        L_W, h = ca.MX.sym("L_W", 3), ca.MX.sym("h")
+        p = [ca.MX.sym(name, each.numel()) for name, each in self.mass_inputs.items()]
+        x_next = repeat_step(step, count)(x, qdot, L_W, h / count, *p)
+        return ca.Function(f"velocity_step_{count}", [x, qdot, L_W, h, *p], [x_next])
 
     def _momentumless_velocity_step(self, substeps: str) -> ca.Function:
         return attitude_steps_without_momentum(self._locked_inertia(), int(substeps))
@@ -324,17 +314,12 @@ class ModelFunctions:
         x = ca.MX.sym("x", self.n + 14)
         qdot, h = ca.MX.sym("qdot", self.n), ca.MX.sym("h")
         loads = ca.MX.sym("loads", LoadLayout(len(self.link_names)).size)
-        p = [
-            ca.MX.sym(name, symbol.numel())
-            for name, symbol in self._kin.mass_properties.inputs.items()
-        ]
+        p = [ca.MX.sym(name, each.numel()) for name, each in self.mass_inputs.items()]
         x_next = repeat_step(step, count)(x, qdot, loads, h / count, *p)
         return ca.Function(f"loaded_velocity_step_{count}", [x, qdot, loads, h, *p], [x_next])
 
     def _total_mass(self) -> ca.Function:
-        return dense_function(
-            "total_mass", self._kin.mass_properties.inputs, {"M": self._kin.total_mass}
-        )
+        return dense_function("total_mass", self.mass_inputs, {"M": self._kin.total_mass})
 
 
 _MAX_SYMBOLIC_MODELS = 8

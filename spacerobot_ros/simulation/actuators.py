@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot, integration
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.capture import CapturePlant, Target, load_target
@@ -222,8 +222,6 @@ class PlantWithFaults(WrappedPlant):
         """External loads; None: there have been none so far."""
         self._disturbances = disturbance_timeline(disturbances, self.robot.link_names)
         self._surroundings = surroundings or Surroundings()
-        if self._disturbances.entries or self._surroundings.has_loads:
-            self._begin_loads()
         self.apply_active_faults()
         self._apply_active_disturbances()
 
@@ -252,8 +250,6 @@ class PlantWithFaults(WrappedPlant):
             A line is not a valid disturbance for this robot; none of the lines is added.
         """
         self._disturbances.inject(text, self.time)
-        if self._disturbances.entries and self.loads is None:
-            self._begin_loads()
         self._apply_active_disturbances()
 
     def succeed(self, before: PlantWithFaults) -> None:
@@ -261,8 +257,6 @@ class PlantWithFaults(WrappedPlant):
         self.tick = before.tick
         self.timeline.copy_from(before.timeline)
         self._disturbances.copy_from(before._disturbances)
-        if self._disturbances.entries and self.loads is None:
-            self._begin_loads()
         self.apply_active_faults()
         self._apply_active_disturbances()
 
@@ -305,11 +299,6 @@ class PlantWithFaults(WrappedPlant):
             self._apply_nozzle_faults(self.thrusters, active)
         self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
 
-    def _begin_loads(self) -> None:
-        self.loads = PlantLoads(self.robot, self._surroundings)
-        self.plant.load(self.loads)
-        self.step = self._loaded_step
-
     def _loaded_step(self, *commands: Any) -> bool:
         assert self.loads is not None
         if self.tick >= self._next_disturbance:
@@ -322,7 +311,12 @@ class PlantWithFaults(WrappedPlant):
         return limited
 
     def _apply_active_disturbances(self) -> None:
-        timeline, loads = self._disturbances, self.loads
+        timeline = self._disturbances
+        if self.loads is None and (timeline.entries or self._surroundings.has_loads):
+            self.loads = PlantLoads(self.robot, self._surroundings)
+            self.plant.load(self.loads)
+            self.step = self._loaded_step
+        loads = self.loads
         active = timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
         self._next_disturbance = timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
         if active is self.disturbances or loads is None:
@@ -446,7 +440,16 @@ def build_plant(
         step = step or mujoco_plant.DEFAULT_INTEGRATION_STEP
         plant = mujoco_plant.build_mujoco_plant(robot, config, start, step, description)
     else:
-        plant = _own_engine_plant(robot, config, start, step or kind.integration_step, description)
+        step = step or kind.integration_step
+
+        def dynamics(of: SpaceRobot, at: InitialState) -> Plant:
+            return kind.plant(of, control_period, at, step)
+
+        if description is None:
+            plant = dynamics(robot, start)
+        else:
+            target = Target(description, config.target, control_period, step, robot)
+            plant = CapturePlant(dynamics, robot, start, target, config)
     if config.thrusters:
         table = find_thrusters(config.thrusters, robot.description)
         plant = ThrusterPlant(plant, control_period, table, config.thrusters_excluded.split())
@@ -459,21 +462,3 @@ def build_plant(
         disturbances=config.disturbances,
         surroundings=surroundings,
     )
-
-
-def _own_engine_plant(
-    robot: SpaceRobot,
-    config: PlantConfig,
-    start: InitialState,
-    step: float,
-    description: RobotDescription | None,
-) -> Plant:
-    kind, control_period = PLANTS[config.actuation], config.control_period
-
-    def dynamics(of: SpaceRobot, at: InitialState) -> Plant:
-        return kind.plant(of, control_period, at, step)
-
-    if description is None:
-        return dynamics(robot, start)
-    target = Target(description, config.target, control_period, step, robot)
-    return CapturePlant(dynamics, robot, start, target, config)

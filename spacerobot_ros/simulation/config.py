@@ -343,11 +343,6 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         return period_ns(self.tick_rate)
 
     @property
-    def clearance_ticks(self) -> int:
-        """Ticks between clearance measurements in lockstep; 0: none."""
-        return self.ticks_of(self.clearance_period)
-
-    @property
     def contact_ticks(self) -> int:
         """Ticks between contact checks; 0: no checks."""
         return self.ticks_of(min(self.clearance_period, _CONTACT_PERIOD))

@@ -416,16 +416,11 @@ def tick_function(
     realised = ca.vertcat(effort, command[n:])
     march = repeat_step(_step_counting_stops(robot, model, loaded=loaded), substeps)
     p, touching = list(model.inputs.values()), _count_touching_joints(robot, state)
-    loads: list[ca.MX] = []
-    if loaded:
-        layout = LoadLayout(len(robot.link_names))
-        loads = [ca.MX.sym("loads", layout.size)]
-        x = ca.vertcat(state, loads[0][layout.time], touching)
-        marched = march(x, ca.vertcat(realised, *loads), h / substeps, *p)
-        next_state = marched[:-2]
-    else:
-        marched = march(ca.vertcat(state, touching), realised, h / substeps, *p)
-        next_state = marched[:-1]
+    layout = LoadLayout(len(robot.link_names))
+    loads = [ca.MX.sym("loads", layout.size)] if loaded else []
+    x = ca.vertcat(state, *(each[layout.time] for each in loads), touching)
+    marched = march(x, ca.vertcat(realised, *loads), h / substeps, *p)
+    next_state = marched[: parts[-1].stop]
 
     q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
     v, omega = model("base_twist", quaternion, q, qdot, p_W, L_W)

@@ -157,7 +157,7 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
     if kind.value:
         if not rest or rest[0] in ("at", "until"):
             raise refusal(f"{name} needs a value: {kind.value}")
-        value = parse_number(rest.pop(0), refusal)
+        value = _parse_number(rest.pop(0), refusal)
         if not kind.minimum <= value <= kind.maximum:
             raise refusal(
                 f"its value is {value:g} but must be from {kind.minimum:g} to {kind.maximum:g}"
@@ -258,7 +258,7 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
         name, components = rest[0], rest[1:4]
         if len(components) < 3:
             raise refusal(_LINE_FORMAT)
-        x, y, z = (parse_number(text, refusal) for text in components)
+        x, y, z = (_parse_number(text, refusal) for text in components)
         if max(abs(x), abs(y), abs(z)) > _MAX_COMPONENT:
             raise refusal(f"components of its {name} must be at most {_MAX_COMPONENT:g}")
         vectors[name], given, rest = (x, y, z), [*given, name], rest[4:]
@@ -305,14 +305,7 @@ def line_refusal(line: str, noun: str) -> Refusal:
     return lambda reason: ParameterError(f"The {noun} '{line.strip()[:80]}' is refused: {reason}.")
 
 
-def parse_number(text: str, refusal: Refusal) -> float:
-    """Parse a finite number in a line.
-
-    Raises
-    ------
-    ParameterError
-        The string is not a finite number.
-    """
+def _parse_number(text: str, refusal: Refusal) -> float:
     try:
         number = float(text)
     except ValueError:
@@ -347,7 +340,7 @@ def parse_times(
     if words[0::2] not in ([], ["at"], ["until"], ["at", "until"]) or len(words) % 2:
         raise refusal(f"only 'at SECONDS' and 'until SECONDS' may follow {before}")
     for word, text in zip(words[0::2], words[1::2], strict=True):
-        times[word] = parse_number(text, refusal)
+        times[word] = _parse_number(text, refusal)
         if abs(times[word]) > MAX_TIME:
             raise refusal(f"its time is {times[word]:g} s but must be at most {MAX_TIME:g} s")
     if not times["until"] > times["at"]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
@@ -40,35 +38,6 @@ class Lockstep:
         return (self.waits and pose_lost) or self._commands.complete
 
 
-@dataclass(frozen=True)
-class TimingStatistics:
-    """Deadline statistics of a real-time plant and its commander.
-
-    Attributes
-    ----------
-    tick_rate
-        Ticks per second of wall time since the last report.
-    ticks, ticks_late, worst_tick
-        Number of ticks; number taken after the next tick was due; largest delay, s.
-    commands, commands_late, worst_command
-        Number of commanded states; number commanded after the next tick was due; largest delay, s.
-    command_age
-        Age of the state that the command in force is for, simulated s.
-    worse
-        Whether there have been delays since the last report.
-    """
-
-    tick_rate: float
-    ticks: int
-    ticks_late: int
-    worst_tick: float
-    commands: int
-    commands_late: int
-    worst_command: float
-    command_age: float
-    worse: bool
-
-
 class RealTime:
     """Schedules ticks by the wall clock, and counts late ticks and commands.
 
@@ -88,8 +57,12 @@ class RealTime:
         self._origin = 0.0
         self.ticks_lost = 0
         """Number of late ticks that the plant never takes."""
-        self._ticks = self._ticks_late = self._answers = self._answers_late = 0
-        self._worst_tick = self._worst_answer = 0.0
+        self.ticks = self.ticks_late = 0
+        """Number of ticks, and of those taken after the next was due."""
+        self.commands = self.commands_late = 0
+        """Number of commanded states, and of those commanded after the next tick was due."""
+        self.worst_tick = self.worst_command = 0.0
+        """Largest delay of a tick and of a command, s."""
         self._reported = 0, 0
         self._ticks_reported, self._reported_at, self._now = 0, 0, 0
         self._state_ns, self._answered_ns = 0, 0.0
@@ -113,39 +86,36 @@ class RealTime:
 
     def count_tick(self, now_ns: int, tick: int) -> None:
         """Count the tick after ``tick``, which is taken now."""
-        self._ticks += 1
+        self.ticks += 1
         self._now, self._state_ns = now_ns, tick * self._period
         late = now_ns - (self._origin + (tick + 2) * self._pace)
         if late > 0:
-            self._ticks_late += 1
-            self._worst_tick = max(self._worst_tick, late)
+            self.ticks_late += 1
+            self.worst_tick = max(self.worst_tick, late / SECOND)
 
     def count_command(self, now_ns: int, stamp_ns: float) -> None:
         """Count a command in force for the state with a given stamp (simulated time)."""
         if stamp_ns <= self._answered_ns:
             return  # A refused command leaves the command in force unchanged.
         self._answered_ns = stamp_ns
-        self._answers += 1
+        self.commands += 1
         late = now_ns - (self._origin + (stamp_ns / self._period + 1) * self._pace)
         if late > 0:
-            self._answers_late += 1
-            self._worst_answer = max(self._worst_answer, late)
+            self.commands_late += 1
+            self.worst_command = max(self.worst_command, late / SECOND)
 
-    def report(self) -> TimingStatistics:
-        """Return the statistics, and the tick rate since the last call."""
-        late = self._ticks_late, self._answers_late
+    @property
+    def command_age(self) -> float:
+        """Age of the state of the command in force, simulated s."""
+        return (self._state_ns - self._answered_ns) / SECOND
+
+    def report(self) -> tuple[float, bool]:
+        """Return the ticks per second of wall time since the last call, and whether there are more
+        delays than then.
+        """
+        late = self.ticks_late, self.commands_late
         worse, self._reported = late != self._reported, late
         elapsed = (self._now - self._reported_at) / SECOND
-        rate = (self._ticks - self._ticks_reported) / elapsed if elapsed > 0 else 0.0
-        self._ticks_reported, self._reported_at = self._ticks, self._now
-        return TimingStatistics(
-            tick_rate=rate,
-            ticks=self._ticks,
-            ticks_late=self._ticks_late,
-            worst_tick=self._worst_tick / SECOND,
-            commands=self._answers,
-            commands_late=self._answers_late,
-            worst_command=self._worst_answer / SECOND,
-            command_age=(self._state_ns - self._answered_ns) / SECOND,
-            worse=worse,
-        )
+        rate = (self.ticks - self._ticks_reported) / elapsed if elapsed > 0 else 0.0
+        self._ticks_reported, self._reported_at = self.ticks, self._now
+        return rate, worse

@@ -222,8 +222,6 @@ def test_a_seed_is_a_robot_and_no_error_is_the_true_one() -> None:
     ]
     assert masses[0] == masses[1] != masses[2]
     assert masses[3] == [body.inertia.mass for body in true.bodies]
-    with pytest.raises(ValueError, match=r"error of 1\.0"):
-        true.with_model_error(1.0, 0)
 
 
 @pytest.mark.parametrize("seed", range(4))

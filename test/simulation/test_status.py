@@ -256,25 +256,24 @@ def test_reports_count_ticks_and_answers_since_the_start_and_the_rate_since_the_
     for tick in range(5):
         # After tick k its successor is due at 10 (k + 1) ms, and late from 10 (k + 2) ms on.
         time.count_tick((10 * (tick + 1) + (12 if tick == 3 else 0)) * MS, tick)
-    first = time.report()
-    assert first.tick_rate == pytest.approx(5 / 0.05)
-    assert (first.ticks, first.ticks_late) == (5, 1)
-    assert first.worst_tick == pytest.approx(0.002)
-    assert first.worse
+    tick_rate, worse = time.report()
+    assert tick_rate == pytest.approx(5 / 0.05)
+    assert (time.ticks, time.ticks_late) == (5, 1)
+    assert time.worst_tick == pytest.approx(0.002)
+    assert worse
     time.count_command(45 * MS, 40 * MS)
     time.count_command(46 * MS, 40 * MS)
     time.count_command(66 * MS, 50 * MS)
     for tick in range(5, 9):
         time.count_tick((50 + 20 * (tick - 4)) * MS, tick)
-    second = time.report()
-    assert second.tick_rate == pytest.approx(4 / 0.08)
-    assert second.ticks == 9
-    assert (second.commands, second.commands_late) == (2, 1)
-    assert second.worst_command == pytest.approx(0.006)
-    assert second.command_age == pytest.approx(0.03)
-    assert second.worse
-    third = time.report()
-    assert (third.tick_rate, third.ticks, third.worse) == (0.0, 9, False)
+    tick_rate, worse = time.report()
+    assert tick_rate == pytest.approx(4 / 0.08)
+    assert time.ticks == 9
+    assert (time.commands, time.commands_late) == (2, 1)
+    assert time.worst_command == pytest.approx(0.006)
+    assert time.command_age == pytest.approx(0.03)
+    assert worse
+    assert time.report() == (0.0, False)
 
 
 # -- plants from their configuration: which steps are refused, and what the steps do -------------
