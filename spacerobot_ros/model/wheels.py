@@ -74,14 +74,14 @@ class ReactionWheels:
         names = description.wheel_names
         joints = list(description.joint_names)
         index = np.array([joints.index(name) for name in names], dtype=np.int64)
-        bodies = [_body_of(description, name) for name in names]
+        wheels = [_wheel_of(description, name) for name in names]
         return cls(
             description,
             names,
             index,
             np.setdiff1d(np.arange(len(joints)), index),
-            np.array([_axis_B(body) for body in bodies]).reshape(-1, 3).T,
-            np.array([_spin_inertia(body) for body in bodies]),
+            np.array([body.origin.R @ axis for body, axis in wheels]).reshape(-1, 3).T,
+            np.array([_spin_inertia(*wheel) for wheel in wheels]),
             description.limits("velocity")[index],
             description.limits("effort")[index],
         )
@@ -160,9 +160,8 @@ class ReactionWheels:
         """
         links = {link.name: link for link in self.description.links}
         for name, moment in zip(self.names, self.inertia, strict=True):
-            body = _body_of(self.description, name)
-            assert body.joint is not None
-            link, axis = links[body.name], body.joint.axis
+            body, axis = _wheel_of(self.description, name)
+            link = links[body.name]
             about = link.inertia.about_com - moment * np.outer(axis, axis)
             links[body.name] = replace(link, inertia=replace(link.inertia, about_com=about))
         return self.description.with_links(tuple(links.values())).with_locked(
@@ -202,22 +201,21 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
                 '<limit velocity="..." effort="..."/> in rad/s and N m'
             )
         else:
-            flaw = _imbalance_clause(body)
+            flaw = _imbalance_clause(body, joint.axis)
         if flaw:
             raise RobotDescriptionError(f"The wheel '{joint.name}' {flaw}.")
 
 
-def _imbalance_clause(body: Body) -> str:
+def _imbalance_clause(body: Body, axis: Array) -> str:
     """Return a clause on a wheel that is no body of revolution; empty: it is one."""
-    assert body.joint is not None
-    axis, inertia = body.joint.axis, body.inertia
+    inertia = body.inertia
     offset = float(np.linalg.norm(np.cross(axis, inertia.com)))
     if offset > _MAX_OFFSET:
         return (
             f"is not balanced: its centre of mass is {offset:.3g} m off its axis; "
             "move the origin of its <inertial>"
         )
-    spin = _spin_inertia(body)
+    spin = _spin_inertia(body, axis)
     across = (float(np.trace(inertia.about_com)) - spin) / 2
     symmetric = across * np.eye(3) + (spin - across) * np.outer(axis, axis)
     if np.abs(inertia.about_com - symmetric).max() > _MAX_ASYMMETRY * max(spin, across):
@@ -228,15 +226,10 @@ def _imbalance_clause(body: Body) -> str:
     return ""
 
 
-def _body_of(robot: RobotDescription, joint: str) -> Body:
-    return next(b for b in robot.bodies if b.joint is not None and b.joint.name == joint)
+def _wheel_of(robot: RobotDescription, joint: str) -> tuple[Body, Array]:
+    """Return a wheel and its axis (3,) in its frame."""
+    return next((b, b.joint.axis) for b in robot.bodies if b.joint and b.joint.name == joint)
 
 
-def _axis_B(body: Body) -> Array:
-    assert body.joint is not None
-    return np.asarray(body.origin.R @ body.joint.axis)
-
-
-def _spin_inertia(body: Body) -> float:
-    assert body.joint is not None
-    return float(body.joint.axis @ body.inertia.about_com @ body.joint.axis)
+def _spin_inertia(body: Body, axis: Array) -> float:
+    return float(axis @ body.inertia.about_com @ axis)

@@ -315,12 +315,10 @@ class EffortPlant:
 
     @property
     def state(self) -> Array:
-        """The current state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body`."""
+        """The state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body` from which the
+        next step starts; it may be changed.
+        """
         return self._next_state
-
-    def place(self, state: Array) -> None:
-        """Set the state (2 n + 13,) from which the next step starts."""
-        self._next_state[:] = state
 
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all others.
