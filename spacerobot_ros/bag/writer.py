@@ -15,7 +15,7 @@ from spacerobot_ros.messages.definitions import message_definition, type_hash
 
 
 def free_name(path: Path) -> Path:
-    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... that does not exist."""
+    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... that does not exist yet."""
     number = 0
     while True:
         name = path.with_name(f"{path.stem}-{number}{path.suffix}") if number else path

@@ -113,7 +113,7 @@ class PlantDiagnostics:
         self._unmet_reported = 0
 
     def observe(self, commands: CommandValidator, plant: PlantWithFaults) -> None:
-        """Report on these from now on."""
+        """Set the objects to report on."""
         self._commands, self._plant = commands, plant
 
     def note_refusal(self, source: CommandSource, refusal: Refusal) -> str:
@@ -241,7 +241,8 @@ class PlantDiagnostics:
         )
 
     def _of_thrusters(self, thrusters: ThrusterPlant) -> StatusRecord:
-        """Return propellant, pulses and unmet wrenches; a warning for new unmet wrenches."""
+        """Return propellant, pulses and unmet wrenches; a warning if there are new unmet
+        wrenches."""
         modulator = thrusters.modulator
         unmet = modulator.unmet_periods > self._unmet_reported
         self._unmet_reported = modulator.unmet_periods
@@ -268,7 +269,7 @@ class PlantDiagnostics:
 
 
 def timing_record(node: str, robot: str, real_time: RealTime) -> StatusRecord:
-    """Return the delays of a plant's ticks and of its commander's commands."""
+    """Return the delays of plant ticks and of the commander's commands."""
     tick_rate, worse = real_time.report()
     return _record(
         diagnostic_name(node, "timing"),

@@ -111,7 +111,7 @@ class Composites:
     """Composite rigid bodies outboard of each joint, base components; see the module for symbols.
 
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
-    the motion at unit rate of the joint that carries body j, ``P[j]`` (6,) the momentum of its
+    the unit-rate motion of the joint that carries body j, ``P[j]`` (6,) the momentum of its
     composite (both zero for the base); ``D`` (3, 3) is the locked inertia about the system's centre
     of mass, kg m^2 (paper 4, eq. 16a).
     ``composite[k]`` is the inertia of body k and of all bodies that it carries.

@@ -55,10 +55,10 @@ class ThrusterPlant(WrappedPlant):
         (6,) mean force (N) over torque (N m) of the thrusters in the last tick, at the base link
         origin, in base components.
     ``on_time``, ``duty``, ``thrust``
-        (m,) total on-time of each thruster (s), its duty cycle in the last tick, and its mean force
-        in the last tick (N).
+        (m,) total on-time of each thruster (s), and its duty cycle and mean force (N) in the last
+        tick.
     ``propellant``
-        Total consumption, kg. It does not change the mass of the robot.
+        Total consumption, kg. It does not change the robot mass.
     ``modulator``
         The flight software that opens and closes the thrusters, and counts pulses and unmet
         wrenches.

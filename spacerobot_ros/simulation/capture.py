@@ -91,9 +91,9 @@ class Target:
     inertia
         Its mass properties in its root link frame T.
     grapple
-        Pose of the grapple frame in T.
+        Grapple frame pose in T.
     initial
-        Its motion at the beginning.
+        Its initial motion.
     """
 
     def __init__(
@@ -458,7 +458,7 @@ class CapturePlant(WrappedPlant):
     # -- captures -----------------------------------------------------------------------------
 
     def approach(self) -> RelativeMotion:
-        """Return the present motion of the grapple frame relative to the end-effector."""
+        """Return the current grapple frame motion relative to the end-effector."""
         end_effector = frame_motion(self.robot, self.link, self._motion())
         return RelativeMotion.between(end_effector, self._body().at(self.target.grapple))
 

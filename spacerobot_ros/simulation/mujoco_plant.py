@@ -204,7 +204,7 @@ class MujocoPlant:
             self._update()
 
     def hold(self, joints: Flags) -> None:
-        """Lock the marked joints (n,) at their positions, and release all other joints."""
+        """Lock the marked joints (n,) at their positions, and release all others."""
         locked = self._held & (self._data.eq_active[self._locks] != 0)
         for joint in np.flatnonzero(joints & ~locked):
             self._model.eq_data[self._locks[joint], 0] = self._data.qpos[self._q[joint]]

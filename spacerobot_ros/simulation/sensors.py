@@ -270,7 +270,7 @@ class ReportedState:
         ]
 
     def names(self, topic: Topic) -> tuple[str, ...]:
-        """Return the names of the entries of a topic's arrays: joints or thrusters."""
+        """Return the entry names of a topic's arrays: joints or thrusters."""
         if topic.array_entries_of == "thrusters" and self._plant.thrusters is not None:
             return tuple(self._plant.thrusters.table.names)
         return tuple(self._plant.robot.joint_names)

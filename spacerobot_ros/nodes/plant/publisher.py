@@ -57,7 +57,8 @@ class PlantReport:
         self._node, name = node, node.get_fully_qualified_name()
         self._diagnostics = PlantDiagnostics(name, node.plant, node.commands, real_time)
         self._stream = node.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
-        missing = "" if plant.thrusters is None else plant.thrusters.modulator.missing
+        thrusters = node.plant.thrusters
+        missing = "" if thrusters is None else thrusters.modulator.missing
         if missing:
             node.get_logger().warning(f"The thrusters cannot produce {missing}.")
 
@@ -271,8 +272,7 @@ class ClearancePublisher:
 
     def __init__(
         self,
-        node: FlightNode,
-        plant: PlantWithFaults,
+        node: PlantNode,
         monitor: ClearanceMonitor,
         stream: Publisher | None = None,
     ) -> None:
@@ -283,8 +283,7 @@ class ClearancePublisher:
     @classmethod
     def of(
         cls,
-        node: FlightNode,
-        plant: PlantWithFaults,
+        node: PlantNode,
         described: RobotDescription,
         before: ClearancePublisher | None = None,
         *,
@@ -302,16 +301,12 @@ class ClearancePublisher:
             described,
             tuple(node.plant.robot.link_names),
             None if before is None else before._monitor,
-            capturing=plant.capturing,
+            capturing=node.plant.capturing,
             has_contact_forces=has_contact_forces,
         )
         if monitor is None:
             return None
-        return cls(node, plant, monitor, None if before is None else before._stream)
-
-    def observe(self, plant: PlantWithFaults) -> None:
-        """Measure another plant of the same robot from now on."""
-        self._plant = plant
+        return cls(node, monitor, None if before is None else before._stream)
 
     def look(self, time_ns: int, *, publishes: bool) -> tuple[str, ...] | None:
         """Report contacts that have begun or ended; return the current ones, or None if unchanged.
