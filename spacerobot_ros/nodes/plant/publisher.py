@@ -26,7 +26,6 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.nodes.common.messages import message_class, transform_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
-from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.commands import (
     NO_STAMP,
     CommandSource,
