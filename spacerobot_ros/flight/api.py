@@ -264,19 +264,14 @@ def _with_goals(
     rotvec: npt.ArrayLike | None,
     hands: Sequence[EndEffectorGoal],
 ) -> Scenario:
-    scenario = _with_goal(scenario, goal, position, rotvec)
+    if any(each is not None for each in (goal, position, rotvec)):
+        scenario = scenario.with_other_goal(_changed_goal(scenario.goal, goal, position, rotvec))
     if not hands:
         return scenario
     asked: set[Controlled] = set() if goal is None else set(POSE)
     asked |= set() if position is None else {"position"}
     asked |= set() if rotvec is None else {"attitude"}
     return scenario.with_end_effectors(hands, frozenset(asked))
-
-
-def _with_goal(scenario: Scenario, *given: Any) -> Scenario:
-    if all(each is None for each in given):
-        return scenario
-    return scenario.with_other_goal(_changed_goal(scenario.goal, *given))
 
 
 def _changed_goal(

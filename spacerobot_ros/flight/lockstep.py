@@ -66,7 +66,6 @@ Progress = Callable[[float, float], bool]
 to end the flight."""
 
 _PROGRESS_PERIOD = 0.2  # wall s
-_TICKS_PER_CLOCK_READ = 64
 
 
 @dataclass(frozen=True)
@@ -334,12 +333,11 @@ class LockstepFlight:
                 return ""
             if self.time >= longest:
                 return self._interruption
-            if (
-                self._tick % _TICKS_PER_CLOCK_READ == 0
-                and time.perf_counter() - reported_at >= _PROGRESS_PERIOD
-            ):
+            if time.perf_counter() - reported_at >= _PROGRESS_PERIOD:
                 reported_at = time.perf_counter()
-                if progress(self.time, self._expected_end):
+                status = self._status
+                end = status.ends_at_s if isinstance(status, PlannerStatus) else 0.0
+                if progress(self.time, end):
                     return self._interruption
 
     @property
@@ -359,10 +357,6 @@ class LockstepFlight:
     def time(self) -> float:
         """Simulated time, s."""
         return self._now_ns / SECOND
-
-    @property
-    def _expected_end(self) -> float:
-        return self._status.ends_at_s if isinstance(self._status, PlannerStatus) else 0.0
 
     def _report_state(self) -> None:
         self._reported.update()

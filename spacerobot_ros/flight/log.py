@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from array import array
-
 import numpy as np
 
 from spacerobot_ros.commanding.goal_follower import Status
@@ -22,8 +20,6 @@ from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND
-
-_INITIAL_ROW_COUNT = 1024
 
 
 class FlightLog:
@@ -66,13 +62,13 @@ class FlightLog:
         if self._thrusters is not None:
             sources["propellant"] = self._propellant
         self._sources, self._parts = sources, tuple(sources.values())
-        self._states = _GrowingTable(sum(source.size for source in self._parts))
-        """All quantities of a state side by side."""
-        self._commands = {
-            source.topic: (array("q"), _GrowingTable(len(source.limits)))
-            for source in commands.sources
+        self._states: list[Array] = []
+        """All quantities of each state side by side."""
+        self._commands: dict[str, list[tuple[int, Array]]] = {
+            source.topic: [] for source in commands.sources
         }
-        self._setpoints: dict[str, _GrowingTable] = {}
+        self._sizes = {source.topic: len(source.limits) for source in commands.sources}
+        self._setpoints: dict[str, list[Array]] = {}
         self._plant = plant
         self._faults_seen: object = None
         self._ticks_without_pose: list[int] = []
@@ -83,7 +79,7 @@ class FlightLog:
         """Add the present state."""
         if self._thrusters is not None:
             self._propellant[0] = self._thrusters.propellant
-        np.concatenate(self._parts, out=self._states.next_row())
+        self._states.append(np.concatenate(self._parts))
         sensors = self._reported.sensors
         if sensors.used and self._plant.active is not self._faults_seen:
             self._faults_seen = self._plant.active
@@ -97,16 +93,11 @@ class FlightLog:
     def add_command(
         self, topic: str, tick: int, values: Array, setpoint: tuple[Array, Array] | None = None
     ) -> None:
-        """Add a command; planner commands include the setpoint, joint positions and rates."""
-        if topic not in self._commands:
-            self._commands[topic] = array("q"), _GrowingTable(len(values))
-        ticks, rows = self._commands[topic]
-        ticks.append(tick)
-        rows.next_row()[:] = values
+        """Add a command; commands of a planner include its setpoint, joint positions and rates."""
+        self._commands.setdefault(topic, []).append((tick, values.copy()))
+        self._sizes.setdefault(topic, len(values))
         if setpoint is not None:
-            if topic not in self._setpoints:
-                self._setpoints[topic] = _GrowingTable(2 * len(setpoint[0]))
-            np.concatenate(setpoint, out=self._setpoints[topic].next_row())
+            self._setpoints.setdefault(topic, []).append(np.concatenate(setpoint))
 
     def flight(
         self,
@@ -121,7 +112,7 @@ class FlightLog:
         wall_time: float,
     ) -> Flight:
         """Return the flight."""
-        table = self._states.table()
+        table = np.array(self._states)
         count, ends = len(table), np.cumsum([source.size for source in self._parts])
         columns = np.split(table, ends[:-1], axis=1)
         states = {name: each.copy() for name, each in zip(self._sources, columns, strict=True)}
@@ -139,11 +130,11 @@ class FlightLog:
             series={name: Signal(time, values) for name, values in states.items()},
             commands={
                 topic: Commands(
-                    np.array(ticks, np.int64),
-                    rows.table().copy(),
-                    self._setpoints[topic].table().copy() if topic in self._setpoints else None,
+                    np.array([tick for tick, _ in sent], np.int64),
+                    np.array([values for _, values in sent]).reshape(len(sent), self._sizes[topic]),
+                    np.array(self._setpoints[topic]) if topic in self._setpoints else None,
                 )
-                for topic, (ticks, rows) in self._commands.items()
+                for topic, sent in self._commands.items()
             },
             statuses=tuple(self.statuses),
             events=tuple(self.events),
@@ -163,20 +154,3 @@ class FlightLog:
             refusals=tuple(self.refusals),
             measures_clearance=scenario.plant.clearance_period > 0,
         )
-
-
-class _GrowingTable:
-    def __init__(self, size: int) -> None:
-        self._table = np.empty((_INITIAL_ROW_COUNT, size))
-        self._count = 0
-
-    def next_row(self) -> Array:
-        """Return a new row, to be filled by the caller."""
-        if self._count == len(self._table):
-            self._table = np.concatenate([self._table, np.empty_like(self._table)])
-        self._count += 1
-        return self._table[self._count - 1]
-
-    def table(self) -> Array:
-        """Return all rows so far, without copying."""
-        return self._table[: self._count]

@@ -41,7 +41,7 @@ from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
 from spacerobot_ros.simulation.capture import target_parameters
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, StateField, Topic, goal_topic, path_topic, topic_named
+from spacerobot_ros.topics import TOPICS, StateField, goal_topic, path_topic, topic_named
 
 _SAME_CLOCK_TOLERANCE = 1.0
 """If stamps differ by less from the log times, s, both come from the same clock."""
@@ -211,14 +211,11 @@ class FlightBag(RecordedRobot):
         for name in _QUANTITY_TOPICS:
             for field in TOPICS[name].state if name in self else ():
                 found[field.quantity] = self.quantity(name, field)
-        for topic in self._poses_of_end_effectors():
-            found[topic.state[0].quantity] = self.quantity(topic.name, topic.state[0])
-        return found
-
-    def _poses_of_end_effectors(self) -> Iterator[Topic]:
         for name in self.topic_names():
             if name.endswith("/pose") and name in self:
-                yield topic_named(name)
+                field = topic_named(name).state[0]
+                found[field.quantity] = self.quantity(name, field)
+        return found
 
     def _times(self, series: TopicSeries) -> Array:
         return series.stamp if self.stamped else series.time
@@ -366,7 +363,10 @@ def read_flight(bag: FlightBag) -> Flight:
     if not names and description is not None:
         names = list(description.joint_names)
     scenario = _scenario_in_bag(bag)
-    statuses = {name: _read_statuses(bag, name) for name in COMMANDERS}
+    statuses = {
+        name: [(time, status) for time, status in bag.statuses(name) if not isinstance(status, str)]
+        for name in COMMANDERS
+    }
     decider = next((name for name in COMMANDERS if statuses[name]), COMMANDERS[0])
     goals = bag.goals("goal_pose")
     tool_goals = tuple(
@@ -477,10 +477,6 @@ def impulse(thrust: Signal, weights: Array) -> Signal:
     return Signal(thrust.time, total[:, np.newaxis])
 
 
-def _read_statuses(bag: FlightBag, commander: str) -> list[tuple[int, Status]]:
-    return [(time, s) for time, s in bag.statuses(commander) if not isinstance(s, str)]
-
-
 def _scenario_in_bag(bag: FlightBag) -> Scenario:
     about = bag.metadata.get("scenario", {})
     nodes: dict[str, dict[str, Any]] = {
@@ -539,14 +535,13 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     )
 
 
-def recorded_actuation(robot: RecordedRobot) -> str:
-    """Return the commanded quantity for a robot in a bag: ``velocity``, ``effort``, or
+def recorded_actuation(robot: FlightBag) -> str:
+    """Return the quantity in the commands of a robot in a bag: ``velocity``, ``effort``, or
     nothing.
 
     It is read from the plant's status. In bags without a plant status, wrenches imply efforts.
     """
-    series = robot.get("plant/status")
-    for _, message in reversed(list(series.messages() if series is not None else ())):
+    for _, message in reversed(list(robot.messages("plant/status"))):
         actuation = read_status(message).values.get("actuation", "")
         if actuation in ("velocity", "effort"):
             return actuation
@@ -564,10 +559,10 @@ def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any
     }
 
 
-def recorded_target(robot: RecordedRobot) -> str:
-    """Return the URDF of a robot's target in a bag; empty without a target."""
-    series = robot.get("target/robot_description")
-    return "" if series is None else str(next(series.messages())[1].data)
+def recorded_target(robot: FlightBag) -> str:
+    """Return the URDF text of a robot's target in a bag; empty: there is none."""
+    described = next(robot.messages("target/robot_description"), None)
+    return "" if described is None else str(described[1].data)
 
 
 def _parse_json(text: str) -> Any:

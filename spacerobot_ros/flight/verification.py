@@ -11,13 +11,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from spacerobot_ros.bag import Bag, RecordedRobot, read_bag
+from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
-from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.reading import namespaces, recorded_actuation, recorded_target
+from spacerobot_ros.events import EventKind
+from spacerobot_ros.flight.reading import (
+    FlightBag,
+    namespaces,
+    recorded_actuation,
+    recorded_target,
+)
 from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
 from spacerobot_ros.messages.readers import CommandReader, UnreadableError
-from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
@@ -37,8 +41,8 @@ TOLERANCE = 1e-9
 _MAX_TICKS_PER_STATE, _MAX_SILENT_TICKS = 10, 20_000
 """A paused recorder leaves a gap; stamps that do not belong to a flight leave a larger gap."""
 
-_TOPICS_COMPARED_FIRST = ("joint_states", "odom")
-"""Topics to compare first: their differences explain differences in other topics."""
+_COMPARED_FIRST = {"joint_states": 0, "odom": 1}
+"""Ranks of topics to compare first: their differences explain differences in other topics."""
 
 Floats = NDArray[np.float64]
 
@@ -142,8 +146,7 @@ def verify_bag(
             f" to {last * flight.config.period_ns} ns, and there are {states} of them: a flight "
             "has a state in every tick."
         )
-    initial = _initial_state(first, published, flight)
-    rates = _rates_at(first, published, flight)
+    initial, rates = _initial_state(first, published, flight)
     resimulation = _resimulate(flight, initial, rates, first, last, mujoco=mujoco)
     if flight.config.actuation == "velocity" and not _has_efforts(published):
         # An earlier version, which did not compute the efforts of servos, published zeros.
@@ -174,7 +177,7 @@ class _RecordedPlant:
     (false).
     """
 
-    recorded: RecordedRobot
+    recorded: FlightBag
     config: PlantConfig
     robot: SpaceRobot
     injections: tuple[dict[int, list[str]], dict[int, list[str]]]
@@ -225,28 +228,21 @@ class _RecordedPlant:
 
     @property
     def path(self) -> Path:
-        return self.recorded.bag.path
+        return self.recorded.path
 
 
-def _injections(recorded: RecordedRobot, topic: str, period_ns: int) -> dict[int, list[str]]:
+def _injections(recorded: FlightBag, topic: str, period_ns: int) -> dict[int, list[str]]:
     """Return the texts on a topic by tick: without a stamp, that of their log time."""
     by_tick: dict[int, list[str]] = {}
-    series = recorded.get(topic)
-    for time_ns, message in series.messages() if series is not None else ():
+    for time_ns, message in recorded.messages(topic):
         by_tick.setdefault(time_ns // period_ns, []).append(message.data)
     return by_tick
 
 
-def _requested_grasps(recorded: RecordedRobot, config: PlantConfig) -> dict[int, list[bool]]:
+def _requested_grasps(recorded: FlightBag, config: PlantConfig) -> dict[int, list[bool]]:
     """Return the captures (true) and releases (false) that were requested in each tick."""
     grasps: dict[int, list[bool]] = {}
-    series = recorded.get("events")
-    for _, message in series.messages() if series is not None else ():
-        record = read_status(message)
-        try:
-            event = Event.from_values(record.values)
-        except SpaceRobotError:
-            continue  # Of a later version.
+    for _, _, event in recorded.events():
         captured = event.kind is EventKind.CAPTURED
         if event.time_s is None or not (captured or event.kind is EventKind.RELEASED):
             continue
@@ -257,8 +253,8 @@ def _requested_grasps(recorded: RecordedRobot, config: PlantConfig) -> dict[int,
     return grasps
 
 
-def _recorded_robot(bag: Bag) -> RecordedRobot:
-    candidates = [RecordedRobot(bag, name) for name in namespaces(bag)]
+def _recorded_robot(bag: Bag) -> FlightBag:
+    candidates = [FlightBag(bag, name) for name in namespaces(bag)]
     found = [each for each in candidates if each.get("odom") and each.get("joint_states")]
     if len(found) != 1:
         names = ", ".join(each.namespace for each in found)
@@ -270,7 +266,7 @@ def _recorded_robot(bag: Bag) -> RecordedRobot:
     return found[0]
 
 
-def _plant_config(recorded: RecordedRobot) -> PlantConfig:
+def _plant_config(recorded: FlightBag) -> PlantConfig:
     bag, texts = recorded.bag, recorded.metadata.get("parameters/plant")
     if texts is None:
         raise RecordingError(
@@ -342,7 +338,8 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
     recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
     published: list[_PublishedTopic] = []
     clock = recorded["odom"].stamp_ns
-    for topic in sorted(state_topics(flight.config.end_effectors), key=_comparison_rank):
+    topics = state_topics(flight.config.end_effectors)
+    for topic in sorted(topics, key=lambda topic: _COMPARED_FIRST.get(topic.name, 2)):
         series = recorded.get(topic.name)
         if series is None:
             continue
@@ -396,20 +393,15 @@ def _parse_count(text: str | None) -> int:
     return int(text) if text is not None and text.isdecimal() else 0
 
 
-def _comparison_rank(topic: Topic) -> int:
-    return (
-        _TOPICS_COMPARED_FIRST.index(topic.name)
-        if topic.name in _TOPICS_COMPARED_FIRST
-        else len(_TOPICS_COMPARED_FIRST)
-    )
-
-
 def _initial_state(
     first: int, published: list[_PublishedTopic], flight: _RecordedPlant
-) -> InitialState | None:
-    """Return the first state in the bag; None, for the parameters, if it is the very first."""
+) -> tuple[InitialState | None, Floats]:
+    """Return the first state in the bag, and its joint velocities (n,).
+
+    If it is the very first, the state is None, for the parameters, and the velocities are zero.
+    """
     if first == 0:
-        return None
+        return None, np.zeros(flight.robot.n)
     parts = {p.topic.name: p.values[p.ticks == first] for p in published}
     needed = ("odom", "joint_states", "momentum")
     if not all(len(parts.get(name, ())) for name in needed):
@@ -418,7 +410,7 @@ def _initial_state(
             f"joint_states or momentum."
         )
     n, joints = flight.robot.n, parts["joint_states"][0]
-    return InitialState(
+    state = InitialState(
         position=parts["odom"][0][:3],
         quaternion=parts["odom"][0][3:7],
         joint_positions=np.clip(joints[:n], flight.robot.lower, flight.robot.upper),
@@ -426,15 +418,7 @@ def _initial_state(
         linear_momentum=parts["momentum"][0][:3],
         angular_momentum=parts["momentum"][0][3:6],
     )
-
-
-def _rates_at(first: int, published: list[_PublishedTopic], flight: _RecordedPlant) -> Floats:
-    """Return the joint velocities (n,) in the first state in the bag; zero in the very first."""
-    n = flight.robot.n
-    if first == 0:
-        return np.zeros(n)
-    joints = next(p for p in published if p.topic.name == "joint_states")
-    return joints.values[joints.ticks == first][0, n : 2 * n]
+    return state, joints[n : 2 * n]
 
 
 def _has_efforts(published: list[_PublishedTopic]) -> bool:
