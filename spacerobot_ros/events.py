@@ -233,10 +233,6 @@ class EventKind(str, Enum):
     """A node has died and is restarted by the command that started it."""
 
 
-CONTACTS = frozenset({EventKind.CONTACT, EventKind.CONTACT_ENDED})
-"""Kinds of events about contacts between links."""
-
-
 @dataclass(frozen=True)
 class Event:
     """One change in a node's state.

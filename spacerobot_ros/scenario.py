@@ -557,7 +557,8 @@ def load_scenario(name: str) -> Scenario:
     values = section.get("ros__parameters") if isinstance(section, dict) else None
     in_file = _sections(content, path)
     commanders = tuple(name for name in COMMANDERS if name in in_file) or COMMANDERS[:1]
-    if "scenario" not in content and _names_robot(in_file.get("plant", {})):
+    plant = in_file.get("plant", {})
+    if "scenario" not in content and (plant.get("robot") or plant.get("robot_description")):
         return replace(
             _scenario_without_goal(path.stem, path.resolve(), in_file), commanders=commanders
         )
@@ -587,10 +588,6 @@ def load_scenario(name: str) -> Scenario:
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
     )._with_goal_topics()
-
-
-def _names_robot(plant: Mapping[str, Any]) -> bool:
-    return bool(plant.get("robot") or plant.get("robot_description"))
 
 
 def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:

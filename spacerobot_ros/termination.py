@@ -230,15 +230,11 @@ def start_child(
     """
     import subprocess
 
-    variables = _child_environment(environment)
+    given = os.environ if environment is None else environment
+    variables = {**given, _PARENT_VARIABLE: f"{os.getpid()}"}
     return subprocess.Popen(
         [sys.executable, *words], env=variables, start_new_session=True, **options
     )
-
-
-def _child_environment(environment: Mapping[str, str] | None = None) -> dict[str, str]:
-    variables = os.environ if environment is None else environment
-    return {**variables, _PARENT_VARIABLE: f"{os.getpid()}"}
 
 
 def end_with_parent() -> None:

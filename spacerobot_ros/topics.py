@@ -500,15 +500,12 @@ def topic_named(name: str) -> Topic:
     KeyError
         There is no such topic.
     """
-    if name not in TOPICS and name.endswith("/goal_pose"):
-        return replace(TOPICS[goal_topic("end_effector")], name=name)
-    if name not in TOPICS and name.endswith("/twist"):
-        return replace(TOPICS[twist_topic("end_effector")], name=name)
-    if name not in TOPICS and name.endswith("/path"):
-        return replace(TOPICS[path_topic("end_effector")], name=name)
-    if name not in TOPICS and name.endswith("/pose"):
-        return pose_topic(name.removesuffix("/pose"))
-    return TOPICS[name]
+    link, _, kind = name.rpartition("/")
+    if name in TOPICS or not link:
+        return TOPICS[name]
+    if kind == "pose":
+        return pose_topic(link)
+    return replace(TOPICS[f"end_effector/{kind}"], name=name)
 
 
 def state_topics(end_effectors: Iterable[str] = ()) -> list[Topic]:

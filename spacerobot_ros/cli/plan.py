@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning import Goal
 
 
-_NO_GOAL = GoalOptions(None, None, None)
-
-
 @click.command("plan", cls=GoalCommand)
 @click.argument("scenario", metavar="SCENARIO|ROBOT", shell_complete=complete_scenario)
 @end_effector_options
@@ -77,10 +74,22 @@ def plan_command(
     The gait is simulated. Exit code 0: the plan ends within tolerance; 1: it does not, or the goal
     cannot be reached; 2: bad input.
     """
-    from spacerobot_ros.flight.trials import PlanEvaluation, compare, fastest, try_method
+    from spacerobot_ros.flight.trials import (
+        PlanEvaluation,
+        PlanningProblem,
+        compare,
+        fastest,
+        try_method,
+    )
     from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
+    from spacerobot_ros.scenario import parse_setting, scenario_or_robot
 
-    problem = problem_of_scenario(scenario, goal, settings)
+    for text in settings:
+        node, _, _ = parse_setting(text)
+        if node not in ("plant", "planner"):
+            raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
+    chosen = goal.apply_to(scenario_or_robot(scenario).with_settings(settings))
+    problem = PlanningProblem.of(chosen)
     method = method or problem.config.method
     if count is not None:
         _plan_random_goals(problem, [method] if beside is None else [method, beside], count, within)
@@ -151,31 +160,6 @@ def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:
     reasons = Counter(geometry.ignored_pairs.values())
     listed = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
     return f"clearance   no link pairs are checked{listed and f' ({listed})'}"
-
-
-def problem_of_scenario(
-    name: str, goal: GoalOptions = _NO_GOAL, settings: Sequence[str] = ()
-) -> PlanningProblem:
-    """Return the planning problem for a scenario, or for a robot (a name or a URDF file) at rest.
-
-    ``goal`` replaces the scenario's, ``settings`` are ``planner.parameter=value`` and
-    ``plant.parameter=value``.
-
-    Raises
-    ------
-    ParameterError
-        There is no such scenario or robot, or a parameter is invalid.
-    GoalError
-        The goal is not finite.
-    """
-    from spacerobot_ros.flight.trials import PlanningProblem
-    from spacerobot_ros.scenario import parse_setting, scenario_or_robot
-
-    for text in settings:
-        node, _, _ = parse_setting(text)
-        if node not in ("plant", "planner"):
-            raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
-    return PlanningProblem.of(goal.apply_to(scenario_or_robot(name).with_settings(settings)))
 
 
 def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]:

@@ -65,16 +65,12 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
             f"The base '{robot.base_link}' is a point mass: give it an <inertia>, for a box of "
             "sides a, b, c ixx = m (b^2 + c^2) / 12 and so on."
         )
-    for remark in (
-        _immovable_joint_remark,
-        _unlimited_joint_remark,
-        _implausible_speed_remark,
-        _large_range_remark,
-        _missing_effort_remark,
-    ):
-        found = [text for joint in robot.movable_joints if (text := remark(joint))]
-        if found:
-            yield found[0] + _other_joints_clause(len(found) - 1)
+    found: dict[int, list[str]] = {}
+    for joint in robot.movable_joints:
+        for kind, remark in _joint_remarks(joint):
+            found.setdefault(kind, []).append(remark)
+    for _, remarks in sorted(found.items()):
+        yield remarks[0] + _other_joints_clause(len(remarks) - 1)
     for link in robot.links:
         # A body with such an inertia is refused; a welded link is not.
         if flaw := describe_inertia_flaw(link.inertia.about_com):
@@ -89,53 +85,40 @@ def _other_joints_clause(count: int) -> str:
     return f" The same holds for {count} other joint{'s' if count > 1 else ''}."
 
 
-def _immovable_joint_remark(joint: Joint) -> str:
-    if joint.limits.velocity != 0:
-        return ""
-    return (
-        f"The joint '{joint.name}' has the velocity limit 0, so it cannot move: give "
-        f'<limit velocity="..."/> in {joint.unit}/s.'
-    )
-
-
-def _unlimited_joint_remark(joint: Joint) -> str:
-    if not math.isinf(joint.limits.velocity):
-        return ""
-    return (
-        f"The joint '{joint.name}' has no velocity limit, which planning requires: give "
-        f'<limit velocity="..." effort="..."/> in {joint.unit}/s and '
-        f"{'N' if joint.unit == 'm' else 'N m'}."
-    )
-
-
-def _implausible_speed_remark(joint: Joint) -> str:
-    speed = joint.limits.velocity
-    if speed == 0 or math.isinf(speed) or _LEAST_USUAL_SPEED <= speed <= _LARGEST_USUAL_SPEED:
-        return ""
-    return (
-        f"The joint '{joint.name}' moves at up to {speed:.4g} {joint.unit}/s: check the unit of "
-        "its velocity limit."
-    )
-
-
-def _large_range_remark(joint: Joint) -> str:
-    limits = joint.limits
-    reach = max(-limits.lower, limits.upper)
-    if joint.unit != "rad" or math.isinf(reach) or reach <= _MAX_USUAL_LIMIT:
-        return ""
-    return (
-        f"The joint '{joint.name}' ranges from {limits.lower:.4g} to {limits.upper:.4g} rad: URDF "
-        f"limits are in rad, not in degrees."
-    )
-
-
-def _missing_effort_remark(joint: Joint) -> str:
-    if joint.limits.effort != 0:
-        return ""
-    return (
-        f"The joint '{joint.name}' has the effort limit 0: it responds to velocity commands, but "
-        'not to effort commands. Give <limit effort="..."/> in N or N m.'
-    )
+def _joint_remarks(joint: Joint) -> Iterator[tuple[int, str]]:
+    """Yield notes on the limits of a joint, each with a number for its kind."""
+    limits, unit, speed = joint.limits, joint.unit, joint.limits.velocity
+    if speed == 0:
+        yield (
+            0,
+            f"The joint '{joint.name}' has the velocity limit 0, so it cannot move: give "
+            f'<limit velocity="..."/> in {unit}/s.',
+        )
+    elif math.isinf(speed):
+        yield (
+            1,
+            f"The joint '{joint.name}' has no velocity limit, within which gaits are planned: give "
+            f'<limit velocity="..." effort="..."/> in {unit}/s and '
+            f"{'N' if unit == 'm' else 'N m'}.",
+        )
+    elif not _LEAST_USUAL_SPEED <= speed <= _LARGEST_USUAL_SPEED:
+        yield (
+            2,
+            f"The joint '{joint.name}' moves at up to {speed:.4g} {unit}/s: check the unit of "
+            "its velocity limit.",
+        )
+    if unit == "rad" and _MAX_USUAL_LIMIT < max(-limits.lower, limits.upper) < math.inf:
+        yield (
+            3,
+            f"The joint '{joint.name}' turns from {limits.lower:.4g} to {limits.upper:.4g} rad: "
+            "limits of a URDF are in rad, not in degrees.",
+        )
+    if limits.effort == 0:
+        yield (
+            4,
+            f"The joint '{joint.name}' has the effort limit 0: it moves under velocity commands, "
+            'but not under effort commands. Give <limit effort="..."/> in N or N m.',
+        )
 
 
 def _visual_remarks(robot: RobotDescription) -> Iterator[str]:

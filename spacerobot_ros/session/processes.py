@@ -81,14 +81,6 @@ _CONNECTION_CHECK_PERIOD = 0.05  # wall s
 _CHILD_MODULE = "spacerobot_ros.session.child"
 
 
-def namespace_arguments(namespace: str) -> list[str]:
-    """Return the ROS arguments that put a node, its clock and its frames into a namespace."""
-    if not namespace:
-        return []
-    moved = [word for topic in GLOBAL_TOPICS for word in ("-r", f"{topic}:={topic[1:]}")]
-    return ["-r", f"__ns:={namespace}", *moved]
-
-
 def checked_namespace(name: str) -> str:
     """Return a namespace in ROS form, with a leading slash; empty for none.
 
@@ -157,7 +149,8 @@ class MultiProcessStack:
             scenario.config(name)  # Invalid parameters are refused before any node runs.
         self._restarts, self._show = RestartLimit(restarts), show
         self._timeline = KillTimeline(scenario.kills)
-        self._time_ns = 0
+        self.time_ns = 0
+        """Simulated time that was last received, ns."""
         self._clock_seen = math.inf
         self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -195,7 +188,8 @@ class MultiProcessStack:
             name: node.create_client(Trigger, f"{name}/connections") for name in self.names
         }
         self._get_statistics = node.create_client(Trigger, "planner/statistics")
-        self._statistics = PlannerStatistics()
+        self.statistics = PlannerStatistics()
+        """The planner's statistics, once the flight is finished."""
         self.executor = EventsExecutor()
         self.executor.add_node(node)
         try:
@@ -248,16 +242,6 @@ class MultiProcessStack:
 
     def _read_log(self, name: str) -> str:
         return self._log_file_of(name).read_text("utf-8", errors="replace")
-
-    @property
-    def time_ns(self) -> int:
-        """Last received simulated time, ns."""
-        return self._time_ns
-
-    @property
-    def statistics(self) -> PlannerStatistics:
-        """The planner's statistics, once the flight is finished."""
-        return self._statistics
 
     def start(self, goal: Goal | None) -> None:
         """Activate all nodes and send the goal, if any; the plant starts last."""
@@ -361,7 +345,7 @@ class MultiProcessStack:
         # Without a plant there is no clock, so wall time advances the schedule.
         factor = self.scenario.plant.real_time_factor
         since = factor * (time.monotonic() - self._clock_seen)
-        killed, started = self._timeline.due(self._time_ns / SECOND + since)
+        killed, started = self._timeline.due(self.time_ns / SECOND + since)
         for name in killed:
             self.kill(name)
         for name in started:
@@ -382,7 +366,7 @@ class MultiProcessStack:
             with suppress(OSError):  # A closed terminal must not stop the robot.
                 self._show(message)
             if self._events is not None:
-                at = self._time_ns / SECOND
+                at = self.time_ns / SECOND
                 event = Event(EventKind.NODE_RESTARTED, message, 1, at, about={"node": name})
                 values = event.to_values(time.time())
                 record = StatusRecord(self.client.node.get_name(), event.level, message, values)
@@ -401,7 +385,7 @@ class MultiProcessStack:
             self._active_elsewhere = message.name
 
     def _on_clock(self, message: Clock) -> None:
-        self._time_ns = stamp_to_ns(message.clock)
+        self.time_ns = stamp_to_ns(message.clock)
         self._clock_seen = time.monotonic()
 
     def _connected(self) -> bool:
@@ -445,7 +429,7 @@ class MultiProcessStack:
             if patience < _LONGEST_START:
                 return
             raise
-        self._statistics = PlannerStatistics.from_json(answer.message)
+        self.statistics = PlannerStatistics.from_json(answer.message)
 
     def _call_services(
         self,
@@ -578,7 +562,10 @@ def node_arguments(
     file = folder / f"{name}.yaml"
     own = f"{namespace}/{name}" if namespace else name
     file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
-    ros = ["--ros-args", "-r", f"__node:={name}", *namespace_arguments(namespace)]
+    ros = ["--ros-args", "-r", f"__node:={name}"]
+    if namespace:
+        moved = [word for topic in GLOBAL_TOPICS for word in ("-r", f"{topic}:={topic[1:]}")]
+        ros += ["-r", f"__ns:={namespace}", *moved]
     return ["-m", _CHILD_MODULE, module, *ros, "--params-file", str(file)]
 
 
