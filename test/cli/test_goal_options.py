@@ -243,8 +243,8 @@ def test_paths_of_end_effectors_are_read_from_files(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("1 2 three\n", "three"),
-        ("1 2 3\n1 2 3 0 0 0 1\n", "lines of [3, 7] numbers"),
-        ("# nothing\n", "lines of [] numbers"),
+        ("1 2 3\n1 2 3 0 0 0 1\n", "lines with [3, 7] numbers"),
+        ("# nothing\n", "lines with [] numbers"),
         (None, "No such file"),
     ],
 )

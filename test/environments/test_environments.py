@@ -284,7 +284,7 @@ def test_a_campaign_whose_draws_are_all_refused_says_so(tmp_path: Path) -> None:
     file = tmp_path / "draws.yaml"
     file.write_text(SLIDING.format("initial.joints.slider_1: {uniform: [3.0, 4.0]}"))
     environment = gymnasium.make(ARM, campaign=str(file))
-    with pytest.raises(ParameterError, match="100 successive campaign draws are refused"):
+    with pytest.raises(ParameterError, match="100 successive draws of the campaign are refused"):
         environment.reset(seed=1)
 
 
@@ -325,10 +325,10 @@ def test_goals_of_a_scenario() -> None:
         ({"time_limit": "x"}, "Parameter 'time_limit' is 'x'; it must be a number"),
         ({"scenario": 3}, "Parameter 'scenario' is 3; it must be a text"),
         ({"link": "segment_2"}, "Argument 'link' is 'segment_2', but task 'reorient' has no link"),
-        ({"reward": {"time": np.nan}}, "The weight 'time' of the reward is nan: give a finite"),
+        ({"reward": {"time": np.nan}}, "The reward weight 'time' is nan: use a finite"),
         ({"spread": -1.0}, "Parameter 'spread' is -1.0; it must be a number of at least 0"),
         ({"time_limit": np.inf}, "Parameter 'time_limit' is inf; it must be a finite"),
-        ({"scenario": "a", "campaign": "b"}, "both given: a campaign names its scenario"),
+        ({"scenario": "a", "campaign": "b"}, "both given: a campaign names its own scenario"),
         ({"reward": {"speed": 1}}, "The reward has no weight 'speed'; it has progress"),
         ({"scenario": "faults/late_poses"}, "has faults of sensors, which environments do not"),
         ({"task": 3}, "Parameter 'task' is 3; it must be a text"),
@@ -381,7 +381,7 @@ def test_bad_actions_goals_and_masks_are_refused() -> None:
         with pytest.raises(ParameterError, match=r"The goal .* is not a list of numbers\."):
             vector.reset(options={"goal": given})
     for options, message in (
-        ({"gaol": [0, 0, 0, 1]}, "A reset has no option 'gaol'; its options are goal, start "),
+        ({"gaol": [0, 0, 0, 1]}, "A reset has no option 'gaol'; it has goal, start"),
         ({"start": [{}]}, r"The start is \[{}\]: pass a dictionary, or a list of 2 dictionaries"),
         ({"start": {"q": [0, 0]}}, "A start has no 'q'; it has position, quaternion, "),
         ({"start": {"position": [0, 0]}}, r"The start's position is \[0, 0\]; it must be 3 finite"),

@@ -263,7 +263,7 @@ def test_a_plant_that_latches_ends_the_flight(tmp_path: Path) -> None:
     )  # fmt: skip
     flight = fly_scenario(scenario)
     assert flight.outcome is Outcome.ABORTED
-    assert "beyond the limits" in flight.sentence
+    assert "exceeds the limits" in flight.sentence
     (time, topic, refusal), *_ = flight.refusals
     assert (topic, refusal.latches) == ("joint_commands", True)
     assert flight.duration == pytest.approx(time + 0.05)  # The tick goes by at rest.

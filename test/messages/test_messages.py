@@ -474,7 +474,7 @@ def test_what_a_measured_state_says_beyond_the_robot_is_counted_with_its_reason(
     assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([4, 3], [0.5, 0.0])
     assert decoder.ignored == {
         "joint 'camera_pan' is unknown": 1,
-        "joint 'finger2' is a mimic joint": 1,
+        "joint 'finger2' follows another": 1,
         "velocities are not finite": 1,
     }
     # Drivers of two machines send a message each.

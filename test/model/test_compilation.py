@@ -90,7 +90,7 @@ def test_a_damaged_object_is_made_anew(
     whole = kept.read_bytes()
     kept.write_bytes(DAMAGE[damage](whole))
     assert is_compiled()
-    assert "is deleted and computed again: it is damaged" in caplog.text
+    assert "is deleted and recomputed: it is damaged" in caplog.text
     assert only_file(cache).read_bytes() == whole
     caplog.clear()
     assert is_compiled()

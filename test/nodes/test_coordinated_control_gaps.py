@@ -256,7 +256,7 @@ def test_a_file_that_holds_no_goal_is_refused(
     parameters = {"robot": "planar_manipulator", "resume_file": str(file)}
     with pytest.raises(ParameterError) as refusal:
         node(**construction(harness.context, parameters))
-    assert_one_sentence(str(refusal.value), "resume_file", str(file), "no goal")
+    assert_one_sentence(str(refusal.value), "resume_file", str(file), "no valid goals")
     assert file.read_bytes() == content
 
 
@@ -322,4 +322,6 @@ def test_a_process_with_a_broken_file_ends_with_one_sentence(
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
     ended = warm_python.run(words, file.parent, environment, timeout=60.0)
     assert ended.returncode == 2
-    assert_one_sentence(ended.stderr.strip().splitlines()[-1], "resume_file", str(file), "no goal")
+    assert_one_sentence(
+        ended.stderr.strip().splitlines()[-1], "resume_file", str(file), "no valid goals"
+    )

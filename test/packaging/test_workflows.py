@@ -122,7 +122,7 @@ def test_what_the_container_builds_is_what_readers_build() -> None:
     assert re.fullmatch(r"ln -s spacerobot_ros/(\w+) src/", link)
     assert (ROOT / link.split()[2].removeprefix("spacerobot_ros/") / "package.xml").is_file()
     for page in ("README.md", "docs/operation.md"):
-        assert "was never run" in (ROOT / page).read_text("utf-8")
+        assert "never been run" in (ROOT / page).read_text("utf-8")
     assert "never" in (ROOT / "package.xml").read_text("utf-8")
 
 

@@ -294,7 +294,7 @@ def pose_error(messages: Messages, part: str, quantity: str) -> Array:
 
 def thruster_numbers(group: TraceGroup, messages: Messages) -> Array:
     states = messages["/thrusters"]
-    if group.unit == "share of each tick that they are on":
+    if group.unit == "share of each tick during which they are on":
         share = np.array([m.velocity for m in states])
         assert share[:, share.any(axis=0)].max() <= 1.0
         return share[:, share.any(axis=0)]
@@ -351,9 +351,9 @@ UNITS = {
     "efforts": {"thruster force": "N", "thruster torque": "N m", "joint effort": "N m"},
     "clearance": {"smallest distance": "m"},
     "momentum_budget": {"angular momentum": "N m s"},
-    "momentum": {"change of the total momenta": "kg m/s, kg m²/s", "kinetic energy": "J"},
+    "momentum": {"change in total momenta": "kg m/s, kg m²/s", "kinetic energy": "J"},
     "thrusters": {
-        "thrusters": "share of each tick that they are on",
+        "thrusters": "share of each tick during which they are on",
         "impulse given": "N s",
         "propellant": "g",
     },

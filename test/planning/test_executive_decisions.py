@@ -148,7 +148,7 @@ def test_a_tracking_error_that_cannot_be_planned_for_is_left_to_the_end() -> Non
     loop = executing(ticks=60, wrong_path=0.1, drift_position=0.02)
     stub_of(loop).refusing = True
     loop.until(PlannerState.REACHED)
-    assert any("cannot be replanned: It is too far." in notice for notice in loop.notices)
+    assert any("cannot be planned again: It is too far." in notice for notice in loop.notices)
     assert loop.states == ["executing", "reached"]
 
 

@@ -218,7 +218,7 @@ def test_every_start_has_a_limit_of_its_own(arm: SpaceRobot) -> None:
 @pytest.mark.parametrize(
     ("robot", "asked", "sentence"),
     [
-        ("sliding_masses", {"position": [0.4, 0, 0]}, "put the base no nearer than"),
+        ("sliding_masses", {"position": [0.4, 0, 0]}, "bring the base no closer to it than"),
         ("sliding_masses", {"position": [9, 0, 0]}, "out of reach"),
         (
             "sliding_masses",

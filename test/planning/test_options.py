@@ -227,7 +227,7 @@ def test_other_values_are_refused(given: Any) -> None:
 
 
 def test_the_refusal_of_a_text_names_both_forms() -> None:
-    with pytest.raises(ParameterError, match="numbers, or of texts NAME:VALUE with names of joint"):
+    with pytest.raises(ParameterError, match="numbers, or of strings NAME:VALUE with joint names"):
         option("joint_margin").checked("text")
 
 
@@ -298,7 +298,9 @@ def test_options_by_name_are_not_dispersed() -> None:
     )
     assert values_of(scenario.planner)["optimal.max_velocity"] == ("slider_2:0.1",)
     declaration = Parameter("optimal.max_velocity", ())
-    with pytest.raises(ParameterError, match="the list has texts NAME:VALUE; set a number for ea"):
+    with pytest.raises(
+        ParameterError, match="the list has strings NAME:VALUE; set a number for ea"
+    ):
         _list_values("n", "planner", declaration, scenario)
 
 

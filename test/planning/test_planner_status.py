@@ -164,7 +164,7 @@ def test_a_goal_file_without_ids_is_read(tmp_path: Path) -> None:
 def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "goal.json"
     path.write_text(text)
-    with pytest.raises(ParameterError, match="holds no goal"):
+    with pytest.raises(ParameterError, match="contains no valid goals"):
         GoalFile(str(path)).load()
 
 
@@ -186,7 +186,7 @@ def test_a_goal_that_others_could_have_written_is_not_flown_to(
     assert path.stat().st_mode & 0o777 == 0o600
     for mode in (0o620, 0o602, 0o666):
         path.chmod(mode)
-        with pytest.raises(ParameterError, match="is refused: others may write") as refusal:
+        with pytest.raises(ParameterError, match="is invalid: others can write") as refusal:
             file.load()
         assert f"chmod go-w '{path}'" in str(refusal.value)
     path.chmod(0o644)

@@ -384,8 +384,7 @@ def test_a_violated_tolerance_is_corrected_from_the_measured_state() -> None:
     loop.tick(2)
     told = [each for each in loop.outputs if isinstance(each, Notice)]
     assert (
-        Notice(Severity.WARNING, "The trajectory has ended early with PATH_TOLERANCE_VIOLATED.")
-        in told
+        Notice(Severity.WARNING, "The trajectory ended early with PATH_TOLERANCE_VIOLATED.") in told
     )
     _, second = stub_of(loop).requests
     assert second.correction
