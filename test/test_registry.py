@@ -87,6 +87,7 @@ def installed(tmp_path: Path) -> Path:
     return tmp_path / "site"
 
 
+@pytest.mark.slow
 def test_a_law_of_an_installed_package_flies_by_its_name(tmp_path: Path, installed: Path) -> None:
     """A robot alone has a controller then; entry points that are refused end no flight."""
     words = ["run", "servicer_thrusters", "--method", "lqr"]

@@ -93,7 +93,7 @@ class FlightLog:
     def add_command(
         self, topic: str, tick: int, values: Array, setpoint: tuple[Array, Array] | None = None
     ) -> None:
-        """Add a command; commands of a planner include its setpoint, joint positions and rates."""
+        """Add a command; planner commands include the setpoint, joint positions and rates."""
         self._commands.setdefault(topic, []).append((tick, values.copy()))
         self._sizes.setdefault(topic, len(values))
         if setpoint is not None:

@@ -536,7 +536,7 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
 
 
 def recorded_actuation(robot: FlightBag) -> str:
-    """Return the quantity in the commands of a robot in a bag: ``velocity``, ``effort``, or
+    """Return the commanded quantity for a robot in a bag: ``velocity``, ``effort``, or
     nothing.
 
     It is read from the plant's status. In bags without a plant status, wrenches imply efforts.
@@ -560,7 +560,7 @@ def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any
 
 
 def recorded_target(robot: FlightBag) -> str:
-    """Return the URDF text of a robot's target in a bag; empty: there is none."""
+    """Return the URDF of a robot's target in a bag; empty without a target."""
     described = next(robot.messages("target/robot_description"), None)
     return "" if described is None else str(described[1].data)
 

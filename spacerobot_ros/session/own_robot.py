@@ -97,7 +97,7 @@ def _joint_remarks(joint: Joint) -> Iterator[tuple[int, str]]:
     elif math.isinf(speed):
         yield (
             1,
-            f"The joint '{joint.name}' has no velocity limit, within which gaits are planned: give "
+            f"The joint '{joint.name}' has no velocity limit, which planning requires: give "
             f'<limit velocity="..." effort="..."/> in {unit}/s and '
             f"{'N' if unit == 'm' else 'N m'}.",
         )
@@ -110,8 +110,8 @@ def _joint_remarks(joint: Joint) -> Iterator[tuple[int, str]]:
     if unit == "rad" and _MAX_USUAL_LIMIT < max(-limits.lower, limits.upper) < math.inf:
         yield (
             3,
-            f"The joint '{joint.name}' turns from {limits.lower:.4g} to {limits.upper:.4g} rad: "
-            "limits of a URDF are in rad, not in degrees.",
+            f"The joint '{joint.name}' ranges from {limits.lower:.4g} to {limits.upper:.4g} rad: "
+            "URDF limits are in rad, not in degrees.",
         )
     if limits.effort == 0:
         yield (

@@ -150,7 +150,7 @@ class MultiProcessStack:
         self._restarts, self._show = RestartLimit(restarts), show
         self._timeline = KillTimeline(scenario.kills)
         self.time_ns = 0
-        """Simulated time that was last received, ns."""
+        """Last received simulated time, ns."""
         self._clock_seen = math.inf
         self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
         self.processes: dict[str, subprocess.Popen[bytes]] = {}

@@ -104,6 +104,7 @@ def test_a_node_that_is_killed_and_started_again_flies_on(
     assert not any("Traceback" in line for line in apart.complaints), apart.said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", some_fast(["plant", "planner", "coordinated_control"], "plant"))
 def test_a_partner_that_comes_late_is_met(apart: NodesApart, late: str) -> None:
     commander = "planner" if late == "plant" else late
@@ -126,6 +127,7 @@ def test_a_partner_that_comes_late_is_met(apart: NodesApart, late: str) -> None:
     assert apart.complaints == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("commander", some_fast(list(ROBOTS), "coordinated_control"))
 @pytest.mark.parametrize("node", ["plant", "commander"])
 def test_silent_publishers_do_not_hold_a_node_that_is_activated_again(
@@ -196,6 +198,7 @@ def assert_said_once(apart: NodesApart, *words: str) -> None:
     assert_one_sentence(sentence, *words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "commander"),
     some_fast(

@@ -175,6 +175,7 @@ def robot(spacerobot: Command) -> Iterator[WarmProcess]:
         yield process
 
 
+@pytest.mark.slow
 def test_goals_are_sent_to_a_robot_that_is_up(
     robot: WarmProcess, spacerobot: Command, tmp_path: Path
 ) -> None:

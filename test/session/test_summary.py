@@ -223,6 +223,7 @@ def test_a_schedule_that_begins_with_the_last_status_has_not_been_flown() -> Non
     assert flown_time(statuses, 13.0) == pytest.approx(11.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nodes", [False, True])
 def test_status_events_and_summary_of_a_goal_that_is_reached_partly_agree(
     tmp_path: Path, nodes: bool
