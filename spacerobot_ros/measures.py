@@ -23,7 +23,7 @@ from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_ti
 
 
 class Outcome(str, Enum):
-    """Outcome of a goal; all values except the last are also a ``state`` of status messages."""
+    """Outcome of a goal; each value but the last is also a ``state`` in status messages."""
 
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"

@@ -84,7 +84,7 @@ class InitialStates:
 
     @classmethod
     def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
-        """Return ``count`` equal rows; the caller may change columns.
+        """Return ``count`` identical rows; the caller may overwrite columns.
 
         Raises
         ------

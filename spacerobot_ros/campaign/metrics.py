@@ -28,7 +28,7 @@ class FlightMetric(ABC):
     """SI unit, for people."""
 
     yes_or_no: ClassVar[bool] = False
-    """Whether the value is 1 for yes and 0 for no; if so, reports show no distribution."""
+    """Whether the value is a flag, 1 or 0; if so, reports show no distribution."""
 
     @abstractmethod
     def evaluate(self, flight: Flight) -> float:

@@ -1,8 +1,8 @@
 """Monitor for a controller's goal (reached, failed or lost), with numbers or symbols.
 
-The executive evaluates the monitor numerically, state by state; SIMD lanes compile the same
-methods with CasADi symbols. Conditions are therefore numbers, 1 or 0, combined by arithmetic:
-``a * b`` is "a and b", ``1 - a`` is "not a".
+The executive evaluates the monitor numerically, state by state; SIMD lanes are compiled
+from the same methods, called with CasADi symbols. Conditions are therefore numbers, 1 or 0,
+combined by arithmetic: ``a * b`` is "a and b", ``1 - a`` is "not a".
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Difference:
     recorded, expected
         Its value in the bag, and in the re-simulation.
     remark
-        Known facts about the corresponding commands: a clause in brackets, or empty.
+        What is known about the commands behind it: a clause in brackets, or an empty string.
     """
 
     time: float

@@ -36,9 +36,9 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
 
     If ``p`` (mass properties) is the last argument of the rate, it stays last, after ``h``.
 
-    ``attitude`` is the quaternion's slice of ``x``: it is integrated in R^4 and normalised after
-    the step. The four stages call one function: inlined code would be 6 % faster but take six
-    times as long to compile.
+    ``attitude`` is the slice of ``x`` that holds the quaternion, which is integrated in R^4 and
+    normalised after the step. The four stages call one function: inlined code would be 6 % faster
+    but take six times as long to compile.
     """
     x, held = _symbols_for_inputs(rate)
     h = ca.MX.sym("h")

@@ -322,7 +322,7 @@ class MujocoLoads:
             data.xfrc_applied[body] = np.concatenate([force, torque])
 
     def momentum_rates(self, center: Array) -> Array:
-        """Return the force over moment (6,) of the last applied loads about a centre (3,), in W."""
+        """Return force and moment (6,) of the last applied loads about a point (3,), in W."""
         F, T = self._data.xfrc_applied[self.bodies].T.reshape(2, 3, -1)
         arms = self._data.xipos[self.bodies] - center
         return np.append(F.sum(axis=1), T.sum(axis=1) + cross(arms, F.T).sum(axis=0))

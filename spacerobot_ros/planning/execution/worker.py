@@ -163,11 +163,10 @@ class PlanningWorker:
     """Plans with a planner's method, one plan at a time.
 
     With ``plan_in_background``, a thread plans: CasADi and numpy release Python's global
-    interpreter
-    lock for most of the time. A robot that drifts moves during planning: its plans begin with a
-    rest period, which is
-    extended for the next plan if planning took longer. The thread uses the robot's functions, whose
-    buffers are shared: while the worker is :attr:`busy`, nothing else may use them.
+    interpreter lock for most of the time. A drifting robot keeps moving during planning, so its
+    plans begin with a rest period; if planning takes longer, the rest period of the next plan is
+    extended. The thread uses the robot's functions, whose buffers are shared: while the worker is
+    :attr:`busy`, nothing else may use them.
 
     Parameters
     ----------
