@@ -305,13 +305,14 @@ class DaskWorkers:
         SpaceRobotError
             The scheduler is gone, or cannot load the task.
         """
+        from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
         try:
             made: list[Row | Fallback] = task.result()
         except KilledWorker as error:
             raise WorkerDeath from error
-        except CancelledError as error:
+        except (CancelledError, CommClosedError) as error:
             raise _lost_scheduler_error() from error
         except (ImportError, RuntimeError) as error:
             # dask.distributed raises these for a task that cannot be loaded.

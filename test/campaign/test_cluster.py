@@ -125,8 +125,8 @@ def test_a_scheduler_that_goes_away_is_said_and_takes_no_flight_with_it(tmp_path
                 scheduler.kill()
                 assert run.process.wait(timeout=_LONGEST) == 2
                 assert run.log.read_text().endswith(
-                    "The scheduler is gone. Finished flights are kept; the same command "
-                    "continues.\n"
+                    "The scheduler is gone. Finished flights are kept; repeat the command to "
+                    "continue.\n"
                 )
     found = rows(out)
     assert {row["outcome"] for row in found} == {"reached"}
@@ -145,7 +145,9 @@ def test_a_worker_that_has_no_package_is_refused(tmp_path: Path) -> None:
             worker.awaited("Registered to")
             with started(tmp_path, *command, address) as run:
                 assert run.process.wait(timeout=_LONGEST) == 2
-                expected = rf"The worker at {ADDRESS} has no spacerobot_ros: install it there\.\n"
+                expected = (
+                    rf"The worker at {ADDRESS} does not have spacerobot_ros: install it there\.\n"
+                )
                 assert re.fullmatch(f"drawn .*\n{expected}", run.log.read_text())
 
 
