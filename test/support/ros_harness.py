@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from spacerobot_ros.nodes import RecorderNode
 
-TIMEOUT = 15.0
+TIMEOUT = 30.0
 """Wall s after which a wait has failed: far beyond what anything takes on a busy machine."""
 
 _SLICE = 0.05
