@@ -342,7 +342,9 @@ def test_short_work_is_not_shown_and_without_a_terminal_there_are_lines(
     monkeypatch.setattr("sys.stderr", lines)
     shown = Display("arm", period=0.01)
     shown.fly(1.0, 2.0)
+    end = time.monotonic() + 20.0
     while lines.getvalue().count("flying arm for 0 s: 1.0 of 2.0 s\n") < 2:
+        assert time.monotonic() < end, lines.getvalue()
         time.sleep(0.01)
     shown.close()
     assert "\r" not in lines.getvalue()
