@@ -45,6 +45,9 @@ _PACE_SLACK = 2.0
 _MEETING_TIME = 1.0
 """Wall time from the first state in which poses may come before or long after their joints, s."""
 
+_LATE_POSES = 6
+"""Poses of this many longest steps ago are late on a busy machine: discarded without a message."""
+
 _MEASURED_STEPS = 8
 """Number of steps used to compute the state rate if they are not equal."""
 
@@ -143,7 +146,8 @@ class StampFilter:
         """
         if self.is_present(stamp_ns, self._longest_step):
             return True
-        self._jump_odom = Stamped(stamp_ns, odom)
+        if not 0 < self.now_ns - stamp_ns <= _LATE_POSES * self._longest_step:
+            self._jump_odom = Stamped(stamp_ns, odom)
         return False
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:

@@ -314,6 +314,19 @@ def test_one_state_of_another_time_is_ignored_and_counted(ahead: float, pace: fl
     assert "stamp" in listener.times.last_ignored
 
 
+def test_late_poses_are_neither_used_nor_mentioned() -> None:
+    """On a busy machine joints overtake several poses, which nobody can do anything about."""
+    listener = Listener()
+    listener.states(20)
+    for late in (2, 5, 8):
+        assert not listener.odom(listener.time - late * PERIOD)
+        listener.states(1)
+    assert listener.times.ignored == 0
+    assert not listener.odom(listener.time - 20 * PERIOD)
+    listener.states(1)
+    assert listener.times.ignored == 1
+
+
 def test_a_second_publisher_of_another_time_never_takes_over() -> None:
     listener = Listener()
     listener.states(5)
