@@ -141,6 +141,8 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) servicer_thrusters $(NEAR) $(STRAIGHT)
 	$(FLY) free_flyer --goal 0.8 0.2 0.05 --goal-rotvec 0 0 1 --set plant.tick_rate=10 \
 	    --set coordinated_control.tick_rate=10 --set coordinated_control.settle_time=0.5 $(STRAIGHT)
+	$(FLY) inspection --set plant.tick_rate=10 --set coordinated_control.tick_rate=10 \
+	    --set coordinated_control.settle_time=0.5
 	$(FLY) wheels --set plant.tick_rate=10 --set coordinated_control.tick_rate=10 \
 	    --set coordinated_control.settle_time=1
 	$(FLY) gravity_gradient --set plant.tick_rate=12.5 --set coordinated_control.tick_rate=12.5 \

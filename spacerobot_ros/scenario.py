@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from spacerobot_ros.bag.config import RecorderConfig
@@ -71,6 +72,7 @@ _SCENARIO_KEYS = (
     "kills",
     "world",
     "goal_joint_positions",
+    "goal_waypoints",
     "end_effector_goals",
     *(f"{goal}_{part}" for goal in _GOAL_KEYS for part in ("position", "orientation", "rotvec")),
 )
@@ -257,6 +259,8 @@ class Scenario:
         scenario = {"name": self.name, "description": self.description}
         scenario |= {key: " ".join(map(repr, pose)) for key, pose in self._goal_poses().items()}
         scenario["goal_asked"] = " ".join(sorted(self.goal.asked))
+        if self.goal.waypoints is not None:
+            scenario["goal_waypoints"] = json.dumps(self.goal.waypoints.tolist())
         if self.goal.end_effectors:
             scenario["end_effector_goals"] = json.dumps(_end_effector_values(self.goal))
         scenario["published"] = json.dumps([asdict(row) for row in self.comparable])
@@ -425,7 +429,8 @@ class Scenario:
             asked = asked.union(POSE if len(pose) == 7 else ["position"])
         if rotvec is not None or rpy_deg is not None:
             asked = asked.union(_ATTITUDE)
-        return self.with_other_goal(replace(goal, end_effectors=(), base=POSE, asked=asked))
+        aimed = replace(goal, end_effectors=(), base=POSE, asked=asked, waypoints=None)
+        return self.with_other_goal(aimed)
 
     def with_other_goal(self, goal: Goal) -> Scenario:
         """Return the scenario with another goal and a description that reports this.
@@ -513,6 +518,8 @@ def scenario_text(scenario: Scenario) -> str:
         about["end_effector_goals"] = _end_effector_values(scenario.goal)
     if scenario.goal.joint_positions is not None:
         about["goal_joint_positions"] = scenario.goal.joint_positions.tolist()
+    if scenario.goal.waypoints is not None:
+        about["goal_waypoints"] = scenario.goal.waypoints.ravel().tolist()
     content = {"scenario": {"ros__parameters": about}}
     for node in ("plant", *scenario.commanders, "recorder"):
         values = {
@@ -723,6 +730,13 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
         if name == "goal":
             parts = (part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values))
             goal = replace(goal, asked=frozenset(parts))
+            if numbers := values.get("goal_waypoints"):
+                if len(numbers) % 7:
+                    raise GoalError(
+                        f"goal_waypoints has {len(numbers)} number(s); each pose has 7."
+                    )
+                poses = np.vstack([np.reshape(numbers, (-1, 7)), goal.path_values])
+                goal = replace(goal, waypoints=Goal.through(poses).waypoints, asked=POSE)
         links = values.get("end_effector_goals", {}) if name == "goal" else {}
         if not links:
             return goal

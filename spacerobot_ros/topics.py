@@ -344,6 +344,13 @@ _TOPIC_TABLE = (
         "base goal pose in the world; NaN: any position, or any attitude",
     ),
     Topic(
+        "goal_path",
+        _PATH_TYPE,
+        _PUBLISHED_BY_USER,
+        "base poses in the world for a controller with `profile: planned`, which brings the robot "
+        "to rest at each of them; the last pose is the goal",
+    ),
+    Topic(
         "goal_joint_states",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_USER,

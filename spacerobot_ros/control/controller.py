@@ -189,11 +189,12 @@ class CoordinatedController:
         state: ControlState,
         *,
         base: PoseReference | None = None,
+        waypoints: tuple[Array, ...] = (),
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> GoalMotion:
         """Return the motion from the reference at a given time to the goals of
-        :meth:`set_goals`."""
+        :meth:`set_goals`, with base poses (7,) where it rests on the way."""
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
         start = self.reference_at(time, state)
@@ -207,7 +208,7 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        return GoalMotion(start, goal, self._motion, carries)
+        return GoalMotion(start, goal, self._motion, carries, waypoints)
 
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
@@ -258,7 +259,7 @@ class CoordinatedController:
         return motion if self.wheels is None else self.wheels.limits_with_wheels(motion, state.q)
 
     def _begin_motion(self, time: float, state: ControlState, motion: GoalMotion) -> None:
-        start, goal, _, carries = motion
+        start, goal, _, carries, _ = motion
         limits = self._motion_within_limits(state)
         self.begin(time, self._profile_type(start, goal, limits, carries=carries))
 
@@ -368,7 +369,7 @@ class CoordinatedController:
         NotFiniteError
             A measurement is not finite.
         """
-        state = self._known_state(measured, q, qdot)
+        state, around_B = self._known_state(measured, q, qdot), None
         if state is None:
             commanded = self._braking_command(q, qdot)
         else:
@@ -383,16 +384,19 @@ class CoordinatedController:
                 self.gains_checked = True
                 if warning := self.law.sampling_warning():
                     warn_once(warning)
-            if isinstance(self.profile, PlannedReference) and not self.law.follows_accelerations:
+            if isinstance(self.profile, PlannedReference):
                 planned = self.profile.actuation(
                     time - self._began, self._control_period, self.law.joint_damping
                 )
-                commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
+                if self.profile.uses_table:
+                    around_B = planned.wrench_B
+                if not self.law.follows_accelerations:
+                    commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
             if self.coming_to_rest:
                 commanded = self._to_rest(state)
         if state is not None:
             periods = self._periods_held(time)
-            result = self.apply_limits(state, commanded, periods)
+            result = self.apply_limits(state, commanded, periods, around_B)
             if self.law.integrates and not self.coming_to_rest:
                 self.law.integrate_error(periods * self._control_period, limited=result.limited)
         else:
@@ -403,18 +407,29 @@ class CoordinatedController:
         return result
 
     def apply_limits(
-        self, state: ControlState, commanded: Actuation, periods: int = 1
+        self,
+        state: ControlState,
+        commanded: Actuation,
+        periods: int = 1,
+        around_B: Array | None = None,
     ) -> Saturated:
-        """Return the realised part of a command held for several control periods."""
-        given = self._realised(commanded)
+        """Return the realised part of a command held for several control periods.
+
+        Thruster limits apply to the difference from a wrench ``around_B`` (6,) that was planned for
+        the actual thrusters, which may exceed them.
+        """
+        given = self._realised(commanded, around_B)
         kept = self.joint_rate_limits.apply(state, given, self._limits.effort, periods)
         if self.wheels is not None and kept is not given:
             # Joints that are too fast have the wrench lowered.
-            kept = self._realised(kept)
+            kept = self._realised(kept, around_B)
         return Saturated.of(commanded, kept)
 
-    def _realised(self, wanted: Actuation) -> Actuation:
+    def _realised(self, wanted: Actuation, around_B: Array | None = None) -> Actuation:
         """Return what wheels, if there are any, and then thrusters and joints give of a command."""
+        if around_B is not None:
+            correction = self._realised(wanted._replace(wrench_B=wanted.wrench_B - around_B))
+            return correction._replace(wrench_B=correction.wrench_B + around_B)
         wheels = self.wheels
         if wheels is None:
             return self._limits.apply(wanted).realised
@@ -453,6 +468,12 @@ class CoordinatedController:
         if self.planner is None or not isinstance(self.profile, PlannedReference):
             return math.inf
         return self.planner.time_until_blocked(self.profile, time - self._began)
+
+    def waypoints_passed(self, time: float) -> int:
+        """Return the number of waypoints that the reference has passed at ``time`` (s)."""
+        if not isinstance(self.profile, PlannedReference):
+            return 0
+        return self.profile.waypoints_passed(time - self._began)
 
     def reference_at_rest(self, time: float) -> bool:
         """Whether the reference has reached its goal at ``time`` (s)."""

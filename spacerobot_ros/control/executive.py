@@ -278,7 +278,16 @@ class ControlExecutive:
         if left < 2 * PLANNING_TIME:
             self._plan_next(_Next.BEGIN_ANEW)
         elif left < math.inf:
-            self._pending = {**self._goals, **self._pending}
+            self._plan_anew(self._time)
+
+    def _plan_anew(self, time: float) -> None:
+        """Plan the rest of the motion to the pursued goals again."""
+        passed = self.controller.waypoints_passed(time)
+        self._goals = {
+            part: replace(each, goal=each.goal.after_waypoints(passed))
+            for part, each in self._goals.items()
+        }
+        self._pending = {**self._goals, **self._pending}
 
     def reference_ended(self, remaining: Reference) -> None:
         """Continue with the remaining references: restart the goal or, without a goal, hold the
@@ -373,8 +382,8 @@ class ControlExecutive:
             if reaction >= _Next.HOLD or self.plant_blocked:
                 self._hold_pose(time, measured, aborted=reaction is _Next.ABORT)
             elif reaction is _Next.BEGIN_ANEW and self.controller.planner is not None:
+                self._plan_anew(time)
                 self.controller.hold_here(time, measured)
-                self._pending = {**self._goals, **self._pending}
             elif reaction is _Next.BEGIN_ANEW:
                 self.controller.restart_motion(time, measured)
                 self._watch.begin_anew()
@@ -574,12 +583,20 @@ class ControlExecutive:
             if carried:
                 # Tasks have left the earlier reference behind.
                 self.controller.hold_here(time, state)
-            self.controller.set_goals(time, state, **poses)
+            base, hand, joints = poses["base"], poses["end_effector"], poses["joints"]
+            self.controller.set_goals(time, state, base=base, end_effector=hand, joints=joints)
         if not (carried or again):
             self._report_acceptance(None if planned is None else planned.job.result())
             self._watch.forget_touch(time)
         self._begin_tracking(time)
-        saved = goals_to_save(self.controller, self._watch.asked, self._goal_id, resumes=resumes)
+        of_base = self._goals.get(BASE_GOAL_KEY)
+        saved = goals_to_save(
+            self.controller,
+            self._watch.asked,
+            self._goal_id,
+            waypoints=None if of_base is None else of_base.goal.waypoints,
+            resumes=resumes,
+        )
         self.outputs.append(PursuedGoals(saved))
 
     def _planned(self, time: float, state: ControlState, *, carried: bool) -> PlannedGoals | None:

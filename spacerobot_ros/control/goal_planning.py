@@ -18,9 +18,12 @@ from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 
 
 class Aims(TypedDict):
-    """Poses and joint positions requested by goals; None: not requested."""
+    """Poses and joint positions requested by goals; None: not requested. The base rests at each of
+    the ``waypoints``, poses (7,), before its goal.
+    """
 
     base: PoseReference | None
+    waypoints: tuple[Array, ...]
     end_effector: PoseReference | None
     joints: Array | None
 

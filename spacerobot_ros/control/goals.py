@@ -137,6 +137,11 @@ def _require_controlled(
             f"The goal has a shape of {len(goal.joint_positions)} joints; robot "
             f"'{law.robot.description.name}' has {n}."
         )
+    if goal.waypoints is not None and controller.planner is None:
+        raise PlanningError(
+            f"The goal has {len(goal.waypoints)} waypoint(s), which require a planned motion: set "
+            "profile to planned."
+        )
 
 
 def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
@@ -190,12 +195,12 @@ def aims_of(
     they ask for.
     """
     asked: frozenset[Controlled] = frozenset()
-    poses, shapes = {}, []
+    poses, shapes, waypoints = {}, [], ()
     for key, identified in goals.items():
         goal = identified.goal
         if key == BASE_GOAL_KEY:
             goal = goal.kept_at(state.r_WB, state.quaternion_WB)
-            asked = goal.asked
+            asked, waypoints = goal.asked, tuple(goal.path_values[:-1])
         poses[key] = PoseReference(goal.position, goal.quaternion)
         if goal.joint_positions is not None:
             shapes.append(goal.joint_positions)
@@ -203,6 +208,7 @@ def aims_of(
         shapes = [shape[controller.wheels.wheels.other] for shape in shapes]
     aims = Aims(
         base=poses.get(BASE_GOAL_KEY),
+        waypoints=waypoints,
         end_effector=poses.get(END_EFFECTOR),
         joints=shapes[0] if shapes else None,
     )
@@ -214,11 +220,13 @@ def goals_to_save(
     asked: Mapping[str, frozenset[Controlled]],
     goal_id: str,
     *,
+    waypoints: Array | None,
     resumes: bool,
 ) -> dict[str, IdentifiedGoal]:
     """Return the goals of the present reference by part of the robot.
 
-    ``asked`` are the parts of the poses of base and end-effector that goals request.
+    ``asked`` are the parts of the poses of base and end-effector that goals request, ``waypoints``
+    those of the base.
     """
     goal, selection = controller.goal, controller.law.outputs.selection
     shape = goal.joints.q if goal.joints is not None and selection.joints else None
@@ -233,6 +241,8 @@ def goals_to_save(
         if pose is not None and getattr(selection, key):
             parts = asked[key] if key == BASE_GOAL_KEY else POSE
             kept = Goal(pose.position, pose.quaternion, shape, asked=parts)
+            if key == BASE_GOAL_KEY:
+                kept = replace(kept, waypoints=waypoints)
             found[key] = IdentifiedGoal(kept, goal_id, resumes=resumes)
     return found
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits
 from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.control.reference import ReferenceProfile
@@ -18,7 +20,7 @@ from spacerobot_ros.control.state import (
     PoseReference,
     Reference,
 )
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.rotations import matrix_from_quaternion
@@ -26,7 +28,7 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.target_motion import RelativeMotionOverTime
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.parameters import parameter
-from spacerobot_ros.planning.core.cancellation import Cancellation
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal
 from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
@@ -57,8 +59,8 @@ class PlannedReference(ReferenceProfile):
     ----------
     start, goal, limits, carries
         See :class:`.ReferenceProfile`.
-    motion
-        The plan.
+    *legs
+        The plan: motions one after the other, all but the last to a waypoint.
     """
 
     name: ClassVar[str] = "planned"
@@ -68,29 +70,60 @@ class PlannedReference(ReferenceProfile):
         start: Reference,
         goal: Reference,
         limits: MotionLimits,
-        motion: ThrustMotion,
-        *,
+        *legs: ThrustMotion,
         carries: bool = False,
     ) -> None:
         super().__init__(start, goal, limits, carries=carries)
-        self.motion, self.duration = motion, motion.duration
+        self._legs = legs
+        self._ends = np.cumsum([leg.duration for leg in legs]).tolist()
+        """Times since the start at which the legs end, s."""
+        self.duration = self._ends[-1]
+
+    def _leg_at(self, time: float) -> tuple[ThrustMotion, float]:
+        """Return the leg at a time since the start, s, and its beginning."""
+        k = min(self.waypoints_passed(time), len(self._legs) - 1)
+        return self._legs[k], self._ends[k] - self._legs[k].duration
+
+    def waypoints_passed(self, time: float) -> int:
+        """Return the number of waypoints reached ``time`` s after the start."""
+        return bisect_right(self._ends[:-1], time)
+
+    def configurations(self) -> tuple[Array, Array, BasePoses]:
+        """Return times (K,) since the start, joint positions (K, n) and base poses of the plan."""
+        found = [leg.path() for leg in self._legs]
+        times = [
+            np.linspace(end - leg.duration, end, len(shapes))
+            for end, leg, (shapes, _) in zip(self._ends, self._legs, found, strict=True)
+        ]
+        base = zip(*(poses for _, poses in found), strict=True)
+        return (
+            np.concatenate(times),
+            np.vstack([shapes for shapes, _ in found]),
+            BasePoses(*map(np.vstack, base)),
+        )
 
     @property
     def path(self) -> BasePath:
         """Planned base poses over the time since the start."""
-        _, base = self.motion.path()
-        return BasePath(np.linspace(0.0, self.duration, len(base.position)), *base)
+        times, _, base = self.configurations()
+        return BasePath(times, *base)
+
+    @property
+    def uses_table(self) -> bool:
+        """Whether the motion is planned for a thruster table."""
+        return not self._legs[0].propulsion.norms
 
     @property
     def propellant(self) -> float | None:
         """Propellant required by the plan, kg; None without a thruster table."""
-        return None if self.motion.propulsion.norms else self.motion.spent
+        return sum(leg.spent for leg in self._legs) if self.uses_table else None
 
     def at(self, time: float) -> Reference:
         """Return the reference ``time`` s after its start."""
         if time >= self.duration:
             return self.goal
-        sample, goal = self.motion.at(time), self.goal
+        leg, begins = self._leg_at(time)
+        sample, goal = leg.at(time - begins), self.goal
         hand = sample.end_effector
         return Reference(
             None if goal.base is None else _pose(sample.base),
@@ -114,11 +147,13 @@ class PlannedReference(ReferenceProfile):
             Joint friction added by the law and compensated for in the efforts, N m s/rad.
         """
         ends = min(time + period, self.duration)
-        knot = self.motion.step * (math.floor(time / self.motion.step) + 1)
-        wrench, tau = np.zeros(6), np.zeros(self.motion.joints)
+        leg, begins = self._leg_at(time)
+        knot = begins + leg.step * (math.floor((time - begins) / leg.step) + 1)
+        wrench, tau = np.zeros(6), np.zeros(leg.joints)
         for begin, end in ((time, min(knot, ends)), (knot, ends)):
             if 0.0 <= begin < end:
-                sample, share = self.motion.at((begin + end) / 2), (end - begin) / period
+                leg, begins = self._leg_at((begin + end) / 2)
+                sample, share = leg.at((begin + end) / 2 - begins), (end - begin) / period
                 wrench += share * sample.wrench_B
                 tau += share * (sample.tau + joint_damping * sample.qdot)
         return Actuation(wrench, tau)
@@ -146,7 +181,7 @@ class GrappleReference(PlannedReference):
         base = _pose(end.base)
         goal = Reference(base, _pose(end.end_effector), joints)
         super().__init__(start, goal, limits, motion)
-        self.grapple = grapple
+        self.motion, self.grapple = motion, grapple
         frame = grapple.motion.grapple([motion.duration])
         beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 3))
         self._base = RelativeMotionOverTime(beside.x, still, still, beside.phi, still, still)
@@ -172,12 +207,15 @@ def _pose(frame: FrameSample) -> PoseReference:
 
 
 class GoalMotion(NamedTuple):
-    """Start and goal of a motion, and its limits; ``carries``: whether the arm keeps its shape."""
+    """Start and goal of a motion, and its limits; ``carries``: whether the arm keeps its shape;
+    ``waypoints``: base poses (7,) on the way.
+    """
 
     start: Reference
     goal: Reference
     limits: MotionLimits
     carries: bool
+    waypoints: tuple[Array, ...] = ()
 
 
 class ReferencePlanner:
@@ -229,17 +267,16 @@ class ReferencePlanner:
         """Return how long a reference stays clear of obstacles, s, from a given time after its
         start; infinite: until its end.
         """
-        clearance, motion = self._planner.clearance, profile.motion
-        if clearance is None or not clearance.has_obstacles or time >= motion.duration:
+        clearance = self._planner.clearance
+        if clearance is None or not clearance.has_obstacles or time >= profile.duration:
             return math.inf
-        shapes, base = motion.path()
-        period = motion.duration / (len(shapes) - 1)
-        ahead = slice(max(int(time / period), 0), None)
+        times, shapes, base = profile.configurations()
+        ahead = slice(max(bisect_right(times, time) - 1, 0), None)
         geometry = clearance.geometry
         required = np.where(geometry.with_obstacles, clearance.distance, -np.inf)
         beyond, _ = geometry.nearest_along(shapes[ahead], base.rows(ahead), required)
         blocked = np.flatnonzero(beyond < 0)
-        return float(blocked[0] * period) if len(blocked) else math.inf
+        return float(times[ahead][blocked[0]] - times[ahead][0]) if len(blocked) else math.inf
 
     def plan(
         self, motion: GoalMotion, state: ControlState, cancellation: Cancellation
@@ -252,7 +289,7 @@ class ReferencePlanner:
         PlanningError
             No motion is found.
         """
-        start, goal, limits, carries = motion
+        start, goal, limits, carries, waypoints = motion
         assert goal.base is not None
         begin, q = self._begin(start, state)
         hand, shape = None, None
@@ -262,11 +299,21 @@ class ReferencePlanner:
             shape = q
         if shape is None and goal.end_effector is not None:
             hand = _numbers(goal.end_effector)
-        end = ThrustGoal(_numbers(goal.base), hand, shape, keeps_shape=carries)
+        ends = [ThrustGoal(pose, None, q, keeps_shape=carries) for pose in waypoints]
+        ends.append(ThrustGoal(_numbers(goal.base), hand, shape, keeps_shape=carries))
         if carries:
             begin = replace(begin, qdot=np.zeros(len(q)))
-        found = self._planner.plan(begin, end, cancellation)
-        return PlannedReference(start, goal, limits, found, carries=carries)
+        legs = []
+        for end in ends:
+            try:
+                legs.append(self._planner.plan(begin, end, cancellation))
+            except PlanningError as error:
+                if not waypoints or isinstance(error, PlanningCancelled):
+                    raise
+                name = f"waypoint {len(legs) + 1}" if end is not ends[-1] else "the last pose"
+                raise PlanningError(f"On the way to {name}: {error}") from error
+            begin = RobotMotion.at_rest(end.base, q)
+        return PlannedReference(start, goal, limits, *legs, carries=carries)
 
     def plan_grapple(
         self,

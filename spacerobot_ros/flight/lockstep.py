@@ -490,6 +490,7 @@ class LockstepFlight:
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
         hands, asked = goal.end_effectors, goal.asked
         given = replace(given, end_effectors=hands, base=goal.base, asked=asked)
+        given = replace(given, waypoints=goal.waypoints)
         if self._planner is not None:
             self._planner.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: given)
         if self._controller is not None:

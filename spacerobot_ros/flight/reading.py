@@ -256,7 +256,7 @@ class FlightBag(RecordedRobot):
             stamp = message.header.stamp
             goal_id = ids.of(stamp.sec, stamp.nanosec)
             aim, frame = message, message.header.frame_id
-            if topic.endswith("/path"):
+            if topic.endswith("path"):
                 if not message.poses:
                     continue
                 aim = message.poses[-1]
@@ -368,7 +368,8 @@ def read_flight(bag: FlightBag) -> Flight:
         for name in COMMANDERS
     }
     decider = next((name for name in COMMANDERS if statuses[name]), COMMANDERS[0])
-    goals = bag.goals("goal_pose")
+    of_base = (*bag.goals("goal_pose"), *bag.goals("goal_path"))
+    goals = tuple(sorted(of_base, key=lambda sent: sent.time))
     tool_goals = tuple(
         sorted(
             (*bag.goals("end_effector/goal_pose"), *bag.goals("end_effector/path")),
@@ -607,7 +608,12 @@ def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
     # Bags of earlier versions do not tell what was asked for: numbers of the origin were not.
     given = {"position": position.any(), "attitude": quaternion[:3].any()}
     parts = about.get("goal_asked", " ".join(part for part in given if given[part])).split()
-    return replace(goal, asked=frozenset(part for part in POSE if part in parts))
+    waypoints = about.get("goal_waypoints")
+    return replace(
+        goal,
+        asked=frozenset(part for part in POSE if part in parts),
+        waypoints=None if waypoints is None else np.array(_parse_json(waypoints)),
+    )
 
 
 def read_run(path: str | os.PathLike[str]) -> Flight:

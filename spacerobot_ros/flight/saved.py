@@ -340,16 +340,18 @@ def _goal_streams(flight: FlightData) -> Iterator[_Stream]:
         topic = TOPICS["goal_joint_states"]
         values = {"name": flight.joint_names, "position": goal.joint_positions}
         yield _Stream.of(topic, [(0, encode(topic.type, values))])
-    poses = {"goal_pose": goal if goal.base else None}
+    poses = {"goal_pose": goal if goal.base and goal.waypoints is None else None}
     poses["end_effector/goal_pose"] = scenario.end_effector_goal
+    paths = {} if goal.waypoints is None else {"goal_path": goal.path_values}
     for each in goal.end_effectors:
         link = each.link or DEFAULT_END_EFFECTOR
         if each.waypoints is None:
             poses[goal_topic(link)] = each.as_goal()
         else:
-            message = given_path_message(each.path_values, world, _GOAL_STAMP_NS)
-            topic = topic_named(path_topic(link))
-            yield _Stream.of(topic, [(0, message)], _GOAL_STAMP_NS)
+            paths[path_topic(link)] = each.path_values
+    for name, path in paths.items():
+        message = given_path_message(path, world, _GOAL_STAMP_NS)
+        yield _Stream.of(topic_named(name), [(0, message)], _GOAL_STAMP_NS)
     for name, aim in poses.items():
         if aim is not None:
             message = goal_message(aim, world, _GOAL_STAMP_NS)

@@ -35,11 +35,14 @@ from spacerobot_ros.messages.readers import (
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.commander import CommanderNode
+from spacerobot_ros.nodes.common.messages import path_poses
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, HeartbeatState, Role
 from spacerobot_ros.nodes.common.watchdog import TOPIC as HEARTBEAT
+from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import first_time_ns, stamp_bytes
 
@@ -47,7 +50,8 @@ from spacerobot_ros.times import first_time_ns, stamp_bytes
 class CoordinatedControlNode(CommanderNode):
     """Closed-loop control of spacecraft and arm (paper 4): one command for every measured state.
 
-    ``goal_pose`` is the base goal, ``end_effector/goal_pose`` the end-effector goal.
+    ``goal_pose`` is the base goal, ``end_effector/goal_pose`` the end-effector goal, and
+    ``goal_path`` a base goal with waypoints.
     If a planner publishes ``joint_reference`` (or ``base_reference``), the node tracks it. Until
     there is a goal, the robot holds the pose of its first state. The node converts messages; a
     :class:`ControllerCommander` and its :class:`~spacerobot_ros.control.executive.ControlExecutive`
@@ -87,6 +91,7 @@ class CoordinatedControlNode(CommanderNode):
             self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
+        self.create_subscription(Path, "goal_path", self._on_goal_path, STREAM)
         if self.config.watchdog_timeout:
             self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
@@ -116,6 +121,13 @@ class CoordinatedControlNode(CommanderNode):
         header = {"frame_id": robot.base_link}
         self._wrench_message = MessageTemplate(WRENCH, encode(WRENCH, {"header": header}))
         self._wrench_message.feed("wrench.force.x", commander.wrench)
+
+    def _on_goal_path(self, message: Path) -> None:
+        def read() -> Goal:
+            frame = self.config.world_frame
+            return Goal.through(path_poses(message, frame, "The path of the base", self.pose_of))
+
+        self.receive(BASE_GOAL_KEY, message, read)
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
         if (

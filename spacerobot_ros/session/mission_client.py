@@ -67,6 +67,7 @@ class MissionClient:
         joint_names: Callable[[], Sequence[str]] | None = None,
         end_effectors: Sequence[str] = (),
         paths: Collection[str] = (),
+        base_path: bool = False,
         name: str = "mission_client",
         namespace: str = "",
         context: rclpy.Context | None = None,
@@ -85,7 +86,8 @@ class MissionClient:
         self._joint_names = joint_names
         self._sent = 0
         self._follower = GoalFollower()
-        self._goal_topic = self.node.create_publisher(PoseStamped, "goal_pose", STREAM)
+        kind, topic = (Path, "goal_path") if base_path else (PoseStamped, "goal_pose")
+        self._goal_topic = self.node.create_publisher(kind, topic, STREAM)
         self._sends: list[Publisher] = [self._goal_topic]
         self._shape_topic: Publisher | None = None
         if joint_names is not None:
@@ -175,7 +177,10 @@ class MissionClient:
         self.message = ""
         if self._shape_topic is not None and self._joint_names is not None:
             self._shape_topic.publish(shape_message(goal, self._joint_names()))
-        if goal.base:
+        if goal.waypoints is not None:
+            path = given_path_message(goal.path_values, self._frame, time_ns)
+            self._goal_topic.publish(path)
+        elif goal.base:
             self._goal_topic.publish(goal_message(goal, self._frame, time_ns))
         of_links = {
             each.link: goal_message(each.as_goal(), self._frame, time_ns)

@@ -169,6 +169,7 @@ class MultiProcessStack:
             joint_names=None if names is None else lambda: names,
             end_effectors=scenario.end_effectors,
             paths=scenario.goal.links_with_paths,
+            base_path=scenario.goal.waypoints is not None,
             namespace=self.namespace,
         )
         node = self.client.node

@@ -271,6 +271,74 @@ def test_a_motion_is_blocked_when_it_first_comes_too_near() -> None:
     assert earliest - 0.1 < controller.time_until_blocked(began) < latest + 0.1
 
 
+WAYPOINTS = np.array(
+    [
+        [0.7, 0.2, 0.5, *Rotation.from_rotvec([0.0, 0.0, 1.2]).as_quat()],
+        [0.9, -0.7, 0.0, *Rotation.from_rotvec([0.3, -0.2, -0.9]).as_quat()],
+    ]
+)
+
+
+def through_waypoints() -> Goal:
+    return Goal.through([*WAYPOINTS, [0.2, -0.8, -0.2, *Rotation.from_rotvec([0, 0, 2]).as_quat()]])
+
+
+def stops(poses: np.ndarray, tick: float, within: float) -> list[int]:
+    """Return the waypoints at which the cube of a flight rests, in their order."""
+    speeds = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) / tick
+    found = []
+    for number, waypoint in enumerate(WAYPOINTS):
+        away = np.linalg.norm(poses[:, :3] - waypoint[:3], axis=1)
+        apart = (
+            Rotation.from_quat(poses[:, 3:]).inv() * Rotation.from_quat(waypoint[3:])
+        ).magnitude()
+        nearest = int(np.argmin(away + apart))
+        if away[nearest] < within and apart[nearest] < 2 * within:
+            assert speeds[max(nearest - 15, 0) : nearest + 15].min() < 5e-3
+            found.append((nearest, number))
+    return [number for _, number in sorted(found)]
+
+
+def test_the_cube_rests_at_every_waypoint_of_a_path() -> None:
+    """With thrusts beyond ``max_force``, which bounds what corrects the plan for the thrusters."""
+    flight = docked(through_waypoints(), **{"plan.duration": 0.0, "plan.time_factor": 1.1})
+    assert flight.outcome is Outcome.REACHED, flight.message
+    assert stops(flight.pose, 0.02, 5e-3) == [0, 1]
+    ((_, path),) = flight.paths
+    place, _ = path.at(flight.time[: len(flight.pose)])
+    assert np.linalg.norm(place - flight.pose[:, :3], axis=1).max() < 5e-3
+    force = np.linalg.norm(flight.commands["base_wrench"].values[:, :3], axis=1)
+    assert force.max() > 0.5, "so that the test is sharp: max_force is 0.4"
+
+
+def test_waypoints_that_were_passed_are_not_passed_again() -> None:
+    rig = Follower(plan=replace(load_scenario("free_flyer").controller.plan, duration=0.0))
+    rig.answer()
+    goal = through_waypoints()
+    rig.executive.submit("base", IdentifiedGoal(goal, "path"))
+    rig.answer()
+    profile = rig.executive.controller.profile
+    while np.linalg.norm(rig.places[-1] - WAYPOINTS[0, :3]) > 1e-3:
+        rig.answer()
+    left = (WAYPOINTS[1, :3] + goal.position) / 2
+    rig.executive.use_obstacles(ball(left))
+    for _ in range(100):
+        rig.answer()
+    assert rig.executive.controller.profile is not profile
+    on = len(rig.places)
+    assert rig.fly() is ControllerState.REACHED
+    later = np.array(rig.places[on:])
+    assert np.linalg.norm(later - WAYPOINTS[0, :3], axis=1).min() > 0.05
+    assert np.linalg.norm(later - WAYPOINTS[1, :3], axis=1).min() < 1e-3
+    assert np.linalg.norm(np.array(rig.places) - left, axis=1).min() > 0.15 + 0.1
+
+
+def test_a_straight_profile_refuses_waypoints() -> None:
+    flight = docked(through_waypoints(), **STRAIGHT)
+    assert flight.outcome is Outcome.REFUSED
+    assert_one_sentence(flight.message, "2 waypoint(s)", "set profile to planned")
+
+
 def test_a_start_within_an_obstacle_is_refused() -> None:
     rig = Follower()
     rig.answer()

@@ -25,6 +25,7 @@ from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.control.state import Actuation
 from spacerobot_ros.nodes import FlightNode
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.testing import Stack
 
 Array = npt.NDArray[np.float64]
@@ -279,6 +280,30 @@ def mine(context: rclpy.Context) -> Node:
     return Node("mine", context=context)
 
 
+def test_a_path_is_flown_pose_by_pose() -> None:
+    states: list[Odometry] = []
+    poses = [[0.5, -0.3, 0.2, 0.0, 0.0, 0.6, 0.8], [0.1, 0.2, -0.2, 0.0, 0.28, 0.0, 0.96]]
+    rates = {"plant": {"tick_rate": 20.0}, "coordinated_control": {"tick_rate": 20.0}}
+    rates["coordinated_control"] |= {"plan.duration": 0.0, "plan.time_factor": 1.2}
+    nodes = ("plant", "coordinated_control", mine)
+    with Stack("free_flyer", nodes, rates, timeout=200.0) as stack:
+        stack.nodes["mine"].create_subscription(Odometry, "odom", states.append, 100)
+        assert stack.fly_to(goal=Goal.through(poses)).reached
+    places = np.array([[p.x, p.y, p.z] for p in (s.pose.pose.position for s in states)])
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(stamps(states))
+    for aim in poses:
+        there = int(np.argmin(np.linalg.norm(places - aim[:3], axis=1)))
+        o = states[there].pose.pose.orientation
+        assert np.linalg.norm(places[there] - aim[:3]) < 5e-3
+        apart = Rotation.from_quat([o.x, o.y, o.z, o.w]).inv() * Rotation.from_quat(aim[3:])
+        assert apart.magnitude() < 2e-2
+        assert speeds[there - 6 : there + 6].min() < 2e-3
+
+
+def stamps(states: list[Odometry]) -> np.ndarray:
+    return np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in states])
+
+
 def test_a_goal_in_flight_is_flown_from_where_the_robot_is_without_a_stop() -> None:
     with Stack("free_flyer", nodes=("plant", "coordinated_control", mine)) as stack:
         node = stack.nodes["mine"]
@@ -316,6 +341,5 @@ def test_a_goal_in_flight_is_flown_from_where_the_robot_is_without_a_stop() -> N
     assert speeds[flying] > 0.02
     assert speeds[flying : flying + 100].min() > 0.2 * speeds[flying]
     assert np.linalg.norm(omega[-1]) < 1e-2
-    stamps = np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in states])
-    changes = np.abs(np.diff(speeds)) / np.diff(stamps)
+    changes = np.abs(np.diff(speeds)) / np.diff(stamps(states))
     assert changes.max() < THRUST / MASS * 1.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -353,6 +354,38 @@ def test_files_of_goals_keep_paths(tmp_path: Any) -> None:
     loaded = GoalFile(str(path)).load()["base"]
     assert loaded.goal.equals(goal)
     assert loaded.goal.has_path
+
+
+def test_a_path_of_the_base_is_saved_and_displaced(tmp_path: Path) -> None:
+    values = np.hstack([CORNER, TURNS.as_quat()])
+    goal = Goal.through(values * [1, 1, 1, 2, 2, 2, 2])
+    np.testing.assert_allclose(goal.path_values, values, atol=1e-15)
+    assert not goal.equals(Goal.through(values[1:]))
+    GoalFile(str(tmp_path / "goal")).save({"base": IdentifiedGoal(goal, "4.2")})
+    loaded = GoalFile(str(tmp_path / "goal")).load()["base"].goal
+    np.testing.assert_allclose(loaded.path_values, values, atol=1e-15)
+    moved = goal.displaced(np.array([0.1, 0.2, -0.3])).path_values
+    np.testing.assert_allclose(moved - values, [[0.1, 0.2, -0.3, 0, 0, 0, 0]] * 4, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("poses", "words"),
+    [
+        ([], "no poses"),
+        ([[1.0, 2.0, 3.0]], "an orientation in each pose"),
+        ([[1.0, 2.0, np.nan, 0.0, 0.0, 0.0, 1.0]], "Pose 1"),
+        ([[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0], [1.0] * 3 + [0.0] * 4], "Pose 2"),
+    ],
+)
+def test_invalid_paths_of_the_base_are_refused(poses: Any, words: str) -> None:
+    with pytest.raises(GoalError, match=words):
+        Goal.through(poses)
+
+
+def test_methods_for_the_joints_alone_refuse_waypoints() -> None:
+    goal = Goal.through(np.hstack([CORNER, TURNS.as_quat()]))
+    with pytest.raises(PlanningError, match="does not stop at waypoints"):
+        plan("three_joint_arm", goal, method="optimal", control_period=PERIOD)
 
 
 def test_statuses_tell_the_number_of_waypoints() -> None:

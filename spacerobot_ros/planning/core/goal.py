@@ -158,10 +158,8 @@ class EndEffectorGoal:
 
     def displaced(self, by: Array) -> EndEffectorGoal:
         """Return the goal and its waypoints displaced by a vector (3,) in W, m."""
-        waypoints = self.waypoints
-        if waypoints is not None:
-            waypoints = np.hstack([waypoints[:, :3] + by, waypoints[:, 3:]])
-        return replace(self, position=self.position + by, waypoints=waypoints)
+        moved = _displaced(self.waypoints, by)
+        return replace(self, position=self.position + by, waypoints=moved)
 
     def as_goal(self) -> Goal:
         """Return the goal as a pose for a message; a zero quaternion leaves the attitude free."""
@@ -196,6 +194,8 @@ class Goal:
     asked
         Base pose components given explicitly by the sender. Other components are
         kept from the start (:meth:`kept_at`), and are not required for the goal to be reached.
+    waypoints
+        Base poses (K, 7) before the goal, at each of which the robot comes to rest; None: none.
     """
 
     position: Array
@@ -204,6 +204,21 @@ class Goal:
     end_effectors: tuple[EndEffectorGoal, ...] = ()
     base: frozenset[Controlled] = POSE
     asked: frozenset[Controlled] = POSE
+    waypoints: Array | None = None
+
+    @classmethod
+    def through(cls, poses: npt.ArrayLike) -> Goal:
+        """Return the goal at the end of a base path: poses (K, 7).
+
+        Raises
+        ------
+        GoalError
+            See :meth:`EndEffectorGoal.along`; or the poses have no orientations.
+        """
+        end = EndEffectorGoal.along("base", poses)
+        if end.quaternion is None:
+            raise GoalError("The path of the base needs an orientation in each pose.")
+        return cls(end.position, end.quaternion, waypoints=end.waypoints)
 
     @classmethod
     def of_end_effectors(
@@ -412,7 +427,21 @@ class Goal:
     def displaced(self, by: Array) -> Goal:
         """Return the goal with all its positions displaced by a vector (3,) in W, m."""
         hands = tuple(each.displaced(by) for each in self.end_effectors)
-        return replace(self, position=self.position + by, end_effectors=hands)
+        moved = _displaced(self.waypoints, by)
+        return replace(self, position=self.position + by, end_effectors=hands, waypoints=moved)
+
+    @property
+    def path_values(self) -> Array:
+        """The waypoints and the goal (K + 1, 7), as accepted by :meth:`through`."""
+        end = np.concatenate([self.position, self.quaternion])[np.newaxis]
+        return end if self.waypoints is None else np.vstack([self.waypoints, end])
+
+    def after_waypoints(self, passed: int) -> Goal:
+        """Return the goal without its first waypoints."""
+        if self.waypoints is None or not passed:
+            return self
+        left = self.waypoints[passed:]
+        return replace(self, waypoints=left if len(left) else None)
 
     def equals(self, other: Goal) -> bool:
         """Whether another goal has exactly the same poses and shape."""
@@ -425,9 +454,12 @@ class Goal:
             and self.base == other.base
             and {each.link: each.path_values.tolist() for each in self.end_effectors}
             == {each.link: each.path_values.tolist() for each in other.end_effectors}
-            and np.array_equal(self.position, other.position)
-            and np.array_equal(self.quaternion, other.quaternion)
+            and np.array_equal(self.path_values, other.path_values)
         )
+
+
+def _displaced(waypoints: Array | None, by: Array) -> Array | None:
+    return None if waypoints is None else waypoints + np.pad(by, (0, waypoints.shape[1] - 3))
 
 
 def _require_one_goal_each(goals: Iterable[EndEffectorGoal]) -> None:

@@ -343,6 +343,11 @@ class GaitMethod(ABC):
             )
 
     def _require_no_path(self, goal: Goal) -> None:
+        if goal.waypoints is not None:
+            raise PlanningError(
+                f"{self.name} moves the base by the joints alone and does not stop at waypoints: "
+                "coordinated control does, with the profile 'planned'."
+            )
         for each in goal.end_effectors:
             if each.waypoints is not None:
                 raise PlanningError(

@@ -199,6 +199,9 @@ def decode_goal(entry: Mapping[str, Any]) -> Goal:
     goal = Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"])
     asked = entry.get("asked", POSE)
     goal = replace(goal, asked=frozenset(part for part in POSE if part in asked))
+    if "waypoints" in entry:
+        given = Goal.through([*entry["waypoints"], goal.path_values[0].tolist()])
+        goal = replace(goal, waypoints=given.waypoints)
     if "end_effectors" not in entry:
         return goal
     goals = [EndEffectorGoal.of_numbers(*each) for each in entry["end_effectors"].items()]
@@ -215,6 +218,8 @@ def encode_goal(identified: IdentifiedGoal) -> dict[str, Any]:
         "quaternion": goal.quaternion.tolist(),
         "joint_positions": None if shape is None else shape.tolist(),
     }
+    if goal.waypoints is not None:
+        entry["waypoints"] = goal.waypoints.tolist()
     if goal.asked != POSE:
         entry["asked"] = sorted(goal.asked)
     if goal.end_effectors:
