@@ -175,6 +175,10 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
             f"{_judged(summary, 'attitude', 'rad')}"
         )
     drift = "not explained by thrusters:" if summary["has_thrust"] else "changed by"
+    took, factor = summary["plan_time_s"], summary["real_time_factor"]
+    # A controller in a process of its own does not report how long it planned.
+    planned = f", planned in {took:.3f} s" if took else ""
+    pace = f"{factor:.0f}" if factor >= 10 else f"{factor:.2g}"
     return [
         f"{summary['scenario']}, {summary['method']}: {summary['verdict']}",
         f"position    ({numbers(summary['final_position_m'])}) m{beside}",
@@ -182,9 +186,9 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         *_end_effector_line(summary),
         *([f"shape       ({numbers(shape)})"] if (shape := _shape(summary)) else []),
         f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
-        f"{summary['corrections']} correction(s), planned in {summary['plan_time_s']:.3f} s",
+        f"{summary['corrections']} correction(s){planned}",
         f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
-        f"{summary['ticks_per_s']:.0f} ticks/s, {summary['real_time_factor']:.0f} times real time",
+        f"{summary['ticks_per_s']:.0f} ticks/s, {pace} times real time",
         f"momentum    {drift} {quantity(summary['linear_momentum_drift'], 'kg m/s')} and "
         f"{quantity(summary['angular_momentum_drift'], 'kg m^2/s')}",
         *_propellant_line(summary),
