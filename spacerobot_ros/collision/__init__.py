@@ -4,7 +4,6 @@ from spacerobot_ros.collision.distances import Solid
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair, ObstaclePair
 from spacerobot_ros.collision.nearest import (
     Approach,
-    NearestPair,
     nearest_approach,
     nearest_approaches,
 )
@@ -14,7 +13,6 @@ __all__ = [
     "BasePoses",
     "CollisionGeometry",
     "LinkPair",
-    "NearestPair",
     "ObstaclePair",
     "Solid",
     "nearest_approach",

@@ -85,6 +85,7 @@ class ExactDistances:
     def __init__(self, solids: Sequence[Solid], coal: Any) -> None:
         self._coal = coal
         self._geometries = [self._geometry(solid) for solid in solids]
+        self._computers: dict[tuple[int, int], Any] = {}
 
     def _geometry(self, solid: Solid) -> tuple[Any, Array, Array]:
         """Return the shape, and its attitude and position in the frame of its link."""
@@ -143,7 +144,9 @@ class ExactDistances:
         """
         coal = self._coal
         (one, R_a, r_a), (other, R_b, r_b) = self._geometries[first], self._geometries[second]
-        compute = coal.ComputeDistance(one, other)
+        if (first, second) not in self._computers:
+            self._computers[first, second] = coal.ComputeDistance(one, other)
+        compute = self._computers[first, second]
         request, result = coal.DistanceRequest(), coal.DistanceResult()
         R_ab = np.swapaxes(R_1 @ R_a, 1, 2) @ (R_2 @ R_b)
         between = (r_2 + R_2 @ r_b) - (r_1 + R_1 @ r_a)
@@ -154,57 +157,6 @@ class ExactDistances:
             there.setTranslation(r_ab[k])
             result.clear()
             yield compute(here, there, request, result), result, R_ab[k], r_ab[k]
-
-    def placed(self) -> PlacedSolids:
-        """Return the solids for evaluation at successive states."""
-        return PlacedSolids(self._geometries, self._coal)
-
-
-class PlacedSolids:
-    """Moving solids and the exact distances between them; see :class:`ExactDistances`.
-
-    Parameters
-    ----------
-    geometries
-        Shapes with their attitudes and positions in the link frames.
-    coal
-        The module.
-    """
-
-    def __init__(self, geometries: Sequence[tuple[Any, Array, Array]], coal: Any) -> None:
-        self._coal = coal
-        self._shapes = [shape for shape, _, _ in geometries]
-        self._R = np.array([R for _, R, _ in geometries])
-        self._r = np.array([r for _, _, r in geometries])[:, :, np.newaxis]
-        self._poses = [coal.Transform3s.Identity() for _ in geometries]
-        self._computers: dict[tuple[int, int], Any] = {}
-        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
-        self._present: tuple[Array, Array] = self._R, self._r[:, :, 0]
-        self._placed: set[int] = set()
-
-    def move(self, R: Array, r: Array) -> None:
-        """Place every solid's link at attitudes (S, 3, 3) and positions (S, 3), m, in one frame."""
-        self._present = R @ self._R, r + (R @ self._r)[:, :, 0]
-        self._placed.clear()
-
-    def distance(self, first: int, second: int) -> float:
-        """Return the distance between two solids, m; negative: penetration depth."""
-        compute = self._computers.get((first, second))
-        if compute is None:
-            compute = self._coal.ComputeDistance(self._shapes[first], self._shapes[second])
-            self._computers[first, second] = compute
-        self._result.clear()
-        poses = self._pose(first), self._pose(second)
-        return float(compute(*poses, self._request, self._result))
-
-    def _pose(self, solid: int) -> Any:
-        pose = self._poses[solid]
-        if solid not in self._placed:
-            R, r = self._present
-            pose.setRotation(R[solid])
-            pose.setTranslation(r[solid])
-            self._placed.add(solid)
-        return pose
 
 
 class EnclosureDistances:

@@ -230,10 +230,14 @@ class CollisionGeometry:
             (..., n), m or rad; with a base (N, n).
         base Base poses; None: obstacles are ignored.
         """
-        R, r = self._kinematics.link_poses(shapes)
+        return self.with_world(self._kinematics.link_poses(shapes), base)
+
+    def with_world(self, links: Poses, base: BasePoses | None) -> Poses:
+        """Return poses of links with that of the world appended, if there is one."""
         if self.robot.world is None:
-            return R, r
-        at = shapes.shape[:-1]
+            return links
+        R, r = links
+        at = r.shape[:-2]
         R_BW = np.broadcast_to(np.eye(3), (*at, 3, 3))
         r_BW = np.full((*at, 3), _UNKNOWN_BASE_DISTANCE)
         if base is not None:
@@ -302,21 +306,36 @@ class CollisionGeometry:
         infinity ignores one. They are infinite if there are no pairs; obstacles are ignored without
         poses of the base.
         """
-        distances = np.full(len(shapes), np.inf)
-        pairs = np.zeros(len(shapes), dtype=np.int64)
-        if not len(self.pairs) or not len(shapes):
+        return self.nearest_at(self.poses(shapes, base), required)
+
+    def nearest_at(
+        self, poses: Poses, required: Array | float = 0.0
+    ) -> tuple[Array, npt.NDArray[np.int64]]:
+        """Return the smallest distances as :meth:`nearest_along`, from the poses of the links."""
+        R, r = poses
+        distances = np.full(len(R), np.inf)
+        pairs = np.zeros(len(R), dtype=np.int64)
+        if not len(self.pairs) or not len(R):
             return distances, pairs
-        R, r = self.poses(shapes, base)
         required = np.broadcast_to(required, len(self.pairs))
-        bounds = self.lower_bounds((R, r)) - required
+        bounds = self.lower_bounds(poses) - required
+        least = bounds.min(axis=0)
         # Pairs that may be the nearest come first, so that most others need not be looked at.
-        for pair in np.argsort(bounds.min(axis=0), kind="stable").tolist():
+        for pair in np.argsort(least, kind="stable").tolist():
+            if least[pair] >= distances.max():
+                break
             at = np.flatnonzero(bounds[:, pair] < distances)
-            if len(at):
-                found = self.distances(pair, (R[at], r[at])) - required[pair]
-                nearer = found < distances[at]
-                distances[at[nearer]], pairs[at[nearer]] = found[nearer], pair
+            found = self.distances(pair, (R[at], r[at])) - required[pair]
+            nearer = found < distances[at]
+            distances[at[nearer]], pairs[at[nearer]] = found[nearer], pair
         return distances, pairs
+
+    def links_in_contact(self, poses: Poses) -> frozenset[LinkPair]:
+        """Return the pairs of links in contact at one set of poses."""
+        near = np.flatnonzero(self.lower_bounds(poses)[0] <= 0).tolist()
+        return frozenset(
+            self.links_of(pair) for pair in near if self.distances(pair, poses)[0] <= 0
+        )
 
     def distances_of_links(self, shape: Array) -> dict[LinkPair, float]:
         """Return the distances between links in a configuration (n,), m, smallest first."""

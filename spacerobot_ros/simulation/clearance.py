@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
+from spacerobot_ros.collision import BasePoses, CollisionGeometry, LinkPair, ObstaclePair
 from spacerobot_ros.errors import quantity
 from spacerobot_ros.events import (
     SECONDS,
@@ -115,11 +115,12 @@ class ClearanceMonitor:
         *,
         has_contact_forces: bool = False,
     ) -> None:
-        self._nearest, self._pushing = NearestPair(geometry, links), has_contact_forces
+        self._geometry, self._pushing = geometry, has_contact_forces
+        self._order = [links.index(each) for each in geometry.links]
         self.touching: frozenset[LinkPair] = frozenset()
         """Links in contact in the last state."""
         self._capturing: CapturePlant | None = None
-        self._from_target: NearestPair | None = None
+        self._from_target: CollisionGeometry | None = None
 
     @classmethod
     def of(
@@ -157,7 +158,7 @@ class ClearanceMonitor:
             bodies = np.array([around.solids[i].body for i, _ in around.pairs], dtype=int)
             around.pairs = around.pairs[bodies != robot.frames[capturing.link][0]]
             if len(around.pairs):
-                monitor._capturing, monitor._from_target = capturing, NearestPair(around, links)
+                monitor._capturing, monitor._from_target = capturing, around
         return monitor
 
     def measure(
@@ -174,14 +175,18 @@ class ClearanceMonitor:
         time_s
             Simulated time, s.
         """
-        distance, pair = self._nearest.nearest(link_R, link_r, pose)
-        status = ClearanceStatus(distance, self._nearest.geometry.links_of(pair), time_s)
+        R = link_R.reshape(1, 3, -1, 3).swapaxes(1, 2)[:, self._order]
+        links = R, link_r.reshape(3, -1).T[np.newaxis, self._order]
+        poses = self._geometry.with_world(links, _base(pose))
+        (distance,), (pair,) = self._geometry.nearest_at(poses)
+        status = ClearanceStatus(float(distance), self._geometry.links_of(pair), time_s)
         before, touching = self.touching, frozenset[LinkPair]()
         if distance <= 0:
-            touching = self._nearest.links_in_contact(link_R, link_r, pose)
+            touching = self._geometry.links_in_contact(poses)
         if self._from_target is not None and self._capturing and self._capturing.payload is None:
             seen = relative_pose(self._capturing.target_pose, pose)
-            touching |= self._from_target.links_in_contact(link_R, link_r, seen)
+            among = self._from_target.with_world(links, _base(seen))
+            touching |= self._from_target.links_in_contact(among)
         self.touching = touching
         return status, [
             *(self._begun(each, time_s) for each in sorted(touching - before)),
@@ -198,6 +203,10 @@ class ClearanceMonitor:
         joint = " and" if self._pushing else ";"
         message = f"{_subject(links)} touch{joint} {then}."
         return Event(EventKind.CONTACT, message, _ERROR, time_s, about=_names(links))
+
+
+def _base(pose: Array) -> BasePoses:
+    return BasePoses(pose[np.newaxis, :3], pose[np.newaxis, 3:])
 
 
 def _subject(links: LinkPair) -> str:

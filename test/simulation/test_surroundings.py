@@ -17,7 +17,7 @@ from support.crossing import URDF, distance
 from support.effort_flights import random_urdf, robot_of, tumbling
 from support.oracles import Array, PinocchioOracle, assert_agrees, random_motion
 
-from spacerobot_ros.collision import CollisionGeometry, LinkPair, NearestPair, ObstaclePair
+from spacerobot_ros.collision import CollisionGeometry, LinkPair, ObstaclePair
 from spacerobot_ros.collision import distances as distances_module
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
@@ -393,16 +393,14 @@ def test_the_nearest_pair_is_that_of_all_distances(name: str) -> None:
     together, pairs = geometry.nearest_along(shapes)
     np.testing.assert_allclose(together, each.min(axis=0), atol=1e-9)
     np.testing.assert_array_equal(pairs, each.argmin(axis=0))
-    nearest, pose = (
-        NearestPair(geometry, geometry.links),
-        np.array([0.3, -0.2, 0.1, 0, 0, 0.6, 0.8]),
-    )
+    monitor = ClearanceMonitor(geometry, geometry.links)
+    pose = np.array([0.3, -0.2, 0.1, 0, 0, 0.6, 0.8])
     for k in range(len(shapes)):
         poses = R[k].transpose(1, 0, 2).reshape(3, -1), r[k].T
-        found, _ = nearest.nearest(poses[0], poses[1], pose)
-        assert found == pytest.approx(together[k], abs=1e-9)
+        status, _ = monitor.measure(*poses, pose, 0.0)
+        assert status.distance == pytest.approx(together[k], abs=1e-9)
         touching = {geometry.links_of(p) for p in np.flatnonzero(each[:, k] <= 0).tolist()}
-        assert nearest.links_in_contact(poses[0], poses[1], pose) == touching
+        assert monitor.touching == touching
     assert (each.min(axis=0) < 0).any()
 
 
