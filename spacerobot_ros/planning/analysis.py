@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,11 +25,7 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.core.workspaces import Workspaces, workspaces
 from spacerobot_ros.planning.methods.auto import AutoGait
 from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
-from spacerobot_ros.planning.methods.nominal_shape import (
-    NominalShape,
-    best_nominal,
-    nominal_at_shape,
-)
+from spacerobot_ros.planning.methods.nominal_shape import NominalShape, NominalShapeChooser
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
 
@@ -118,14 +113,10 @@ def analyze(
         _check_link(robot, link)
     given = None if shape is None else _check_shape(robot, shape)
     anywhere = best_sampled_brackets(robot)
-    nominal = None
-    if robot.n >= 3 and anywhere.controllable:
-        triples = list(itertools.combinations(range(robot.n), 3))
-        if given is None:
-            middle = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
-            nominal = best_nominal(robot, middle, triples, _LOOP_EDGE_LENGTH)
-        else:
-            nominal = nominal_at_shape(robot, given, triples, _LOOP_EDGE_LENGTH)
+    nominal, loops = None, NominalShapeChooser(robot, _LOOP_EDGE_LENGTH)
+    if loops.triples and anywhere.controllable:
+        middle = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
+        nominal = loops.best(middle) if given is None else loops.around(given)
     planar = check_planar_chain(robot)
     if given is None:
         best = planar if planar.controllable else anywhere

@@ -25,13 +25,7 @@ from spacerobot_ros.planning import METHODS, Goal, PlanRequest, RobotState, Tole
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods import area_loop
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait, EdgePath, edge_path
-from spacerobot_ros.planning.methods.nominal_shape import (
-    NominalShape,
-    NominalShapeChooser,
-    best_nominal,
-    nominal_at_shape,
-    nominal_with_clearance,
-)
+from spacerobot_ros.planning.methods.nominal_shape import NominalShape, NominalShapeChooser
 from spacerobot_ros.resources import robot_file
 
 Array = npt.NDArray[np.float64]
@@ -104,8 +98,8 @@ def test_small_loops_turn_the_base_by_the_curvature_matrix(
     robot = arm if seed is None else SpaceRobot.from_urdf(urdf)
     oracle = PinocchioOracle(urdf, robot.joint_names)
     shape = NOMINAL if seed is None else np.clip([0.3, -0.4, 0.5, 0.2], robot.lower, robot.upper)
-    joints = (0, 1, 2) if seed is None else (3, 0, 2)
-    nominal = nominal_at_shape(robot, shape, [joints], 1.0)
+    joints = [robot.joint_names[i] for i in ((0, 1, 2) if seed is None else (3, 0, 2))]
+    nominal = NominalShapeChooser(robot, 1.0, " ".join(joints)).around(shape)
     errors = []
     for size in (4e-3, 1e-3):
         S = size * np.array(areas)
@@ -118,12 +112,13 @@ def test_small_loops_turn_the_base_by_the_curvature_matrix(
 
 
 def test_the_condition_number_of_the_papers_nominal_shape(arm: SpaceRobot) -> None:
-    nominal = nominal_at_shape(arm, NOMINAL, [(0, 1, 2)], 1.0)
+    nominal = NominalShapeChooser(arm, 1.0).around(NOMINAL)
     assert nominal.condition == pytest.approx(3.60, abs=5e-3)
 
 
 def test_the_best_nominal_shape_is_better_than_any_of_many(arm: SpaceRobot) -> None:
-    best = best_nominal(arm, np.zeros(3), [(0, 1, 2)], 1.0)
+    chooser = NominalShapeChooser(arm, 1.0)
+    best = chooser.best(np.zeros(3))
 
     def worst_turn(nominal: NominalShape) -> float:
         room = np.minimum(nominal.shape - arm.lower, arm.upper - nominal.shape)
@@ -133,7 +128,7 @@ def test_the_best_nominal_shape_is_better_than_any_of_many(arm: SpaceRobot) -> N
 
     rng = np.random.default_rng(5)
     for shape in rng.uniform(arm.lower, arm.upper, (500, 3)):
-        assert worst_turn(nominal_at_shape(arm, shape, [(0, 1, 2)], 1.0)) <= worst_turn(best) + 1e-6
+        assert worst_turn(chooser.around(shape)) <= worst_turn(best) + 1e-6
     # Loops of a radian fit round it.
     assert np.all(best.shape - 0.5 >= arm.lower)
     assert np.all(best.shape + 0.5 <= arm.upper)
@@ -492,29 +487,24 @@ def walled(roomy_arm: SpaceRobot, **options: Any) -> AreaLoopGait:
 
 
 def test_boxes_of_loops_keep_clear_and_are_the_best_that_do(roomy_arm: SpaceRobot) -> None:
-    free = nominal_with_clearance(roomy_arm, START.q, [(0, 1, 2)], 1.0, 0.5, lambda shapes: True)
-    kept = nominal_with_clearance(roomy_arm, START.q, [(0, 1, 2)], 1.0, 0.5, beyond_the_wall)
+    chooser = NominalShapeChooser(roomy_arm, 1.0)
+    free = chooser.with_clearance(START.q, 0.5, lambda shapes: True)
+    kept = chooser.with_clearance(START.q, 0.5, beyond_the_wall)
     assert free is not None
     assert kept is not None
     assert free.shape[1] > WALL, "the best one is beyond the wall only if it must be"
     assert kept.shape[1] + kept.longest[1] / 2 <= WALL + 1e-12
     assert kept.longest.max() <= 0.5
-    assert (
-        nominal_with_clearance(roomy_arm, START.q, [(0, 1, 2)], 1.0, 0.5, lambda shapes: False)
-        is None
-    )
+    assert chooser.with_clearance(START.q, 0.5, lambda shapes: False) is None
     # Edges of less than a tenth of a milliradian are none.
-    assert (
-        nominal_with_clearance(roomy_arm, START.q, [(0, 1, 2)], 1.0, 1e-5, lambda shapes: True)
-        is None
-    )
+    assert chooser.with_clearance(START.q, 1e-5, lambda shapes: True) is None
     seen: list[Array] = []
 
     def refuse(shapes: Array) -> bool:
         seen.append(shapes)
         return False
 
-    nominal_with_clearance(roomy_arm, START.q, [(0, 1, 2)], 1.0, 0.5, refuse)
+    chooser.with_clearance(START.q, 0.5, refuse)
     assert {each.shape for each in seen} == {(27, 3)}
     np.testing.assert_allclose(np.ptp(seen[0], axis=0), free.longest)
     np.testing.assert_allclose(seen[0].mean(axis=0), free.shape)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,13 +47,14 @@ _HELD_JOINT_TOLERANCE = 1e-3
 
 _NEIGHBOUR_OFFSETS = np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=3)))
 
-
 _BOX_SHARES = (1.0, 0.5, 0.25, 0.125)
 """Edges of the boxes in which links keep the clearance, as fractions of the longest loop edges."""
 
 _BOX_GRID_POINTS = 7
 
 _MAX_BOXES = 300
+
+Triple = tuple[int, int, int]
 
 ClearanceTest = Callable[[Array], bool]
 """Whether links keep the clearance at all shapes (N, n)."""
@@ -79,7 +80,7 @@ class NominalShape:
     """
 
     shape: Array
-    joints: tuple[int, int, int]
+    joints: Triple
     M: Array
     longest: Array
 
@@ -95,7 +96,7 @@ class NominalShape:
 
 
 class NominalShapeChooser:
-    """Chooses nominal shapes for a robot.
+    """Chooses nominal shapes for a robot, and the three joints of loops around them.
 
     Parameters
     ----------
@@ -110,6 +111,11 @@ class NominalShapeChooser:
     is_roomy
         Returns whether (N,) links have room to move at shapes (N, n); None: everywhere.
 
+    Attributes
+    ----------
+    triples
+        Triples of joints to choose from, without joints of zero velocity limit.
+
     Raises
     ------
     ParameterError
@@ -120,14 +126,12 @@ class NominalShapeChooser:
         self,
         robot: SpaceRobot,
         largest_edge: float,
-        joints: str,
-        nominal: Sequence[float],
+        joints: str = "",
+        nominal: Sequence[float] = (),
         is_roomy: LoopRoomTest | None = None,
     ) -> None:
-        self._robot = robot
-        self._is_roomy = is_roomy
-        self._largest_edge = largest_edge
-        self._triples = _list_triples(robot, joints.split())
+        self._robot, self._largest_edge, self._is_roomy = robot, largest_edge, is_roomy
+        self.triples = _list_triples(robot, joints.split())
         self._given_shape = (
             _require_shape(robot, np.array(nominal, dtype=float)) if len(nominal) else None
         )
@@ -147,46 +151,17 @@ class NominalShapeChooser:
             Joint limits leave no room for loops, or loops at this shape do not rotate the base
             about all axes.
         """
-        return kept if kept is not None and self._can_be_kept(kept, q) else self._choose_nominal(q)
-
-    def shapes_with_more_room(self, q: Array, is_clear: ClearanceTest) -> Iterator[NominalShape]:
-        """Yield other nominal shapes from shape ``q`` (n,), around which loops have room.
-
-        All shapes in a box around each keep the clearance (``is_clear``). The edges of the first
-        box
-        are as long as loop edges may be, those of the next box half as long, and so on. Nothing is
-        yielded if the user has specified the nominal shape.
-        """
-        if self._given_shape is not None:
-            return
-        for share in _BOX_SHARES:
-            found = nominal_with_clearance(
-                self._robot, q, self._triples, self._largest_edge, share, is_clear
-            )
-            if found is not None:
-                yield found
-
-    def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
-        """Return the nominal shape with unlimited joints moved by whole revolutions close to
-        ``q``."""
-        turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
-        return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
-
-    def _can_be_kept(self, chosen: NominalShape, q: Array) -> bool:
-        moved = np.abs(np.delete(q - chosen.shape, chosen.joints)).max(initial=0.0)
-        return self._given_shape is not None or bool(moved <= _HELD_JOINT_TOLERANCE)
-
-    def _choose_nominal(self, q: Array) -> NominalShape:
+        if kept is not None:
+            moved = np.abs(np.delete(q - kept.shape, kept.joints)).max(initial=0.0)
+            if self._given_shape is not None or moved <= _HELD_JOINT_TOLERANCE:
+                return kept
         robot = self._robot
-        if not self._triples:
+        if not self.triples:
             raise PlanningError(
                 f"area_loop needs three moving joints; robot '{robot.description.name}' has "
                 f"{int(np.sum(robot.velocity_limit > 0))} with a velocity limit above zero."
             )
-        if self._given_shape is not None:
-            chosen = nominal_at_shape(robot, self._given_shape, self._triples, self._largest_edge)
-        else:
-            chosen = best_nominal(robot, q, self._triples, self._largest_edge, self._is_roomy)
+        chosen = self.best(q) if self._given_shape is None else self.around(self._given_shape)
         names = [robot.joint_names[i] for i in chosen.joints]
         least = int(np.argmin(chosen.longest))
         if chosen.longest[least] < _MIN_EDGE:
@@ -204,144 +179,131 @@ class NominalShapeChooser:
             )
         return chosen
 
+    def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
+        """Return the nominal shape with unlimited joints moved by whole revolutions close to
+        ``q``."""
+        turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
+        return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
-def nominal_at_shape(
-    robot: SpaceRobot, shape: Array, triples: Sequence[tuple[int, int, int]], largest_edge: float
-) -> NominalShape:
-    """Return a given shape (n,) with the best joint triple.
+    def around(self, shape: Array) -> NominalShape:
+        """Return a given shape (n,) with the best joint triple.
 
-    Boxes that do not fit around it are shifted into the limits; see :class:`NominalShape`.
-    """
-    K = curvatures(robot, shape[np.newaxis])[0]
-    lower, upper = robot.lower, robot.upper
-    candidates = []
-    for triple in triples:
-        longest = np.minimum(largest_edge, (upper - lower)[list(triple)])
-        candidates.append(NominalShape(shape, triple, curvature_matrices(K, triple), longest))
-    return max(candidates, key=lambda nominal: float(_worst_axis_turn(nominal.M, nominal.longest)))
+        Boxes that do not fit around it are shifted into the limits; see :class:`NominalShape`.
+        """
+        K = curvatures(self._robot, shape[np.newaxis])[0]
+        width = np.minimum(self._largest_edge, self._robot.upper - self._robot.lower)
+        return _best(
+            NominalShape(shape, triple, curvature_matrices(K, triple), width[list(triple)])
+            for triple in self.triples
+        )
 
+    def best(self, held: Array) -> NominalShape:
+        """Return the best nominal shape over all triples; other joints are as in ``held`` (n,).
 
-def best_nominal(
-    robot: SpaceRobot,
-    held: Array,
-    triples: Sequence[tuple[int, int, int]],
-    largest_edge: float,
-    is_roomy: LoopRoomTest | None = None,
-) -> NominalShape:
-    """Return the best nominal shape over all triples; other joints are as in ``held`` (n,).
+        Boxes with the longest edges around it fit within the limits. Links have room there if they
+        have room anywhere.
+        """
+        triples = self._best_triples()
+        points = _GRID_POINTS.get(len(triples), 5)
+        return _best(self._best_of_triple(held, triple, points) for triple in triples)
 
-    Boxes with the longest edges around it fit within the limits. Links have room there
-    (``is_roomy``) if they have room anywhere.
-    """
-    triples = _select_best_triples(robot, triples, largest_edge)
-    points = _GRID_POINTS.get(len(triples), 5)
-    return max(
-        (
-            _best_shape_of_triple(robot, held, triple, largest_edge, points, is_roomy)
-            for triple in triples
-        ),
-        key=lambda nominal: float(_worst_axis_turn(nominal.M, nominal.longest)),
-    )
+    def shapes_with_more_room(self, held: Array, is_clear: ClearanceTest) -> Iterator[NominalShape]:
+        """Yield other nominal shapes, around which loops have room; see :meth:`with_clearance`.
 
+        The edges of the first box are as long as loop edges may be, those of the next box half as
+        long, and so on. Nothing is yielded if the user has specified the nominal shape.
+        """
+        if self._given_shape is None:
+            found = (self.with_clearance(held, share, is_clear) for share in _BOX_SHARES)
+            yield from (each for each in found if each is not None)
 
-def nominal_with_clearance(
-    robot: SpaceRobot,
-    held: Array,
-    triples: Sequence[tuple[int, int, int]],
-    largest_edge: float,
-    share: float,
-    is_clear: ClearanceTest,
-) -> NominalShape | None:
-    """Return the best nominal shape on a grid around which links keep the clearance, or None.
+    def with_clearance(
+        self, held: Array, share: float, is_clear: ClearanceTest
+    ) -> NominalShape | None:
+        """Return the best nominal shape on a grid around which links keep the clearance, or None.
 
-    They keep it in a box with a fraction of the longest edges, which bounds the loop edges.
-    Other joints are as in ``held`` (n,).
-    """
-    ranked: list[tuple[float, NominalShape]] = []
-    for triple in _select_best_triples(robot, triples, largest_edge):
+        They keep it in a box with a fraction of the longest edges, which bounds the loop edges.
+        Other joints are as in ``held`` (n,).
+        """
+        ranked: list[tuple[float, NominalShape]] = []
+        for triple in self._best_triples():
+            at = _grid(*self._box(triple), _BOX_GRID_POINTS)
+            shapes, matrices, longest = self._loops_at(held, triple, at)
+            edges = share * longest
+            turns = _worst_axis_turn(matrices, edges).tolist()
+            ranked += [
+                (turn, NominalShape(shape, triple, M, box))
+                for turn, shape, M, box in zip(turns, shapes, matrices, edges, strict=True)
+            ]
+        ranked.sort(key=lambda each: -each[0])
+        for turn, nominal in ranked[:_MAX_BOXES]:
+            too_small = turn <= 0.0 or nominal.longest.min() < _MIN_EDGE
+            if too_small or nominal.condition >= MAX_CONDITION:
+                continue
+            corners = np.tile(nominal.shape, (len(_NEIGHBOUR_OFFSETS), 1))
+            corners[:, list(nominal.joints)] += 0.5 * nominal.longest * _NEIGHBOUR_OFFSETS
+            if is_clear(corners):
+                return nominal
+        return None
+
+    def _best_triples(self) -> Sequence[Triple]:
+        robot = self._robot
+        if len(self.triples) <= _MAX_TRIPLES:
+            return self.triples
+        shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)
+        K = curvatures(robot, shapes)
+
+        def best(triple: Triple) -> float:
+            longest = self._centred_edges(triple, shapes[:, list(triple)])
+            return float(_worst_axis_turn(curvature_matrices(K, triple), longest).max())
+
+        return sorted(self.triples, key=best, reverse=True)[:_MAX_TRIPLES]
+
+    def _best_of_triple(self, held: Array, triple: Triple, points: int) -> NominalShape:
+        lower, upper = self._box(triple)
+        step, at = (upper - lower) / (points - 1), _grid(lower, upper, points)
+        for _ in range(_GRID_REFINEMENTS):
+            shapes, matrices, longest = self._loops_at(held, triple, at)
+            measures = _worst_axis_turn(matrices, longest)
+            if self._is_roomy is not None:
+                roomy = self._is_roomy(shapes)
+                if roomy.any():
+                    measures = np.where(roomy, measures, 0.0)
+            best = _most_central_index(at, measures, (lower + upper) / 2)
+            step = step / 2
+            at = np.clip(at[best] + step * _NEIGHBOUR_OFFSETS, lower, upper)
+        # The search ends with the best point in the centre of its neighbourhood.
+        shape = held.copy()
+        shape[list(triple)] = at[0]
+        return NominalShape(shape, triple, matrices[best], longest[best])
+
+    def _box(self, triple: Triple) -> tuple[Array, Array]:
+        lower, upper = shape_box(self._robot)
+        return lower[list(triple)], upper[list(triple)]
+
+    def _loops_at(self, held: Array, triple: Triple, at: Array) -> tuple[Array, Array, Array]:
+        """Return shapes (N, n) with three joints at (N, 3), M (N, 3, 3) and longest edges (N, 3)
+        there."""
+        shapes = np.tile(held, (len(at), 1))
+        shapes[:, list(triple)] = at
+        M = curvature_matrices(curvatures(self._robot, shapes), triple)
+        return shapes, M, self._centred_edges(triple, at)
+
+    def _centred_edges(self, triple: Triple, at: Array) -> Array:
+        """Return the longest edges (N, 3) of boxes around points (N, 3) within joint limits."""
         chosen = list(triple)
-        lower, upper = (bound[chosen] for bound in shape_box(robot))
-        axes = [np.linspace(a, b, _BOX_GRID_POINTS) for a, b in zip(lower, upper, strict=True)]
-        at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        matrices, longest = _matrices_and_edges(robot, held, chosen, at, largest_edge)
-        edges = share * longest
-        for place, M, box, turn in zip(
-            at, matrices, edges, _worst_axis_turn(matrices, edges), strict=True
-        ):
-            shape = held.copy()
-            shape[chosen] = place
-            ranked.append((float(turn), NominalShape(shape, triple, M, box)))
-    ranked.sort(key=lambda each: -each[0])
-    for turn, nominal in ranked[:_MAX_BOXES]:
-        if turn <= 0.0 or nominal.longest.min() < _MIN_EDGE or nominal.condition >= MAX_CONDITION:
-            continue
-        corners = np.tile(nominal.shape, (len(_NEIGHBOUR_OFFSETS), 1))
-        corners[:, list(nominal.joints)] += 0.5 * nominal.longest * _NEIGHBOUR_OFFSETS
-        if is_clear(corners):
-            return nominal
-    return None
+        room = np.minimum(at - self._robot.lower[chosen], self._robot.upper[chosen] - at)
+        return np.clip(2 * room, 0.0, self._largest_edge)
 
 
-def _select_best_triples(
-    robot: SpaceRobot, triples: Sequence[tuple[int, int, int]], largest_edge: float
-) -> Sequence[tuple[int, int, int]]:
-    if len(triples) <= _MAX_TRIPLES:
-        return triples
-    shapes = sample_shapes(robot, _SAMPLED_SHAPE_COUNT)
-    K = curvatures(robot, shapes)
-
-    def best(triple: tuple[int, int, int]) -> float:
-        longest = _centred_edges(robot, list(triple), shapes[:, list(triple)], largest_edge)
-        return float(_worst_axis_turn(curvature_matrices(K, triple), longest).max())
-
-    return sorted(triples, key=best, reverse=True)[:_MAX_TRIPLES]
+def _best(candidates: Iterable[NominalShape]) -> NominalShape:
+    return max(candidates, key=lambda each: float(_worst_axis_turn(each.M, each.longest)))
 
 
-def _best_shape_of_triple(
-    robot: SpaceRobot,
-    held: Array,
-    triple: tuple[int, int, int],
-    largest_edge: float,
-    points: int,
-    is_roomy: LoopRoomTest | None,
-) -> NominalShape:
-    chosen = list(triple)
-    lower, upper = (bound[chosen] for bound in shape_box(robot))
-    step = (upper - lower) / (points - 1)
+def _grid(lower: Array, upper: Array, points: int) -> Array:
+    """Return the points (points^3, 3) of a grid over a box."""
     axes = [np.linspace(low, high, points) for low, high in zip(lower, upper, strict=True)]
-    at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    for _ in range(_GRID_REFINEMENTS):
-        matrices, longest = _matrices_and_edges(robot, held, chosen, at, largest_edge)
-        measures = _worst_axis_turn(matrices, longest)
-        if is_roomy is not None:
-            shapes = np.tile(held, (len(at), 1))
-            shapes[:, chosen] = at
-            roomy = is_roomy(shapes)
-            if roomy.any():
-                measures = np.where(roomy, measures, 0.0)
-        best = _most_central_index(at, measures, (lower + upper) / 2)
-        step = step / 2
-        at = np.clip(at[best] + step * _NEIGHBOUR_OFFSETS, lower, upper)
-    # The search ends with the best point in the centre of its neighbourhood.
-    shape = held.copy()
-    shape[chosen] = at[0]
-    return NominalShape(shape, triple, matrices[best], longest[best])
-
-
-def _matrices_and_edges(
-    robot: SpaceRobot, held: Array, chosen: list[int], at: Array, largest_edge: float
-) -> tuple[Array, Array]:
-    """Return M (N, 3, 3) and the longest edges (N, 3) at positions (N, 3) of three joints."""
-    shapes = np.tile(held, (len(at), 1))
-    shapes[:, chosen] = at
-    M = curvature_matrices(curvatures(robot, shapes), chosen)
-    return M, _centred_edges(robot, chosen, at, largest_edge)
-
-
-def _centred_edges(robot: SpaceRobot, chosen: list[int], at: Array, largest_edge: float) -> Array:
-    """Return the longest edges (N, 3) of boxes around points (N, 3) within the joint limits."""
-    room = np.minimum(at - robot.lower[chosen], robot.upper[chosen] - at)
-    return np.clip(2 * room, 0.0, largest_edge)
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _worst_axis_turn(M: Array, longest: Array) -> Array:
@@ -355,8 +317,7 @@ def _most_central_index(at: Array, measures: Array, middle: Array) -> int:
     return int(good[np.argmin(np.linalg.norm(at[good] - middle, axis=1))])
 
 
-def _list_triples(robot: SpaceRobot, names: Sequence[str]) -> list[tuple[int, int, int]]:
-    """Return the triples of joints to choose from, without joints of zero velocity limit."""
+def _list_triples(robot: SpaceRobot, names: Sequence[str]) -> list[Triple]:
     if not names:
         movable = np.flatnonzero(robot.velocity_limit > 0).tolist()
         return list(itertools.combinations(movable, 3))
