@@ -6,8 +6,7 @@ Joints that do not follow their commands are detected.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -74,12 +73,21 @@ class ScheduleFollower:
         Feedback gain from shape error to velocity, 1/s.
     deadband
         Shape errors up to this value are noise and not fed back, m or rad.
+    brakes
+        Whether the schedule is a :func:`braking_schedule`, whose end does not wait for the joints.
     """
 
     def __init__(
-        self, schedule: GaitSchedule, start_ns: int, shape_gain: float, deadband: float = 0.0
+        self,
+        schedule: GaitSchedule,
+        start_ns: int,
+        shape_gain: float,
+        deadband: float = 0.0,
+        *,
+        brakes: bool = False,
     ) -> None:
-        self.schedule = schedule
+        self.schedule, self.brakes = schedule, brakes
+        self._settling_ns = 0 if brakes else round(_MAX_SETTLING_TIME * SECOND)
         self.start_ns = start_ns
         self._period_ns = round(schedule.control_period * SECOND)
         self._last_tick = schedule.ticks
@@ -103,15 +111,26 @@ class ScheduleFollower:
             return False
         last = self._positions[-1] + late / SECOND * self._after
         far = np.abs(last - q).max(initial=0.0) > max(_END_TOLERANCE, self._deadband)
-        return not far or late > _MAX_SETTLING_TIME * SECOND
+        return not far or self.brakes or self.is_overdue(stamp_ns)
 
     def is_overdue(self, stamp_ns: int) -> bool:
         """Whether the schedule has been over for longer than any settling time."""
-        return stamp_ns - self._end_ns > _MAX_SETTLING_TIME * SECOND
+        return stamp_ns - self._end_ns > self._settling_ns
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether the schedule, or the settling time after it, covers a given time."""
-        return self.start_ns <= stamp_ns <= self._end_ns + _MAX_SETTLING_TIME * SECOND
+        return self.start_ns <= stamp_ns <= self._end_ns + self._settling_ns
+
+    def braking(self, stamp_ns: int, duration: float) -> ScheduleFollower:
+        """Return the follower that brakes along the schedule from a time on; see
+        :func:`braking_schedule`."""
+        braking = braking_schedule(self.schedule, (stamp_ns - self.start_ns) / SECOND, duration)
+        return ScheduleFollower(braking, stamp_ns, self.gain, brakes=True)
+
+    def shapes_from(self, stamp_ns: int) -> Array:
+        """Return the shapes at the ticks from a time to the end, at least two."""
+        tick = (stamp_ns - self.start_ns) // self._period_ns
+        return self._positions[min(max(tick, 0), self._last_tick - 1) :].copy()
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
         """Return the first tick at least ``after`` s from now; None after the last tick."""
@@ -143,8 +162,8 @@ class ScheduleFollower:
             velocity += self.gain * (late / SECOND) * self._after
 
 
-class BrakingFollower:
-    """Slows down along a schedule and comes to rest on its path.
+def braking_schedule(schedule: GaitSchedule, begins: float, duration: float) -> GaitSchedule:
+    """Return a schedule that slows down along another one and comes to rest on its path.
 
     Gait time runs at the rate ``1 - t/T``: the shape stays on the gait's path and, since the base
     path at zero momentum does not depend on speed, so does the base. Wheels that keep spinning
@@ -152,68 +171,29 @@ class BrakingFollower:
 
     Parameters
     ----------
-    follower
-        Of the schedule until then.
-    stamp_ns
-        Start of braking, ns.
+    schedule
+        The schedule until then.
+    begins
+        Time since its start, s.
     duration
-        T, s; the gait continues for half this time.
+        T, s; the gait continues for half this time. It ends with the tick at which T is over.
     """
-
-    def __init__(self, follower: ScheduleFollower, stamp_ns: int, duration: float) -> None:
-        self.schedule, self._gain = follower.schedule, follower.gain
-        self._begin_s = (stamp_ns - follower.start_ns) / SECOND
-        self._stamp_ns, self._duration = stamp_ns, duration
-
-    def covers(self, stamp_ns: int) -> bool:
-        """Whether the braking covers a time."""
-        return 0 <= stamp_ns - self._stamp_ns <= self._duration * SECOND
-
-    def has_ended(self, stamp_ns: int, q: Array) -> bool:
-        """Whether the joints have come to rest."""
-        return (stamp_ns - self._stamp_ns) / SECOND >= self._duration
-
-    def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
-        """Write the current desired shape (n,) and the velocities to hold from now on (n,)."""
-        since = (stamp_ns - self._stamp_ns) / SECOND
-        position[:] = self._shape_after(since)
-        tick = self.schedule.control_period
-        velocity[:] = (self._shape_after(since + tick) - position) / tick + self._gain * (
-            position - q
-        )
-
-    def shapes(self, stamp_ns: int) -> Array:
-        """Return the desired shapes (N + 1, n) at the ticks from now until the joints are at
-        rest."""
-        tick = self.schedule.control_period
-        since = (stamp_ns - self._stamp_ns) / SECOND
-        ticks = max(1, math.ceil((self._duration - since) / tick - 1e-9))
-        return np.array([self._shape_after(since + k * tick) for k in range(ticks + 1)])
-
-    def _shape_after(self, since: float) -> Array:
-        tau = min(since / self._duration, 1.0)
-        ticks = (self._begin_s + self._duration * (tau - tau**2 / 2)) / self.schedule.control_period
-        positions = self.schedule.positions
-        k = min(max(int(ticks), 0), len(positions) - 1)
-        ahead = positions[min(k + 1, len(positions) - 1)] - positions[k]
-        shape = np.asarray(positions[k] + (ticks - k) * ahead)
-        end = self.schedule.end_velocities
-        if end is not None:
-            # From the rate at the beginning to that of the end, steadily.
-            T, t = self._duration, min(since, self._duration)
-            first, begin = self._at_begin
-            turned = begin + t * first + t**2 / (2 * T) * (end - first) + (since - t) * end
-            shape = np.where(end != 0, turned, shape)
-        return shape
-
-    @cached_property
-    def _at_begin(self) -> tuple[Array, Array]:
-        """Velocities (n,) and shape (n,) at the beginning of the braking."""
-        ticks = self._begin_s / self.schedule.control_period
-        positions = self.schedule.positions
-        k = min(max(int(ticks), 0), len(positions) - 2)
-        velocity = self.schedule.velocities[k]
-        return velocity, positions[k] + (ticks - k) * self.schedule.control_period * velocity
+    period, positions, last = schedule.control_period, schedule.positions, schedule.ticks
+    since: Array = period * np.arange(max(1, math.ceil(duration / period - 1e-9)) + 1, dtype=float)
+    tau = np.minimum(since / duration, 1.0)
+    ticks = (begins + duration * (tau - tau**2 / 2)) / period
+    k = np.clip(ticks.astype(int), 0, last)
+    ahead = positions[np.minimum(k + 1, last)] - positions[k]
+    shapes = positions[k] + (ticks - k)[:, np.newaxis] * ahead
+    end = schedule.end_velocities
+    if end is not None:
+        # From the rate at the beginning to that of the end, steadily.
+        first = schedule.velocities[min(k[0], last - 1)]
+        t = np.minimum(since, duration)[:, np.newaxis]
+        turned = shapes[0] + t * first + t**2 / (2 * duration) * (end - first)
+        turned += (since[:, np.newaxis] - t) * end
+        shapes = np.where(end != 0, turned, shapes)
+    return replace(schedule, positions=shapes)
 
 
 class TrajectoryTracker:
@@ -237,7 +217,7 @@ class TrajectoryTracker:
         self._ends_by_result = config.output == "trajectory"
         """Whether the robot's own controller follows schedules, and reports their end."""
         self._has_result = False
-        self._follower: ScheduleFollower | BrakingFollower | None = None
+        self._follower: ScheduleFollower | None = None
         self._holds_position = False
         """Whether the setpoint position is the shape to hold."""
         self._wheels = ReactionWheels.of(robot.description).index
@@ -269,7 +249,7 @@ class TrajectoryTracker:
     @property
     def is_braking(self) -> bool:
         """Whether the joints brake along a schedule."""
-        return isinstance(self._follower, BrakingFollower)
+        return self._follower is not None and self._follower.brakes
 
     def start(self, schedule: GaitSchedule, stamp_ns: int, average: int = 0) -> None:
         """Track a schedule with this stamp for its first tick.
@@ -294,7 +274,7 @@ class TrajectoryTracker:
     def braking_shapes(self, stamp_ns: int) -> Array | None:
         """Return the shapes (N + 1, n) at the ticks if braking started now; None at rest."""
         follower = self._begin_braking(stamp_ns)
-        return None if follower is None else follower.shapes(stamp_ns)
+        return None if follower is None else follower.shapes_from(stamp_ns)
 
     def rates_after_braking(self) -> Array | None:
         """Return the velocities (n,) held after braking; None: zero."""
@@ -308,10 +288,10 @@ class TrajectoryTracker:
         rates[self._wheels] = state.qdot[self._wheels]
         return rates
 
-    def _begin_braking(self, stamp_ns: int) -> BrakingFollower | None:
-        if isinstance(self._follower, ScheduleFollower):
-            return BrakingFollower(self._follower, stamp_ns, self._config.abort_time)
-        return self._follower
+    def _begin_braking(self, stamp_ns: int) -> ScheduleFollower | None:
+        if self._follower is None or self._follower.brakes:
+            return self._follower
+        return self._follower.braking(stamp_ns, self._config.abort_time)
 
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
         """Return the tick, at least ``after`` s from now, at which a plan may take over.
@@ -319,7 +299,7 @@ class TrajectoryTracker:
         Its first shape is the desired one, except for joints whose measured position in ``q`` (n,)
         is off by more than noise. None if no schedule is tracked, or if it is over by then.
         """
-        if not isinstance(self._follower, ScheduleFollower):
+        if self._follower is None or self._follower.brakes:
             return None
         take_over = self._follower.take_over(stamp_ns, after)
         if take_over is not None:
@@ -333,9 +313,10 @@ class TrajectoryTracker:
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the schedule or the braking is over."""
-        if self._ends_by_result and isinstance(self._follower, ScheduleFollower):
-            return self._has_result or self._follower.is_overdue(stamp_ns)
-        return self._follower is not None and self._follower.has_ended(stamp_ns, q)
+        follower = self._follower
+        if follower is not None and self._ends_by_result and not follower.brakes:
+            return self._has_result or follower.is_overdue(stamp_ns)
+        return follower is not None and follower.has_ended(stamp_ns, q)
 
     def end_by_result(self) -> None:
         """End the schedule at the next state, because the controller that follows it has ended
@@ -344,18 +325,17 @@ class TrajectoryTracker:
 
     def stop(self, *, at_last_shape: bool = False) -> None:
         """Stop tracking; hold the schedule's last shape, or the next measured shape."""
-        if at_last_shape and isinstance(self._follower, ScheduleFollower):
+        self._holds_position = at_last_shape and self._follower is not None
+        if at_last_shape and self._follower is not None:
             self.setpoint.position[:] = self._follower.schedule.positions[-1]
-            self._holds_position = True
-        else:
-            self._holds_position = False
         if self._follower is not None and self._follower.schedule.end_velocities is not None:
             self.setpoint.velocity[:] = self._follower.schedule.end_velocities
         self._follower = None
 
     def is_check_due(self, stamp_ns: int) -> bool:
         """Whether the schedule has a predicted pose to check at this time."""
-        return isinstance(self._follower, ScheduleFollower) and self.path_check.due(stamp_ns)
+        follower = self._follower
+        return follower is not None and not follower.brakes and self.path_check.due(stamp_ns)
 
     def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
         """Write the setpoint for the current shape ``q`` (n,), and return the stuck joints.
