@@ -42,8 +42,8 @@ _MIN_OPERATIONS_TO_KEEP = 200
 """Smallest number of operations in a cached function: loading it is faster than deriving it, even
 if functions are derived together and only some are missing."""
 
-ANNOUNCEMENT_ATTRIBUTE = "announcement"
-"""Attribute of log records announcing a long computation."""
+announcement_listeners: list[Callable[[str], None]] = []
+"""Functions called with a message when a long computation begins, which the log has too."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -242,10 +242,10 @@ def _run_compiler(command: Sequence[str], folder: Path) -> None:
 @lru_cache(maxsize=1)
 def _announce_compilation() -> None:
     """Log once per process that the first flight of a robot waits for the compiler."""
-    _LOG.info(
-        "Compiling the equations of this robot: this takes some seconds, only once.",
-        extra={ANNOUNCEMENT_ATTRIBUTE: True},
-    )
+    message = "Compiling the equations of this robot: this takes some seconds, only once."
+    _LOG.info(message)
+    for announce in tuple(announcement_listeners):
+        announce(message)
 
 
 @lru_cache

@@ -16,7 +16,6 @@ from spacerobot_ros import plan
 from spacerobot_ros.cli.terminal import Display, display
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.progress import (
@@ -284,18 +283,6 @@ def test_a_search_reports_every_start_and_the_best_so_far() -> None:
     with pytest.raises(PlanningError):
         plan("sliding_masses", position=(9.0, 0.0, 0.0), starts=1)
     assert len(seen) == count, "nothing is report_progress afterwards"
-
-
-def test_listening_changes_nothing_for_others() -> None:
-    package = logging.getLogger("spacerobot_ros")
-    before, handlers = package.level, list(package.handlers)
-    sentences: list[str] = []
-    with report_progress(lambda progress: None, sentences.append):
-        _LOG.info("something")
-        _LOG.info("It takes long.", extra={ANNOUNCEMENT_ATTRIBUTE: True})
-        log_progress(_LOG, SearchProgress(1, 2), "start 1")
-    assert sentences == ["It takes long."]
-    assert (package.level, package.handlers) == (before, handlers)
 
 
 def test_a_long_search_and_flight_are_shown_by_a_line_that_stays_true(

@@ -1,7 +1,7 @@
 """Search progress, and announcements of other long-running work.
 
-A search writes its progress to the log, in a record recognised by :func:`report_progress`. So the
-progress passes through methods that do not handle it, and out of planning threads.
+Those who show progress listen for all searches of the process. So progress passes through methods
+that do not handle it, and out of planning threads.
 """
 
 from __future__ import annotations
@@ -13,10 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 
-from spacerobot_ros.model.compilation import ANNOUNCEMENT_ATTRIBUTE
-
-_RECORD_ATTRIBUTE = "search_progress"
-_PACKAGE = "spacerobot_ros"
+from spacerobot_ros.model.compilation import announcement_listeners
 
 
 class SearchPhase(Enum):
@@ -62,9 +59,14 @@ class SearchProgress:
         return f"{self.phase.value}, {starts * counted}{best}"
 
 
+_listeners: list[Callable[[SearchProgress], None]] = []
+
+
 def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) -> None:
-    """Log a message about a search, with its progress."""
-    logger.info(line, extra={_RECORD_ATTRIBUTE: progress})
+    """Log a message about a search, and report its progress."""
+    logger.info(line)
+    for show in tuple(_listeners):
+        show(progress)
 
 
 @contextmanager
@@ -80,34 +82,10 @@ def report_progress(
     announce
         Called with a message when other long-running work begins.
     """
-    handler, logger = _ProgressHandler(show, announce), logging.getLogger(_PACKAGE)
-    before = logger.level
-    # Python prints warnings only as long as no handler takes records.
-    unhandled = None if logger.hasHandlers() else logging.lastResort
-    if unhandled is not None:
-        logger.addHandler(unhandled)
-    logger.addHandler(handler)
-    # Other handlers keep their own levels, so their output does not change.
-    logger.setLevel(logging.INFO if before == logging.NOTSET else min(before, logging.INFO))
+    _listeners.append(show)
+    announcement_listeners.append(announce)
     try:
         yield
     finally:
-        logger.setLevel(before)
-        logger.removeHandler(handler)
-        if unhandled is not None:
-            logger.removeHandler(unhandled)
-
-
-class _ProgressHandler(logging.Handler):
-    def __init__(
-        self, show: Callable[[SearchProgress], None], announce: Callable[[str], None]
-    ) -> None:
-        super().__init__(logging.INFO)
-        self._show, self._announce = show, announce
-
-    def emit(self, record: logging.LogRecord) -> None:
-        progress = getattr(record, _RECORD_ATTRIBUTE, None)
-        if isinstance(progress, SearchProgress):
-            self._show(progress)
-        elif getattr(record, ANNOUNCEMENT_ATTRIBUTE, False):
-            self._announce(record.getMessage())
+        _listeners.remove(show)
+        announcement_listeners.remove(announce)
