@@ -313,9 +313,9 @@ def test_the_head_says_that_the_goal_is_not_that_of_the_scenario(tmp_path: Path)
 def test_several_schedules(tmp_path: Path) -> None:
     other = ([0.0, 0.0, 1.0], [0.0, 0.0, 0.1])
     statuses = [
-        (0.0, "Flying.", EXECUTING | goal_value(*other)),
-        (10.0, "Flying.", EXECUTING | goal_value()),
-        (20.0, "Flying.", EXECUTING | goal_value()),
+        (0.0, "Flying.", EXECUTING | goal_value(*other) | {"goal_id": "0.000000001"}),
+        (10.0, "Flying.", EXECUTING | goal_value() | {"goal_id": "10.000000000"}),
+        (20.0, "Flying.", EXECUTING | goal_value() | {"goal_id": "10.000000000"}),
         (30.0, "The goal is not met.", {"state": "failed"} | goal_value()),
     ]
     goals = [(0.0, *other), (10.0, *GOAL)]

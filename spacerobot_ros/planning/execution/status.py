@@ -526,30 +526,14 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
         None if no schedule was flown.
     """
     given = list(statuses)
-    schedules = [i for i, (_, status) in enumerate(given) if status.state is PlannerState.EXECUTING]
-    if not schedules:
+    executing = [each for each in given if each[1].state is PlannerState.EXECUTING]
+    if not executing:
         return None
-    first = last = schedules[-1]
-    for i in reversed(range(last)):
-        before = given[i][1]
-        match before.state, _have_same_goal(before, given[last][1]):
-            case PlannerState.EXECUTING, True:
-                first = i
-            case (PlannerState.PLANNING, _) | (PlannerState.REFUSED, False):
-                # A refused goal does not end the earlier goal.
-                pass
-            case _:
-                break
-    ended = [
+    last_began, last = executing[-1]
+    began = next(time for time, status in executing if status.goal_id == last.goal_id)
+    ends = (
         time
-        for time, status in given[last + 1 :]
-        if status.state.decided and status.state is not PlannerState.REFUSED
-    ]
-    return (ended[0] if ended else end_s) - given[first][0]
-
-
-def _have_same_goal(first: PlannerStatus, second: PlannerStatus) -> bool:
-    """Whether two statuses report on one goal, or on two goals with the same pose."""
-    same_id = bool(first.goal_id) and first.goal_id == second.goal_id
-    same_goal = first.goal == second.goal
-    return same_id or (same_goal and first.end_effector_goals == second.end_effector_goals)
+        for time, status in given
+        if time >= last_began and status.state.decided and status.state is not PlannerState.REFUSED
+    )
+    return next(ends, end_s) - began
