@@ -199,7 +199,7 @@ def test_a_path_on_a_topic_is_followed_and_another_takes_its_place(harness: Harn
     start = end_of_motion(urdf, NAMES, np.array([START]), [HAND], PLACE, ATTITUDE)[HAND][0]
     for message, said in (
         (path_through([]), "The path of 'end_effector' has no poses."),
-        (path_through([start, start * np.nan]), "Pose 2 of the path of 'end_effector' is [nan"),
+        (path_through([start, start * np.nan]), "Pose 2 of the path of 'end_effector' is invalid"),
         (
             path_through(start + WAY, frame="moon"),
             "is in frame 'moon'; goals are accepted in 'world'",

@@ -99,10 +99,8 @@ class EndEffectorGoal:
         GoalError
             There are no poses or too many, or one is invalid.
         """
-        values, name = (
-            as_numbers(poses, f"The goal path of '{link}'", GoalError),
-            f"The path of '{link}'",
-        )
+        values = as_numbers(poses, f"The goal path of '{link}'", GoalError)
+        name = f"The path of '{link}'"
         if not values.size:
             raise GoalError(f"{name} has no poses.")
         if values.ndim != 2 or values.shape[1] not in (3, 7):
@@ -114,24 +112,18 @@ class EndEffectorGoal:
             raise GoalError(
                 f"{name} has {len(values)} poses; at most {MAX_PATH_POSES} are allowed."
             )
-        refused = ~(np.abs(values) <= _MAX_COORDINATE).all(axis=1)
-        if refused.any():
-            k = int(np.argmax(refused))
-            raise GoalError(
-                f"Pose {k + 1} of the path of '{link}' is {values[k].tolist()}, which is not "
-                f"finite or farther than {_MAX_COORDINATE:g} m away."
-            )
-        if values.shape[1] == 7:
-            sizes = np.linalg.norm(values[:, 3:], axis=1)
-            if not sizes.all():
-                k = int(np.argmin(sizes))
+        goals = []
+        for k, pose in enumerate(values):
+            try:
+                goals.append(cls.checked(link, pose))
+            except GoalError as error:
                 raise GoalError(
-                    f"Pose {k + 1} of the path of '{link}' has a zero quaternion, not a rotation; "
-                    "give all of its poses an orientation, or none."
-                )
-            values = np.hstack([values[:, :3], values[:, 3:] / sizes[:, np.newaxis]])
-        goal = cls.checked(link, values[-1])
-        return replace(goal, waypoints=values[:-1]) if len(values) > 1 else goal
+                    f"Pose {k + 1} of the path of '{link}' is invalid: {error}"
+                ) from None
+        *waypoints, goal = goals
+        if not waypoints:
+            return goal
+        return replace(goal, waypoints=np.array([each.values for each in waypoints]))
 
     @classmethod
     def of_numbers(cls, link: str, numbers: npt.ArrayLike) -> EndEffectorGoal:
