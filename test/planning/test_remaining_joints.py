@@ -179,20 +179,6 @@ def test_joints_that_never_follow_again_are_found_in_the_end(
     assert 10.0 + 4 * NEEDED * TICK < min(found.values()) < 10.0 + 20 * NEEDED * TICK
 
 
-@pytest.mark.parametrize("commanded_too", [0.05, 0.0])
-@pytest.mark.parametrize("jump", [0.0, 0.004, 0.02])
-def test_a_plant_that_is_restarted_and_gets_no_commands_yet_has_no_stuck_joint(
-    jump: float, commanded_too: float
-) -> None:
-    """It resumes at an earlier state, where one joint was elsewhere: that is no motion."""
-    watch = StuckJointWatch(3, NEEDED, TICK)
-    velocity, q = np.array([0.05, 0.05, commanded_too]), np.zeros(3)
-    for tick in range(7 * NEEDED):
-        if tick == NEEDED:
-            q = np.array([0.0, -jump, 0.0])
-        assert watch.find_stuck(q, velocity * (tick + 1) * TICK, velocity) == [], tick
-
-
 # -- goals are planned with the joints that remain, and the plant, whose joints are --------------
 
 

@@ -423,9 +423,8 @@ class StuckJointWatch:
     For every joint, the range of positions since it last followed is compared with the commanded
     range. A joint is stuck if it was commanded to move in at least N ticks and the first range is a
     small fraction of the second. So joints that are not commanded to move, slow joints, and noisy
-    measurements are not mistaken for stuck joints. If no joint moves at all, or none has moved for
-    half of N ticks although several were commanded to, they are watched for longer, because a
-    restarted plant takes a while to receive commands.
+    measurements are not mistaken for stuck joints. If several joints are commanded to move and none
+    does, they are watched for longer, because commands may not arrive for a while.
 
     Parameters
     ----------
@@ -453,8 +452,6 @@ class StuckJointWatch:
         self._window = np.full(n, self._ticks, dtype=np.int64)
         self._commanded = np.zeros(n)
         self._commanded_range, self._measured_range = np.zeros((2, n)), np.zeros((2, n))
-        self._standstill_q, self._standstill_motion = np.full(n, np.inf), np.zeros(n)
-        self._standstill_ticks = 0
 
     def find_stuck(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
         """Return the indices of joints considered stuck from this tick on, usually none.
@@ -470,7 +467,6 @@ class StuckJointWatch:
                 return []
             self._suspicious = True
             self._restart_joints(np.ones(self._joints, dtype=np.bool_), q)
-        self._count_standstill(q, velocity)
         _widen_ranges(self._measured_range, q)
         self._commanded += velocity * self._control_period
         _widen_ranges(self._commanded_range, self._commanded)
@@ -487,7 +483,7 @@ class StuckJointWatch:
         stuck = due & (measured <= _STUCK_SHARE * commanded) & (commanded > self._band)
         moved = commanded > self._band
         still = measured[moved] <= _STUCK_SHARE * commanded[moved]
-        none_moves = (np.count_nonzero(moved) > 1 and still.all()) or self._is_at_standstill
+        none_moves = np.count_nonzero(moved) > 1 and still.all()
         if none_moves and self._window[due].max() < self._max_window:
             # Joints do not all jam at once: perhaps commands do not arrive for a while.
             stuck[:] = False
@@ -496,21 +492,6 @@ class StuckJointWatch:
         self._window[due] *= 2
         self._restart_joints(follows | stuck, q)
         return [int(i) for i in np.flatnonzero(stuck)]
-
-    def _count_standstill(self, q: Array, velocity: Array) -> None:
-        """Count the ticks without any motion, and sum the commanded motion of each joint."""
-        if np.abs(q - self._standstill_q).max(initial=0.0) > self._band:
-            self._standstill_q[:] = q
-            self._standstill_motion[:] = 0.0
-            self._standstill_ticks = 0
-        self._standstill_motion += np.abs(velocity) * self._control_period
-        self._standstill_ticks += 1
-
-    @property
-    def _is_at_standstill(self) -> bool:
-        """Whether several joints had commands to move for a while, and no joint moved."""
-        commanded = int(np.count_nonzero(self._standstill_motion > self._band))
-        return commanded > 1 and 2 * self._standstill_ticks >= self._ticks
 
     def _restart_joints(self, joints: npt.NDArray[np.bool_], q: Array) -> None:
         self._moving_ticks[joints], self._window[joints] = 0, self._ticks
