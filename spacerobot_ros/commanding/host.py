@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.events import Event
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.execution.status import ScheduleStart
-
-LogLevel = Literal["debug", "info", "warning", "error"]
+from spacerobot_ros.planning.execution.status import LogLevel, ScheduleStart
 
 
 class CommanderActivity(Enum):

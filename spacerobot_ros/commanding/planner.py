@@ -286,8 +286,8 @@ class PlannerCommander(Commander):
                 if self.trajectories is not None:
                     self.trajectories.start(start)
                 self._warn_of_disturbances(self._disturbances)
-            case Notice(severity, message):
-                host.log(severity.value, message)
+            case Notice(level, message):
+                host.log(level, message)
             case Transition(source, event, target):
                 host.log("debug", f"{source.value} -> {target.value}: {event.value}")
                 if self.trajectories is not None:

@@ -60,7 +60,7 @@ from spacerobot_ros.planning.execution.status import (
     PlanReason,
     Transition,
 )
-from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFrame
+from spacerobot_ros.planning.execution.teleoperation import TwistCommand
 from spacerobot_ros.planning.execution.worker import PlanJob, PlanningWorker
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 
@@ -529,7 +529,7 @@ def stop(loop: Loop) -> None:
 
 
 def twist(loop: Loop) -> None:
-    command = TwistCommand("mass_2", np.array([0.3, 0.01, -0.4]), np.ones(3), TwistFrame.BASE)
+    command = TwistCommand("mass_2", np.array([0.3, 0.01, -0.4]), np.ones(3), "base")
     with suppress(PlanningError):
         loop.executive.propose_twist(command)
 

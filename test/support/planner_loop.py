@@ -33,7 +33,6 @@ from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatus,
     ScheduleStart,
-    Severity,
     Transition,
 )
 from spacerobot_ros.planning.execution.worker import (
@@ -312,7 +311,7 @@ class Loop:
             match output:
                 case PursuedGoals() as pursued:
                     if problem := self.goal_file.pursue(pursued):
-                        output = Notice(Severity.ERROR, problem)
+                        output = Notice("error", problem)
                 case PlannerStatus() as status if status.state.decided:
                     refused = status.state is PlannerState.REFUSED
                     self.goal_file.end(status.goal_id, refused=refused)

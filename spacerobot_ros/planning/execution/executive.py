@@ -36,6 +36,7 @@ from spacerobot_ros.planning.execution.state_average import MeasuredState, State
 from spacerobot_ros.planning.execution.status import (
     ActiveGoal,
     Event,
+    LogLevel,
     Notice,
     Output,
     Phase,
@@ -44,7 +45,6 @@ from spacerobot_ros.planning.execution.status import (
     PlannerStatus,
     PlanReason,
     ScheduleStart,
-    Severity,
     Transition,
     describe_remaining_error,
 )
@@ -55,7 +55,6 @@ from spacerobot_ros.planning.execution.worker import (
     Planned,
     PlanningTask,
     PlanningWorker,
-    Postponed,
     Refused,
 )
 from spacerobot_ros.times import SECOND
@@ -245,7 +244,7 @@ class Executive:
         if final:
             active.not_flown_reason = why
         elif why:
-            self._add_notice(Severity.WARNING, f"{sentence_case(why)}.")
+            self._add_notice("warning", f"{sentence_case(why)}.")
         self._tracker.end_by_result()
 
     def configure(self, config: PlannerConfig) -> None:
@@ -312,7 +311,7 @@ class Executive:
                     f"{sentence_case(clause)}: the joints brake, and the remaining motion is "
                     "replanned."
                 )
-                self._add_notice(Severity.WARNING, message)
+                self._add_notice("warning", message)
                 self.outputs.append(active.status(PlannerState.EXECUTING, message))
                 self._brake_for_replan(Event.OBSTACLES)
 
@@ -329,7 +328,7 @@ class Executive:
             return
         self._drop_plan()
         self._change_phase(Event.PLANT_RESET, self._phase_at_rest())
-        self._add_notice(Severity.WARNING, message)
+        self._add_notice("warning", message)
 
     def cancel_plan(self) -> None:
         """Cancel the plan that the worker is computing; any thread may call this."""
@@ -509,7 +508,7 @@ class Executive:
         try:
             state = self._average.state()
         except PlanningError as reason:
-            self._add_notice(Severity.WARNING, f"The path is unknown: {reason}")
+            self._add_notice("warning", f"The path is unknown: {reason}")
             return
         error = None if corrected else self._tracker.path_check.error(state)
         if error is None:
@@ -668,17 +667,10 @@ class Executive:
         if result is None:
             return
         self.statistics.plan_time_s += result.wall_time
-        if isinstance(result, Postponed):
-            self._add_notice(
-                Severity.INFO,
-                f"The plan came {result.late:.3g} s after its start, while the robot drifts: "
-                "planning is repeated with a later start.",
-            )
-            return
         job, self._job = self._job, None
         assert job is not None
         self.statistics.plans += 1
-        self._add_notice(Severity.INFO, f"Planned in {result.wall_time:.6f} s.")
+        self._add_notice("info", f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
             result = result.for_goal(job.identified)
         if isinstance(result, Planned):
@@ -716,17 +708,17 @@ class Executive:
             last = self._in_motion_attempts == _MAX_IN_MOTION_ATTEMPTS
             again = "from rest" if last else "from a later tick"
             message = f"No plan begins in motion, so the goal is planned for {again}: {why}"
-            self._add_notice(Severity.WARNING, message)
+            self._add_notice("warning", message)
         elif reason is PlanReason.SHRINKING_HORIZON:
             message = f"The remaining motion is not planned again: {why}"
-            self._add_notice(Severity.INFO, message)
+            self._add_notice("info", message)
         elif reason.is_for_new_goal:
             message = why if active is None else f"{why} The earlier goal is still pursued."
             refused = PlannerStatus.of_goal(PlannerState.REFUSED, message, job.identified)
             self.outputs.append(refused)
         elif isinstance(job.error, TrackingError):
             message = f"{job.error}, and the remaining motion cannot be planned again: {why}"
-            self._add_notice(Severity.WARNING, message)
+            self._add_notice("warning", message)
         else:
             assert active is not None
             assert job.error is not None
@@ -803,7 +795,7 @@ class Executive:
         self._stop_motion(Event.TIME_JUMPED)
         before, now = self._stamp_ns / SECOND, stamp_ns / SECOND
         self._add_notice(
-            Severity.WARNING,
+            "warning",
             f"The state time has jumped from {before:.9g} s to {now:.9g} s, for which no "
             "motion is planned.",
         )
@@ -867,13 +859,13 @@ class Executive:
         self.outputs.append(Transition(self.phase, event, target))
         self.phase = target
 
-    def _add_notice(self, severity: Severity, message: str) -> None:
-        self.outputs.append(Notice(severity, message))
+    def _add_notice(self, level: LogLevel, message: str) -> None:
+        self.outputs.append(Notice(level, message))
 
     def _add_warning(
         self, kind: EventKind, message: str, about: IdentifiedGoal, values: Mapping[str, str]
     ) -> None:
-        self._add_notice(Severity.WARNING, message)
+        self._add_notice("warning", message)
         self._add_event(kind, message, about, 1, values)
 
     def _add_event(

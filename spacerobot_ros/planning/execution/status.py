@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from spacerobot_ros.errors import quantity
 from spacerobot_ros.events import (
@@ -225,19 +225,13 @@ _FORMAT = KeyValueFormat(
 )
 
 
-class Severity(Enum):
-    """Severity of a notice."""
-
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
+LogLevel = Literal["debug", "info", "warning", "error"]
 
 
-@dataclass(frozen=True)
-class Notice:
+class Notice(NamedTuple):
     """A log message."""
 
-    severity: Severity
+    level: LogLevel
     message: str
 
 

@@ -9,8 +9,7 @@ the twist, each relative to the joint's velocity limit. With ``keep_attitude``, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -55,12 +54,8 @@ _MIDPOINT_STEPS = 2
 _ROUNDING = 1e-12
 
 
-class TwistFrame(Enum):
-    """Frame of the components of a twist."""
-
-    WORLD = "world"
-    BASE = "base"
-    LINK = "link"
+TwistFrame = Literal["world", "base", "link"]
+"""Frame of the components of a twist."""
 
 
 @dataclass(frozen=True)
@@ -96,10 +91,10 @@ class TwistCommand:
         description = robot.description
         if link not in description.frames or link == description.base_link:
             raise PlanningError(f"Robot '{description.name}' has no end-effector '{link}'.")
-        frames = {
-            world: TwistFrame.WORLD,
-            description.base_link: TwistFrame.BASE,
-            link: TwistFrame.LINK,
+        frames: dict[str, TwistFrame] = {
+            world: "world",
+            description.base_link: "base",
+            link: "link",
         }
         # Frames of a robot may have a prefix.
         found = frames.get(frame) or frames.get(frame.rpartition("/")[2])
@@ -114,11 +109,7 @@ class TwistCommand:
 
     def in_base(self, R_WB: Array, R_BE: Array) -> tuple[Array, Array]:
         """Return both velocities (3,) in base components."""
-        R = {
-            TwistFrame.WORLD: R_WB.T,
-            TwistFrame.BASE: np.eye(3),
-            TwistFrame.LINK: R_BE,
-        }[self.frame]
+        R = {"world": R_WB.T, "base": np.eye(3), "link": R_BE}[self.frame]
         return R @ self.linear, R @ self.angular
 
 

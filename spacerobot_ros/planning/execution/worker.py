@@ -119,15 +119,6 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Postponed:
-    """A plan that was ready too late, and by how much, s; planning is repeated with a later
-    start."""
-
-    late: float
-    wall_time: float
-
-
-@dataclass(frozen=True)
 class Refused:
     """The reason for a failed plan, as a message, and the wall time spent planning, s."""
 
@@ -211,6 +202,8 @@ class PlanningWorker:
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
         """The latest method without stuck joints, and its task."""
         self._job: PlanningJob[GaitSchedule] | None = None
+        self._time = 0.0
+        """Wall time of the work on the requested plan so far, s."""
         self._coasting: _Coasting | None = None
         """Rest period at the start of the requested plan, because the base drifts meanwhile."""
 
@@ -238,7 +231,7 @@ class PlanningWorker:
 
     def submit(self, task: PlanningTask, stamp_ns: int) -> None:
         """Make a plan from the state with this stamp, synchronously or in a thread."""
-        self._coasting = None
+        self._coasting, self._time = None, 0.0
         at_rest = task.braking is None and task.take_over is None
         if at_rest and self.plans_in_background and self._drifts(task.request.state):
             self._coasting = _Coasting(task, stamp_ns, _COASTING_TIME)
@@ -252,13 +245,16 @@ class PlanningWorker:
         with nullcontext() if self.plans_in_background else self._long_work():
             self._job.start(in_background=self.plans_in_background)
 
-    def poll(self, stamp_ns: int) -> Planned | Refused | Postponed | None:
+    def poll(self, stamp_ns: int) -> Planned | Refused | None:
         """Return the result at the state with this stamp; None until the plan has ended, or if it
         was cancelled.
 
         Unexpected method errors are raised here.
         """
         result, coasting = self.take_result(), self._coasting
+        if result is not None:
+            self._time += result.wall_time
+            result = replace(result, wall_time=self._time)
         if not isinstance(result, Planned):
             return result
         if coasting is None:
@@ -275,7 +271,7 @@ class PlanningWorker:
         # The base has drifted past the start of the plan.
         self._coasting = replace(coasting, duration=_COASTING_FACTOR * elapsed)
         self.start(self._coasting.task(self._config.control_period))
-        return Postponed(elapsed - coasting.duration, result.wall_time)
+        return None
 
     def take_result(self) -> Planned | Refused | None:
         """Return the result of the work once; None until it has ended, or if it was cancelled."""
