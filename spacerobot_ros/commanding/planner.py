@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.host import CommanderHost, StateDecoder
@@ -37,28 +37,12 @@ from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.topics import twist_topic
 
 
-class _MeasuredState:
-    """A measured state for the planner: everything but the joints is read where it is needed."""
+class _MeasuredState(NamedTuple):
+    """A measured state for the planner."""
 
-    def __init__(self, decoder: StateDecoder) -> None:
-        self.decoder = decoder
-        self.stamp_ns = 0
-        self.odom: Any = None
-        self.base_error: CommandError | None = None
-        """The reason why the last :meth:`base` could not be read."""
-
-    @property
-    def q(self) -> Array:
-        return self.decoder.q
-
-    def base(self) -> BaseMeasurement | None:
-        if self.odom is None:
-            return None
-        try:
-            return BaseMeasurement(*self.decoder.decode_base(self.odom), self.decoder.qdot)
-        except CommandError as error:
-            self.base_error = error
-            return None
+    stamp_ns: int
+    q: Array
+    base: BaseMeasurement | None
 
 
 class PlannerCommander(Commander):
@@ -112,7 +96,6 @@ class PlannerCommander(Commander):
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
         worker = self._make_worker(robot)
         self.executive = Executive(robot, self.config, worker)
-        self._measured = _MeasuredState(decoder)
 
     def _make_worker(self, robot: SpaceRobot) -> PlanningWorker:
         described = robot.description
@@ -251,29 +234,31 @@ class PlannerCommander(Commander):
 
     def _answer_state(self, pairing: Pairing) -> None:
         """Answer a state as soon as its joints have arrived; only plans need its pose."""
-        executive, states, measured = self.executive, self.states, self._measured
+        executive, decoder, states = self.executive, self._decoder, self.states
         assert executive is not None
-        measured.odom = None if pairing is Pairing.WITHOUT_POSE else states.odom
+        assert decoder is not None
         try:
-            measured.stamp_ns = measured.decoder.decode_joints(states.joints)
+            stamp = decoder.decode_joints(states.joints)
         except CommandError as error:
             self._log_fault("state", f"joint_states: {error}.")
             return
+        base = None
+        if pairing is not Pairing.WITHOUT_POSE:
+            try:
+                base = BaseMeasurement(*decoder.decode_base(states.odom), decoder.qdot)
+            except CommandError as error:
+                self._log_fault("odom", f"odom: {error}.")
+        measured = _MeasuredState(stamp, decoder.q, base)
         if pairing is Pairing.LATE_POSE:
             # The state was answered without its pose; a plan uses the pose at the next joints.
             executive.add_base_measurement(measured)
-        else:
-            if self.trajectories is not None:
-                self.trajectories.check_server(measured.stamp_ns)
-            executive.update(measured)
-            if executive.outputs:
-                self._forward_outputs()
-                if not self.active:
-                    return
-            self.host.send_command(measured.stamp_ns)
-        if measured.base_error is not None:
-            self._log_fault("odom", f"odom: {measured.base_error}.")
-            measured.base_error = None
+            return
+        if self.trajectories is not None:
+            self.trajectories.check_server(stamp)
+        executive.update(measured)
+        self._forward_outputs()
+        if self.active:
+            self.host.send_command(stamp)
 
     def _forward(self, output: Any) -> None:
         host = self.host

@@ -366,7 +366,7 @@ def test_the_search_of_the_optimal_method_is_cancelled() -> None:
     cancellation = Cancellation()
     cancellation.cancel()
     state = loop.executive._average
-    base = loop.measured.base()
+    base = loop.measured.base
     assert base is not None
     state.add(base.pose, base.twist, loop.plant.q, base.qdot)
     goal = goal_at(([0.0, 0.0, 0.0], [0.05, -0.03, 0.02]))

@@ -424,6 +424,7 @@ class NoisyState(PlantState):
         self._draw()
         return self._q
 
+    @property
     def base(self) -> BaseMeasurement | None:
         self._draw()
         return self._base

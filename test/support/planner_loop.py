@@ -190,6 +190,7 @@ class PlantState:
     def q(self) -> Array:
         return self._plant.q * np.nan if self.broken else self._plant.q
 
+    @property
     def base(self) -> BaseMeasurement | None:
         if not self.seen:
             return None

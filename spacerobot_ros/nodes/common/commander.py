@@ -22,7 +22,6 @@ from std_msgs.msg import String
 
 from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.host import LogLevel
 from spacerobot_ros.commanding.plant_state import PlantStopped, Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
@@ -46,6 +45,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
+from spacerobot_ros.planning.execution.status import LogLevel
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, first_time_ns
 

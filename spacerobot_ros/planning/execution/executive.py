@@ -372,7 +372,7 @@ class Executive:
         if self.phase is Phase.TELEOPERATING:
             self._follow_twist(measured)
         elif not tracker.is_active:
-            base = measured.base() if tracker.needs_wheel_rates else None
+            base = measured.base if tracker.needs_wheel_rates else None
             qdot = None if base is None else base.qdot
             tracker.hold(q, qdot, obeyed=not self.plant_rests)
         self.statistics.commands_published += 1

@@ -40,8 +40,9 @@ class MeasuredState(Protocol):
     def q(self) -> Array:
         """Shape (n,), m or rad."""
 
+    @property
     def base(self) -> BaseMeasurement | None:
-        """Return base and rates; None if the base was not measured together with the joints."""
+        """Base and rates; None if the base was not measured together with the joints."""
 
 
 class StateAverage:
@@ -99,7 +100,7 @@ class StateAverage:
 
     def take(self, measured: MeasuredState, *, alone: bool = False) -> bool:
         """Add a state if its base was measured, or let it stand ``alone``; return whether."""
-        base = measured.base()
+        base = measured.base
         if base is None:
             return False
         if alone:

@@ -230,7 +230,7 @@ class Teleoperation:
 
     def keep_base_pose(self, measured: MeasuredState) -> None:
         """Store the measured base pose."""
-        following, base = self._following, measured.base()
+        following, base = self._following, measured.base
         if following is not None and base is not None and np.all(np.isfinite(base.pose)):
             following.pose, following.pose_ns = base.pose, measured.stamp_ns
 
