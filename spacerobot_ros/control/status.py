@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,13 +16,14 @@ from spacerobot_ros.events import (
     number_format,
 )
 from spacerobot_ros.planning.core.goal import Controlled
+from spacerobot_ros.planning.execution.status import GoalState
 
 if TYPE_CHECKING:
     from spacerobot_ros.control.controller import CoordinatedController
     from spacerobot_ros.control.limits import Saturated
 
 
-class ControllerState(str, Enum):
+class ControllerState(GoalState):
     """Value of ``state`` in controller/status."""
 
     WAITING = "waiting"
@@ -40,33 +40,6 @@ class ControllerState(str, Enum):
     ABORTED = "aborted"
     ESTIMATING = "estimating"
     STOPPED = "stopped"
-
-    @property
-    def decided(self) -> bool:
-        """Whether the goal state is final."""
-        return self in (
-            ControllerState.REACHED,
-            ControllerState.REACHED_PARTLY,
-            ControllerState.FAILED,
-            ControllerState.REFUSED,
-            ControllerState.ABORTED,
-        )
-
-    @property
-    def level(self) -> int:
-        """diagnostic_msgs/DiagnosticStatus level: 0 OK, 1 WARN, 2 ERROR."""
-        match self:
-            case ControllerState.FAILED | ControllerState.REFUSED | ControllerState.STOPPED:
-                return 2
-            case (
-                ControllerState.REACHED_PARTLY
-                | ControllerState.ABORTED
-                | ControllerState.ESTIMATING
-                | ControllerState.STALLED
-            ):
-                return 1
-            case _:
-                return 0
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,32 @@ _LATE_TIME_SHARE = 1 / 3
 """Remaining fraction of a motion's duration from which the motion counts as late."""
 
 
-class PlannerState(str, Enum):
+_LEVELS = {
+    "stalled": 1,
+    "estimating": 1,
+    "reached_partly": 1,
+    "aborted": 1,
+    "failed": 2,
+    "refused": 2,
+    "stopped": 2,
+}
+
+
+class GoalState(str, Enum):
+    """Value of ``state`` in the status of a commander."""
+
+    @property
+    def decided(self) -> bool:
+        """Whether the goal has ended and is no longer pursued."""
+        return self.value in ("reached", "reached_partly", "failed", "refused", "aborted")
+
+    @property
+    def level(self) -> int:
+        """diagnostic_msgs/DiagnosticStatus level: 0 OK, 1 WARN, 2 ERROR."""
+        return _LEVELS.get(self.value, 0)
+
+
+class PlannerState(GoalState):
     """Value of ``state`` in planner/status."""
 
     WAITING = "waiting"
@@ -53,21 +78,6 @@ class PlannerState(str, Enum):
     REFUSED = "refused"
     ABORTED = "aborted"
     TELEOPERATING = "teleoperating"
-
-    @property
-    def decided(self) -> bool:
-        """Whether the goal has ended and is no longer pursued."""
-        return self in (
-            *(PlannerState.REACHED, PlannerState.REACHED_PARTLY, PlannerState.FAILED),
-            *(PlannerState.REFUSED, PlannerState.ABORTED),
-        )
-
-    @property
-    def level(self) -> int:
-        """diagnostic_msgs/DiagnosticStatus level: 0 OK, 1 WARN, 2 ERROR."""
-        if self in (PlannerState.FAILED, PlannerState.REFUSED):
-            return 2
-        return 1 if self in (PlannerState.ABORTED, PlannerState.REACHED_PARTLY) else 0
 
 
 @dataclass(frozen=True)
