@@ -543,7 +543,8 @@ def obstacles(*, near: bool) -> Act:
     """Let other obstacles be there, which the rest of the schedule comes too near to, or not."""
     clearance: Any = SimpleNamespace(
         has_obstacles=True,
-        approaches=lambda positions, base: ["there"] * near,
+        required=lambda q, base: np.zeros(0),
+        approaches=lambda positions, required=None, base=None: ["there"] * near,
         clause=lambda approach, period: "link 'a' and obstacle 'b' touch",
     )
 
