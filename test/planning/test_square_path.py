@@ -417,18 +417,6 @@ def test_a_drifting_robot_is_refused(
     assert shown in text
 
 
-def test_the_goal_position_is_checked_on_request(chain: SpaceRobot) -> None:
-    end = np.array(paper_gait(chain).notes["final_position"])
-    attitude = about_z(np.pi / 2).as_quat()
-    reached = Goal.checked(end + np.array([0, 0, 9e-7]), attitude, DEPLOYED)
-    assert planner(chain, check_position=1).plan(at_rest(FOLDED), reached).ticks == 480
-    missed = Goal.checked(end + np.array([0, 0.01, 0]), attitude, DEPLOYED)
-    text = refusal_of(chain, at_rest(FOLDED), missed, check_position=1)
-    assert "0.01 m from the goal position" in text
-    assert str(np.round(end, 4).tolist()) in text
-    assert planner(chain).plan(at_rest(FOLDED), missed).ticks == 480
-
-
 @pytest.mark.parametrize("times", [{"t2": 8.0}, {"t3": 11.0}, {"t1": 30.0}, {"t4": 20.0}])
 def test_times_that_do_not_follow_each_other_are_refused(
     chain: SpaceRobot, times: dict[str, Any]

@@ -88,9 +88,6 @@ class SquarePathOptions:
     centre_2: float = parameter(
         0.0, "second coordinate of a given centre", "rad", minimum=-1000.0, maximum=1000.0
     )
-    check_position: int = nonnegative(
-        0, "1: reject goals whose position differs from the predicted one", maximum=1
-    )
     longest: float = parameter(3600.0, "longest permitted manoeuvre", "s", minimum=1.0, maximum=1e9)
 
 
@@ -200,13 +197,6 @@ class SquarePathGait(GaitMethod):
         )
         path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
-        if self.options.check_position and left.distance > tolerance.position:
-            raise PlanningError(
-                f"The base will be at {np.round(path.position[-1], 4).tolist()} m, "
-                f"{left.distance:.3g} m from the goal position: without thrust, attitude and "
-                "shape determine the base position; with check_position 0, the goal position is "
-                "ignored."
-            )
         notes: Notes = {
             "psi_e": psi_e.tolist(),
             "turn_of_step_1": step_1,
