@@ -42,7 +42,6 @@ from spacerobot_ros.planning.core.goal import (
     Controlled,
     EndEffectorGoal,
     Goal,
-    PoseError,
     RobotState,
     Tolerance,
     end_effector_pose,
@@ -544,11 +543,7 @@ class ResolvedRateGait(GaitMethod):
         self._require_goal_of_end_effectors(goal)
         if goal.has_path:
             return self._plan_along_path(replace(request, state=state, goal=goal), cancellation)
-        error = PoseError.between(state.position, state.quaternion, goal, q, self.robot)
         waypoints = self._waypoints(request, goal)
-        at_goal = Tolerance(_ZERO_DISTANCE, _ZERO_DISTANCE).admits(error, self.controls)
-        if at_goal and not len(waypoints):
-            return self._schedule(state, goal, q[np.newaxis], {})
         lines = self._link_paths(state, goal, request.tolerance, waypoints)
         if lines.length < _ZERO_DISTANCE:
             return self._schedule(state, goal, q[np.newaxis], {})
