@@ -179,7 +179,7 @@ class Commander(ABC):
         """Drop the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
             self.give_up_goals(PlantStopped(why))
-            self._stop_executive()
+            self._reset_executive()
         self.robot = self.executive = self._decoder = self._described = None
 
     def activate(self) -> None:
@@ -203,10 +203,15 @@ class Commander(ABC):
         why = f"Aborted: {failure or 'this node was deactivated.'}"
         if self.config.resume_file:
             why += " A goal from a topic is resumed when the node is activated again."
-        if self.activity is not CommanderActivity.INACTIVE and self.executive is not None:
-            self._stop_executive()
+        if self.activity is not CommanderActivity.INACTIVE:
+            self._reset_executive()
         self.activity, self._waiting_goals = CommanderActivity.INACTIVE, {}
         self._fly_to.end_dropped_goals((), why)
+
+    def _reset_executive(self) -> None:
+        if self.executive is not None:
+            self.executive.reset()
+            self._forward_outputs()
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -640,10 +645,6 @@ class Commander(ABC):
     @abstractmethod
     def _actuation_refusal(self) -> str:
         """Message on a plant that takes other commands than these; empty: it takes them."""
-
-    @abstractmethod
-    def _stop_executive(self) -> None:
-        """Stop the executive, which gives up its goals."""
 
     @abstractmethod
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:

@@ -289,10 +289,6 @@ class ControllerCommander(Commander):
             "plant with actuation:=effort."
         )
 
-    def _stop_executive(self) -> None:
-        assert self.executive is not None
-        self.executive.reset()
-
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         if self.executive is None:
             self._waiting_goals = dict(saved)

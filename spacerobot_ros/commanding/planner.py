@@ -140,14 +140,6 @@ class PlannerCommander(Commander):
             "coordinated_control."
         )
 
-    def _stop_executive(self) -> None:
-        assert self.executive is not None
-        if self.trajectories is None:
-            commands = self.statistics.commands_published
-            self.host.log("info", f"{commands} commands were published.")
-        self.executive.stop()
-        self._forward_outputs()
-
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
         goal = saved.get(BASE_GOAL_KEY)
         if goal is None:

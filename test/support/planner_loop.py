@@ -260,7 +260,7 @@ class Loop:
         return sentence
 
     def stop(self) -> None:
-        self.executive.stop()
+        self.executive.reset()
         self._take()
 
     def late(self) -> None:

@@ -334,12 +334,16 @@ class Executive:
         """Cancel the plan that the worker is computing; any thread may call this."""
         self._worker.cancel()
 
-    def stop(self) -> None:
-        """Abort all goals immediately, without a status, and wait for the worker to end."""
+    def reset(self) -> None:
+        """Drop all goals immediately, without a status, and wait for the worker to end."""
         self._tracker.stop()
         self._forget_goals()
         self._worker.close()
         self._change_phase(Event.DEACTIVATED, Phase.IDLE)
+        if self.config.output != "trajectory":
+            self._add_notice(
+                "info", f"{self.statistics.commands_published} commands were published."
+            )
 
     # -- measured states ----------------------------------------------------------------------
 
