@@ -24,10 +24,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import rotational
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
@@ -146,8 +143,6 @@ def external_loads(
     return ExternalLoads(tuple(forces), loads[layout.gravity_W], loads[layout.friction])
 
 
-# -- motion relative to a circular orbit ----------------------------------------------------------
-
 EARTH_GRAVITATION = 3.986004418e14
 """Earth's gravitational parameter, m^3/s^2."""
 
@@ -161,55 +156,3 @@ def mean_motion_at(altitude: float) -> float:
     ``altitude`` is the height above the equatorial radius, m.
     """
     return math.sqrt(EARTH_GRAVITATION / (EARTH_RADIUS + altitude) ** 3)
-
-
-def relative_motion(
-    n: float, r0_O: npt.ArrayLike, v0_O: npt.ArrayLike, t: npt.ArrayLike
-) -> tuple[Array, Array]:
-    """Return the position and velocity of a free body in the orbital frame at given times.
-
-    Closed-form solution of the Clohessy-Wiltshire equations (1960),
-    ``xdd = 3 n^2 x + 2 n yd``, ``ydd = -2 n xd``, ``zdd = -n^2 z``.
-
-    Parameters
-    ----------
-    n
-        Mean motion, rad/s; zero: uniform motion.
-    r0_O, v0_O
-        (3,) position (m) and velocity (m/s) at time zero, both relative to O, in O components.
-    t
-        (...) times, s.
-
-    Returns
-    -------
-    r_O, v_O
-        (..., 3), m and m/s.
-
-    Raises
-    ------
-    ParameterError
-        A value is not finite, or ``n`` is negative.
-    """
-    r0, v0, times = (np.asarray(each, dtype=float) for each in (r0_O, v0_O, t))
-    if not (math.isfinite(n) and n >= 0.0):
-        raise ParameterError(f"The mean motion is {n:g} rad/s; it must be finite and at least 0.")
-    if not all(np.all(np.isfinite(each)) for each in (r0, v0, times)):
-        raise ParameterError(
-            "The position, velocity and times of a relative motion must be finite."
-        )
-    if n == 0.0:
-        return r0 + times[..., np.newaxis] * v0, np.broadcast_to(v0, (*times.shape, 3)).copy()
-    angle = n * times
-    s, c = np.sin(angle), np.cos(angle)
-    (x, y, z), (x_dot, y_dot, z_dot) = r0, v0
-    r = (
-        (4 - 3 * c) * x + s / n * x_dot + 2 / n * (1 - c) * y_dot,
-        6 * (s - angle) * x + y - 2 / n * (1 - c) * x_dot + (4 * s - 3 * angle) / n * y_dot,
-        c * z + s / n * z_dot,
-    )
-    v = (
-        3 * n * s * x + c * x_dot + 2 * s * y_dot,
-        6 * n * (c - 1) * x - 2 * s * x_dot + (4 * c - 3) * y_dot,
-        -n * s * z + c * z_dot,
-    )
-    return np.stack(r, axis=-1), np.stack(v, axis=-1)

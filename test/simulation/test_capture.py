@@ -12,12 +12,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.oracles import Array, PinocchioOracle
+from support.oracles.orbit import relative_motion
 
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Inertia
-from spacerobot_ros.model.external_loads import relative_motion
 from spacerobot_ros.model.grasp import BodyMotion, Payload, RelativeMotion
 from spacerobot_ros.model.urdf import with_held_joints
 from spacerobot_ros.parameters import configured

@@ -16,13 +16,14 @@ from scipy.spatial.transform import Rotation
 from support.crossing import URDF, distance
 from support.effort_flights import random_urdf, robot_of, tumbling
 from support.oracles import Array, PinocchioOracle, assert_agrees, random_motion
+from support.oracles.orbit import relative_motion
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair, ObstaclePair
 from spacerobot_ros.collision import distances as distances_module
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
-from spacerobot_ros.model.external_loads import EARTH_GRAVITATION, relative_motion
+from spacerobot_ros.model.external_loads import EARTH_GRAVITATION
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.resources import robot_file

@@ -294,7 +294,7 @@ class ControlLaw(ABC):
     def _use_function(self, *, weighs: bool) -> None:
         """Build the function of the law; one that ``weighs`` outputs computes automatic gains."""
         self._weighs, robot = weighs, self.robot
-        self._mobility: ca.SX | None = None
+        self._fills_gains = False
         inputs = {name: np.asarray(value) for name, value in self.inputs().items()}
         key: tuple[Any, ...] = (
             type(self),
@@ -338,9 +338,7 @@ class ControlLaw(ABC):
             "J_z": self.outputs.J_z,
             **self.results(symbols),
         }
-        if self._mobility is not None:
-            results["mobility"] = self._mobility
-        elif self._weighs:
+        if self._weighs and not self._fills_gains:
             gains = ca.vertcat(symbols["kp"], symbols["kd"])
             if ca.depends_on(results["actuation"], gains):
                 raise ParameterError(
@@ -378,12 +376,13 @@ class ControlLaw(ABC):
             solve_positive_definite(H[3:, 3:], z1.J_z[:, 3:].T),
         )
         mobility = z1.J_z @ moved
-        self._mobility = mobility + _SINGULAR_DAMPING * ca.diag(ca.diag(mobility))
+        mobility = mobility + _SINGULAR_DAMPING * ca.diag(ca.diag(mobility))
+        self._fills_gains = True
         Kd = self._damping_rate
         Kp = _CRITICAL_STIFFNESS * Kd**2
         damping = ca.if_else(symbols["kd"] > 0, 0, Kd * z1.error_rate)
         stiffness = ca.if_else(symbols["kp"] > 0, 0, z1.acceleration + Kp * z1.error)
-        return solve_positive_definite(self._mobility, damping + stiffness)
+        return solve_positive_definite(mobility, damping + stiffness)
 
     @classmethod
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
@@ -492,11 +491,6 @@ class ControlLaw(ABC):
         """Whether gains may be matrices, which act through the law's integral term."""
         return self._has_integral
 
-    @property
-    def integral_gains(self) -> Array:
-        """The diagonal of Ki (m,), in the order of ``outputs.labels``."""
-        return self._ki.copy()
-
     def command(self, state: ControlState, reference: Reference) -> Actuation:
         """Return the thruster wrench and the joint efforts, unlimited.
 
@@ -574,34 +568,6 @@ class ControlLaw(ABC):
         along = U[:, singular_values < self.singular_value_threshold].T @ error
         size = float(np.linalg.norm(error))
         return float(np.linalg.norm(along)) / size if size > 0 else 0.0
-
-    def errors_under(self, state: ControlState, pull: Array) -> Array:
-        """Return the errors (m,) with ``Kp e = pull`` (m,), at rest in a state's shape."""
-        kp, given = self.gain_diagonals[0], self._in["kp"]
-        if not self._weighs:
-            return np.asarray(np.linalg.solve(self.gain_matrices[0], pull))
-        mobility = self._evaluate_at(state, self._in["integral"])["mobility"]
-        # Automatic gains act through the mass matrix of all outputs.
-        Kp = np.diag(given) + np.linalg.solve(mobility, np.diag(np.where(given > 0, 0.0, kp)))
-        return np.asarray(np.linalg.solve(Kp, pull))
-
-    def command_per_error(self, state: ControlState) -> Array:
-        """Return the command (6 + n, m) per unit of ``Kp e``, at rest in a state's shape."""
-        units = np.vstack([np.zeros(self.outputs.m), np.eye(self.outputs.m)])
-        at_rest, *each = (self._evaluate_at(state, unit)["actuation"].ravel() for unit in units)
-        return np.array(each).T - at_rest[:, np.newaxis]
-
-    def _evaluate_at(self, state: ControlState, integral: Array) -> dict[str, Array]:
-        """Return the results of the function at rest, in the shape of a state, without errors."""
-        state = ControlState.at_rest(state.r_WB, state.quaternion_WB, state.q)
-        selection = self.outputs.selection
-        reference = Reference.present(self.robot, state, selection.end_effector_link)
-        given = {name: memory.copy() for name, memory in self._in.items()}
-        self.outputs.pack_state(state, given["state"])
-        self.outputs.pack_reference(reference, given["reference"])
-        given["integral"] = integral
-        results = self.function(*given.values(), *self.robot.mass_arguments.values())
-        return dict(zip(self.function.name_out(), map(np.array, results), strict=True))
 
     @property
     def state(self) -> ControlState:
