@@ -1,7 +1,7 @@
 """Reads URDF files and strings into :class:`.RobotDescription`.
 
-The syntax is checked first (:func:`_checked_root`): every message names the element and its
-correction. Then links and joints are read, links connected by fixed joints are merged, and
+Every element and attribute is checked when it is read; messages name the element and its
+correction. Elements that are not read are ignored. Links connected by fixed joints are merged, and
 robots with singular equations are rejected.
 """
 
@@ -12,9 +12,8 @@ import os
 import shlex
 import subprocess
 import sys
-from collections import Counter
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
@@ -215,7 +214,13 @@ def parse_robot(text: str) -> RobotDescription:
             _refuse_impossible_inertia(
                 [link for link in description.links if description.frames[link.name][0] == number]
             )
-    _require_mass(description)
+    if description.bodies[0].inertia.mass <= 0:
+        raise RobotDescriptionError(
+            f"The base link '{description.base_link}' has no mass; a free-floating base needs an "
+            "<inertial> with mass and inertia. Give it those of the spacecraft that carries the "
+            'robot, for instance <inertial><mass value="100"/><inertia ixx="10" iyy="10" '
+            'izz="10" ixy="0" ixz="0" iyz="0"/></inertial>.'
+        )
     require_reaction_wheels(description)
     return description
 
@@ -258,7 +263,9 @@ def with_held_joints(robot: RobotDescription, positions: Array | None = None) ->
         joint = held[element.get("name", "")]
         if element.get("type") == "fixed":
             continue
-        _remove_children(element, ("origin", "axis", "limit", "mimic", "wheel", "dynamics"))
+        for tag in ("origin", "axis", "limit", "mimic", "wheel", "dynamics"):
+            for child in element.findall(tag):
+                element.remove(child)
         element.set("type", "fixed")
         place, turn = joint.origin.r.tolist(), rpy_from_matrix(joint.origin.R).tolist()
         pose = {"xyz": " ".join(map(repr, place)), "rpy": " ".join(map(repr, turn))}
@@ -291,8 +298,9 @@ def parse_world(text: str) -> RobotDescription:
 
 def _read_tree(text: str) -> RobotDescription:
     """Return the links and joints of a URDF text, whatever their masses."""
-    root = _checked_root(text)
-    if len(root.findall("link")) > _MAX_LINKS:
+    root = _root_of(text)
+    elements = {kind: _named_elements(root, kind) for kind in ("link", "joint")}
+    if len(elements["link"]) > _MAX_LINKS:
         raise RobotDescriptionError(
             f"The robot description has more than {_MAX_LINKS} links: deriving its equations "
             "would take hours."
@@ -302,17 +310,11 @@ def _read_tree(text: str) -> RobotDescription:
         for material in root.findall("material")
         if (color := material.find("color")) is not None
     }
-    for kind in ("link", "joint"):
-        names = [element.get("name", "") for element in root.findall(kind)]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise RobotDescriptionError(
-                f"The {kind} name '{twice[0]}' is used twice; names must be unique."
-            )
-    links = {
-        link.name: link for link in (_read_link(each, colours) for each in root.findall("link"))
-    }
-    joints = _with_leaders([_read_joint(each, links) for each in root.findall("joint")])
+    links = {name: _read_link(name, each, colours) for name, each in elements["link"].items()}
+    _name_limits_not_read(root)
+    joints = _with_leaders(
+        [_read_joint(name, each, links) for name, each in elements["joint"].items()]
+    )
     bodies, frames = weld_links(links, joints)
     carried = root.find("world/robot")
     return RobotDescription(
@@ -327,68 +329,239 @@ def _read_tree(text: str) -> RobotDescription:
     )
 
 
+def _root_of(text: str) -> Element:
+    try:
+        root = fromstring(text)
+    except (ParseError, ValueError) as error:
+        raise RobotDescriptionError(
+            f"The robot description is not valid URDF: it is not XML ({error})."
+        ) from error
+    if root.tag != "robot":
+        raise RobotDescriptionError(
+            "The robot description is not valid URDF but "
+            f"{_OTHER_FORMATS.get(root.tag, 'something else')}: its root element is <{root.tag}>, "
+            "but a URDF has the root element <robot>. Export or convert it to URDF."
+        )
+    if not root.get("name"):
+        raise _MalformedError("the <robot> has no name", '<robot name="...">')
+    return root
+
+
+def _named_elements(root: Element, kind: str) -> dict[str, Element]:
+    """Return the links or joints by their names, which are unique."""
+    found: dict[str, Element] = {}
+    for number, element in enumerate(root.findall(kind), 1):
+        name = element.get("name", "")
+        if not name:
+            raise _MalformedError(f"the {kind} number {number} has no name", f'<{kind} name="...">')
+        if name in found:
+            raise RobotDescriptionError(
+                f"The {kind} name '{name}' is used twice; names must be unique."
+            )
+        found[name] = element
+    return found
+
+
+def _name_limits_not_read(root: Element) -> None:
+    given = {name for limit in root.iterfind("joint/limit") for name in limit.attrib}
+    ignored = [name for name in _LIMITS_NOT_READ if name in given]
+    if ignored:
+        warn_once(
+            f"The limits of {' and '.join(ignored)} in the URDF of '{root.get('name', '')}' are "
+            "ignored; only position, velocity and effort limits are enforced."
+        )
+
+
+# -- elements and attributes ------------------------------------------------------------------
+
+_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
+
+_LIMITS_NOT_READ = ("acceleration", "deceleration", "jerk")
+"""Limits of URDF 1.2 that are not enforced."""
+
+_ATTRIBUTES = {
+    "origin": {
+        "xyz": (3, "m"),
+        "rpy": (3, "rad: roll, pitch and yaw"),
+        "quat_xyzw": (4, "a unit quaternion"),
+    },
+    "mass": {"value": (1, "kg")},
+    "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), (1, "kg m^2")),
+    "parent": {"link": (0, "the name of a link")},
+    "child": {"link": (0, "the name of a link")},
+    "axis": {"xyz": (3, "a direction")},
+    "limit": {
+        "velocity": (1, "m/s or rad/s"),
+        "effort": (1, "N or N m"),
+        "lower": (1, "m or rad"),
+        "upper": (1, "m or rad"),
+    },
+    "mimic": {
+        "joint": (0, "the name of the joint to follow"),
+        "multiplier": (1, "ratio of its motion to that of the leading joint"),
+        "offset": (1, "m or rad"),
+    },
+    "box": {"size": (3, "m")},
+    "cylinder": {"radius": (1, "m"), "length": (1, "m")},
+    "sphere": {"radius": (1, "m")},
+    "capsule": {"radius": (1, "m"), "length": (1, "m")},
+    "mesh": {
+        "filename": (0, "the file of the mesh"),
+        "scale": (3, "factors along x, y and z"),
+    },
+    "color": {"rgba": (4, "red, green, blue and opacity, from 0 to 1")},
+}
+"""Count of numbers (0: a text), and meaning or unit, of every attribute that is read."""
+
+_GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
+
+_REMEDIES = {
+    "mass": '<mass value="..."/> in kg',
+    "geometry": f"a <geometry> with one of {', '.join(_GEOMETRIES)}",
+    "parent": '<parent link="..."/>',
+    "child": '<child link="..."/>',
+}
+"""What to write for an element that is missing."""
+
+
+class _MalformedError(RobotDescriptionError):
+    """A flaw of the form of a URDF, with the text to write instead."""
+
+    def __init__(self, flaw: str, remedy: str) -> None:
+        super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
+
+
+def _child(parent: Element, tag: str, where: str) -> Element | None:
+    """Return the only child with a tag; None: there is none. ``where`` is its link or joint."""
+    found = parent.findall(tag)
+    if len(found) > 1:
+        flaw = f"the {_owner(parent, where)} has {len(found)} elements <{tag}>"
+        raise _MalformedError(flaw, "one of them")
+    return found[0] if found else None
+
+
+def _needed_child(parent: Element, tag: str, where: str) -> Element:
+    found = _child(parent, tag, where)
+    if found is None:
+        raise _MalformedError(f"the {_owner(parent, where)} has no <{tag}>", _REMEDIES[tag])
+    return found
+
+
+def _owner(element: Element, where: str) -> str:
+    return where if element.tag in ("link", "joint") else f"<{element.tag}> of {where}"
+
+
+def _text(element: Element, name: str, where: str, default: str | None = None) -> str:
+    """Return an attribute; without a ``default``, it is required."""
+    given = element.get(name, default)
+    if given is None:
+        flaw = f"the <{element.tag}> of {where} has no '{name}'"
+        raise _MalformedError(flaw, _attribute_remedy(element, name))
+    return given
+
+
+def _attribute_remedy(element: Element, name: str) -> str:
+    count, meaning = _ATTRIBUTES[element.tag][name]
+    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by spaces, ")
+    return f'<{element.tag} {name}="..."/>: {numbers}{meaning}'
+
+
+def _numbers(
+    element: Element,
+    name: str,
+    where: str,
+    default: str | None = None,
+    largest: float = _MAX_NUMBER,
+) -> Array:
+    """Return the numbers of an attribute (k,); without a ``default``, it is required."""
+    words, owner = _text(element, name, where, default).split(), f"the <{element.tag}> of {where}"
+    wrong = next((word for word in words if not _is_number(word)), None)
+    if wrong is not None:
+        flaw = f"'{name}' of {owner} has '{wrong}', which is not a number"
+        raise _MalformedError(flaw, _attribute_remedy(element, name))
+    if len(words) != (count := _ATTRIBUTES[element.tag][name][0]):
+        flaw = f"'{name}' of {owner} has {len(words)} numbers instead of {count}"
+        raise _MalformedError(flaw, _attribute_remedy(element, name))
+    numbers = np.array(words, dtype=float)
+    if not np.all(np.abs(numbers) <= largest):
+        finite = np.isfinite(numbers).all()
+        flaw = f"is larger than {_MAX_NUMBER:g} in its SI unit" if finite else "is not finite"
+        raise RobotDescriptionError(f"A number in {owner} {flaw}: {' '.join(words)}.")
+    return numbers
+
+
+def _number(element: Element, name: str, where: str, default: str | None = None) -> float:
+    return float(_numbers(element, name, where, default)[0])
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" not in word
+
+
+def _require_known_attributes(element: Element, where: str) -> None:
+    """Refuse unknown attributes of an element whose attributes are optional: they are misspelt."""
+    known = _ATTRIBUTES[element.tag]
+    if unknown := set(element.keys()).difference(known):
+        flaw = f"the <{element.tag}> of {where} has the unknown attribute '{min(unknown)}'"
+        raise _MalformedError(flaw, f"one of {', '.join(known)}")
+
+
 # -- links ------------------------------------------------------------------------------------
 
 
-def _read_numbers(element: Element | None, name: str, default: str, where: str) -> Array:
-    text = default if element is None else element.get(name, default)
-    return _require_finite([float(word) for word in text.split()], where)
-
-
-def _read_number(element: Element | None, name: str, where: str) -> float:
-    return float(_require_finite(0.0 if element is None else float(element.get(name, "0")), where))
-
-
-def _require_finite(values: float | list[float], where: str) -> Array:
-    array = np.array(values, dtype=float)
-    if not np.all(np.isfinite(array)):
-        raise RobotDescriptionError(f"A number in {where} is not finite: {array.tolist()}.")
-    if array.size and np.abs(array).max() > _MAX_NUMBER:
-        raise RobotDescriptionError(
-            f"A number in {where} is larger than {_MAX_NUMBER:g} in its SI unit: {array.tolist()}."
-        )
-    return array
-
-
 def _read_pose(element: Element, where: str) -> Pose:
-    origin = element.find("origin")
+    origin = _child(element, "origin", where)
     if origin is None:
         return Pose()
-    where = f"the origin of {where}"
-    r = _read_numbers(origin, "xyz", "0 0 0", where)
-    quaternion = _read_numbers(origin, "quat_xyzw", "", where)
-    if not quaternion.size:
-        return Pose(matrix_from_rpy(_read_numbers(origin, "rpy", "0 0 0", where)), r)
+    _require_known_attributes(origin, where)
+    r = _numbers(origin, "xyz", where, "0 0 0")
+    if origin.get("quat_xyzw") is None:
+        return Pose(matrix_from_rpy(_numbers(origin, "rpy", where, "0 0 0")), r)
+    quaternion = _numbers(origin, "quat_xyzw", where)
     if origin.get("rpy") is not None:
-        raise RobotDescriptionError(f"{where.capitalize()} has 'rpy' and 'quat_xyzw': give one.")
+        raise RobotDescriptionError(f"The origin of {where} has 'rpy' and 'quat_xyzw': give one.")
     if not (length := float(np.linalg.norm(quaternion))):
-        raise RobotDescriptionError(f"'quat_xyzw' in {where} is zero: give a unit quaternion.")
+        raise RobotDescriptionError(
+            f"'quat_xyzw' in the origin of {where} is zero: give a unit quaternion."
+        )
     return Pose(matrix_from_quaternion(quaternion / length), r)
 
 
-def _read_link(link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
-    name = link.get("name", "")
+def _read_link(name: str, link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
     where = f"link '{name}'"
     inertia = Inertia()
-    if (inertial := link.find("inertial")) is not None:
-        pose = _read_pose(inertial, where)
-        mass = _read_number(inertial.find("mass"), "value", where)
-        moments = inertial.find("inertia")
-        about = _read_inertia(moments, where)
+    if (inertial := _child(link, "inertial", where)) is not None:
+        mass = _number(_needed_child(inertial, "mass", where), "value", where)
+        about = _read_inertia(_child(inertial, "inertia", where), where)
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
-        inertia = Inertia(mass, np.zeros(3), about).moved(pose)
-    shapes, collisions = (
-        tuple(_read_shape(each, colours, where) for each in link.findall(tag))
-        for tag in ("visual", "collision")
-    )
-    return Link(name, inertia, shapes, collisions)
+        inertia = Inertia(mass, np.zeros(3), about).moved(_read_pose(inertial, where))
+    shapes = [_read_shape(each, colours, where) for each in link.findall("visual")]
+    supported = [each for each in link.findall("collision") if _is_supported(each, where)]
+    collisions = [_read_shape(each, colours, where) for each in supported]
+    return Link(name, inertia, tuple(shapes), tuple(collisions))
+
+
+def _is_supported(collision: Element, where: str) -> bool:
+    """Warn of forms of other programs, such as planes."""
+    form = next((each.tag for each in collision.iterfind("geometry/*")), None)
+    if form not in _GEOMETRIES:
+        warn_once(
+            f"A <collision> of {where} is {f'a <{form}>' if form else 'empty'}, which is not "
+            f"supported: give it one of {', '.join(f'<{name}>' for name in _GEOMETRIES)}."
+        )
+    return form in _GEOMETRIES
 
 
 def _read_inertia(moments: Element | None, where: str) -> Array:
+    if moments is None:
+        return np.zeros((3, 3))
     return symmetric_of_entries(
-        _read_number(moments, f"i{'xyz'[row]}{'xyz'[column]}", where)
-        for row, column in INERTIA_ENTRIES
+        _number(moments, f"i{'xyz'[row]}{'xyz'[column]}", where) for row, column in INERTIA_ENTRIES
     )
 
 
@@ -461,89 +634,100 @@ def _refuse_impossible_inertia(welded: list[Link]) -> NoReturn:
 
 
 def _read_colour(color: Element, where: str) -> tuple[float, ...]:
-    return tuple(_read_numbers(color, "rgba", "", f"a color of {where}").tolist())
+    return tuple(_numbers(color, "rgba", where).tolist())
 
 
 def _read_shape(element: Element, colours: dict[str, tuple[float, ...]], where: str) -> Shape:
-    geometry = element.find("geometry")
-    assert geometry is not None
-    (form,) = geometry
+    forms = list(_needed_child(element, "geometry", where))
+    remedy = f"one of {', '.join(f'<{name}>' for name in _GEOMETRIES)}"
+    if len(forms) != 1:
+        raise _MalformedError(f"a <geometry> of {where} has {len(forms)} shapes", remedy)
+    (form,) = forms
+    if form.tag not in _GEOMETRIES:
+        raise _MalformedError(f"a <geometry> of {where} is a <{form.tag}>", remedy)
+    resource = ""
     if form.tag == "mesh":
-        # A negative scale mirrors.
-        size = _read_numbers(form, "scale", "1 1 1", f"the scale of a mesh of {where}")
+        resource = _text(form, "filename", where)
+        size = _numbers(form, "scale", where, "1 1 1")  # A negative scale mirrors.
     else:
-        names = (attribute.name for attribute in _ATTRIBUTES[form.tag])
-        numbers = " ".join(form.get(name, "") for name in names).split()
-        size = _require_finite([float(number) for number in numbers], f"the geometry of {where}")
+        size = np.concatenate([_numbers(form, name, where) for name in _ATTRIBUTES[form.tag]])
         if size.min() < 0:
             raise RobotDescriptionError(
                 f"A size in a <geometry> of {where} is negative: {size.tolist()}. "
                 "Give lengths in m."
             )
     rgba: tuple[float, ...] = Shape.rgba
-    if (material := element.find("material")) is not None:
-        color = material.find("color")
+    if (material := _child(element, "material", where)) is not None:
+        color = _child(material, "color", where)
         if color is not None:
             rgba = _read_colour(color, where)
         else:
             rgba = colours.get(material.get("name", ""), rgba)
     red, green, blue, opacity = rgba
-    return Shape(
-        form.tag,
-        tuple(size.tolist()),
-        _read_pose(element, where),
-        (red, green, blue, opacity),
-        form.get("filename", "") if form.tag == "mesh" else "",
-    )
+    pose = _read_pose(element, where)
+    return Shape(form.tag, tuple(size.tolist()), pose, (red, green, blue, opacity), resource)
 
 
 # -- joints -----------------------------------------------------------------------------------
 
 
-def _read_joint(joint: Element, links: dict[str, Link]) -> Joint:
-    name = joint.get("name", "")
+def _read_joint(name: str, joint: Element, links: dict[str, Link]) -> Joint:
     where = f"joint '{name}'"
+    kind = _read_kind(joint, where)
     ends = {}
     for role in ("parent", "child"):
-        end = joint.find(role)
-        assert end is not None
-        ends[role] = end.get("link", "")
+        ends[role] = _text(_needed_child(joint, role, where), "link", where)
         if ends[role] not in links:
             raise RobotDescriptionError(
                 f"The {role} of {where} is '{ends[role]}', but there is no such link."
                 f"{suggestion(ends[role], links)}"
             )
-    kind = JointKind(joint.get("type"))
-    axis = _read_numbers(joint.find("axis"), "xyz", "1 0 0", where)
-    if kind is not JointKind.FIXED:
-        norm = float(np.linalg.norm(axis))
-        if norm < 1e-9:
-            raise RobotDescriptionError(f"The axis of {where} is zero; give it a direction.")
-        axis = axis / norm
+    pose, axis = _read_pose(joint, where), np.array([1.0, 0.0, 0.0])
+    if kind is JointKind.FIXED:
+        return Joint(name, kind, ends["parent"], ends["child"], pose, axis, JointLimits())
+    if (given := _child(joint, "axis", where)) is not None:
+        axis = _numbers(given, "xyz", where)
+    norm = float(np.linalg.norm(axis))
+    if norm < 1e-9:
+        raise RobotDescriptionError(f"The axis of {where} is zero; give it a direction.")
     return Joint(
         name,
         kind,
         ends["parent"],
         ends["child"],
-        _read_pose(joint, where),
-        axis,
-        _read_limits(joint.find("limit"), kind, where),
-        _read_mimic(joint.find("mimic"), where),
+        pose,
+        axis / norm,
+        _read_limits(_child(joint, "limit", where), kind, where),
+        _read_mimic(_child(joint, "mimic", where), where),
         joint.find("wheel") is not None,
     )
+
+
+def _read_kind(joint: Element, where: str) -> JointKind:
+    kinds, kind = [each.value for each in JointKind], joint.get("type")
+    if kind is None:
+        remedy = f'type="..." with one of {", ".join(kinds)}'
+        raise _MalformedError(f"the {where} has no type", remedy)
+    if kind not in kinds:
+        raise RobotDescriptionError(
+            f"The type of {where} is '{kind}'; a free-floating tree has "
+            f"{', '.join(kinds[:-1])} and {kinds[-1]} joints. The base floats "
+            "freely: remove any joint that connects it to a world, and that world's link."
+        )
+    return JointKind(kind)
 
 
 def _read_mimic(mimic: Element | None, where: str) -> Mimic | None:
     if mimic is None:
         return None
-    leader = mimic.get("joint", "")
-    (multiplier,) = _read_numbers(mimic, "multiplier", "1", f"<mimic> of {where}")
-    (offset,) = _read_numbers(mimic, "offset", "0", f"<mimic> of {where}")
+    _require_known_attributes(mimic, where)
+    leader = _text(mimic, "joint", where)
+    multiplier = _number(mimic, "multiplier", where, "1")
     if multiplier == 0:
         raise RobotDescriptionError(
             f"The {where} mimics '{leader}' with multiplier 0: it does not move; make it fixed."
         )
-    return Mimic(leader, float(multiplier), float(offset))
+    return Mimic(leader, multiplier, _number(mimic, "offset", where, "0"))
 
 
 def _with_leaders(joints: list[Joint]) -> list[Joint]:
@@ -612,13 +796,10 @@ def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLim
             f"The {where} is {kind.value} and has no <limit>: "
             "give lower, upper, velocity and effort."
         )
-    values = {
-        name: float(limit.get(name, "0")) or 0.0
-        for name in ("lower", "upper", "velocity", "effort")
-    }
-    for name, value in values.items():
-        if math.isnan(value):
-            raise RobotDescriptionError(f"The limit '{name}' of {where} is not a number.")
+    values = {}
+    for name, default in (("lower", "0"), ("upper", "0"), ("velocity", None), ("effort", None)):
+        (number,) = _numbers(limit, name, where, default, largest=math.inf).tolist()
+        values[name] = number or 0.0
     for name in ("velocity", "effort"):
         if values[name] < 0:
             raise RobotDescriptionError(
@@ -635,264 +816,3 @@ def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLim
         if abs(values[name]) >= _NO_LIMIT:
             values[name] = math.copysign(math.inf, values[name])
     return JointLimits(**values)
-
-
-def _require_mass(robot: RobotDescription) -> None:
-    """Refuse moving parts without mass, which would make the inertia matrix singular."""
-    base = robot.bodies[0].inertia
-    if base.mass <= 0:
-        raise RobotDescriptionError(
-            f"The base link '{robot.base_link}' has no mass; a free-floating base needs an "
-            "<inertial> with mass and inertia. Give it those of the spacecraft that carries the "
-            'robot, for instance <inertial><mass value="100"/><inertia ixx="10" iyy="10" '
-            'izz="10" ixy="0" ixz="0" iyz="0"/></inertial>.'
-        )
-    outboard_mass = [body.inertia.mass for body in robot.bodies]
-    outboard_moment = [float(np.trace(body.inertia.about_com)) for body in robot.bodies]
-    for index in range(len(robot.bodies) - 1, 0, -1):
-        parent = robot.bodies[index].parent
-        outboard_mass[parent] += outboard_mass[index]
-        outboard_moment[parent] += outboard_moment[index]
-    for body, mass, moment in zip(
-        robot.bodies[1:], outboard_mass[1:], outboard_moment[1:], strict=True
-    ):
-        assert body.joint is not None
-        if mass <= 0 and (body.joint.kind is JointKind.PRISMATIC or moment <= 0):
-            raise RobotDescriptionError(
-                f"Joint '{body.joint.name}' moves link '{body.name}', which has no mass, so its "
-                "dynamics are undefined. Give it an <inertial> or make the joint fixed."
-            )
-
-
-# -- form of the text -------------------------------------------------------------------------
-
-_OTHER_FORMATS = {"sdf": "an SDF model", "mujoco": "a MuJoCo model"}
-
-_ELEMENTS_READ = {
-    "robot": ("link", "joint", "material", "disable_collisions", "world"),
-    "link": ("inertial", "visual", "collision"),
-    "joint": ("origin", "parent", "child", "axis", "limit", "mimic", "wheel"),
-    "material": ("color",),
-}
-"""Element tags to read, by parent tag; other elements are ignored."""
-
-_EXACT_ELEMENTS = ("origin", "mimic")
-"""Elements with optional attributes: an unknown attribute is an error and would change the
-robot."""
-
-_GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
-_ACCEPTED_GEOMETRIES = [[name] for name in _GEOMETRIES]
-_GEOMETRY_REMEDY = f"a <geometry> with one of {', '.join(_GEOMETRIES)}"
-
-
-@dataclass(frozen=True)
-class _Attribute:
-    """An attribute: count of its numbers (0: a text), meaning or unit, whether it is required."""
-
-    name: str
-    count: int
-    meaning: str
-    needed: bool = True
-
-
-_ORIGIN_ATTRIBUTES = (
-    _Attribute("xyz", 3, "m", needed=False),
-    _Attribute("rpy", 3, "rad: roll, pitch and yaw", needed=False),
-    _Attribute("quat_xyzw", 4, "a unit quaternion", needed=False),
-)
-
-_ATTRIBUTES = {
-    "origin": _ORIGIN_ATTRIBUTES,
-    "mass": (_Attribute("value", 1, "kg"),),
-    "inertia": tuple(
-        _Attribute(name, 1, "kg m^2") for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    ),
-    "parent": (_Attribute("link", 0, "the name of a link"),),
-    "child": (_Attribute("link", 0, "the name of a link"),),
-    "axis": (_Attribute("xyz", 3, "a direction"),),
-    "limit": (
-        _Attribute("velocity", 1, "m/s or rad/s"),
-        _Attribute("effort", 1, "N or N m"),
-        _Attribute("lower", 1, "m or rad", needed=False),
-        _Attribute("upper", 1, "m or rad", needed=False),
-    ),
-    "mimic": (
-        _Attribute("joint", 0, "the name of the joint to follow"),
-        _Attribute(
-            "multiplier", 1, "ratio of its motion to that of the leading joint", needed=False
-        ),
-        _Attribute("offset", 1, "m or rad", needed=False),
-    ),
-    "box": (_Attribute("size", 3, "m"),),
-    "cylinder": (_Attribute("radius", 1, "m"), _Attribute("length", 1, "m")),
-    "sphere": (_Attribute("radius", 1, "m"),),
-    "capsule": (_Attribute("radius", 1, "m"), _Attribute("length", 1, "m")),
-    "mesh": (
-        _Attribute("filename", 0, "the file of the mesh"),
-        _Attribute("scale", 3, "factors along x, y and z", needed=False),
-    ),
-    "color": (_Attribute("rgba", 4, "red, green, blue and opacity, from 0 to 1"),),
-}
-
-_REQUIRED_ELEMENTS = {
-    "inertial": {"mass": '<mass value="..."/> in kg'},
-    "visual": {"geometry": _GEOMETRY_REMEDY},
-    "collision": {"geometry": _GEOMETRY_REMEDY},
-    "joint": {"parent": '<parent link="..."/>', "child": '<child link="..."/>'},
-}
-
-_LIMITS_NOT_READ = ("acceleration", "deceleration", "jerk")
-"""Limits of URDF 1.2 that are not enforced."""
-
-_JOINT_TYPES = tuple(kind.value for kind in JointKind)
-
-
-def _checked_root(text: str) -> Element:
-    """Return the root of a URDF text, reduced to the :data:`_ELEMENTS_READ`."""
-    try:
-        root = fromstring(text)
-    except (ParseError, ValueError) as error:
-        raise RobotDescriptionError(
-            f"The robot description is not valid URDF: it is not XML ({error})."
-        ) from error
-    if root.tag != "robot":
-        raise RobotDescriptionError(
-            "The robot description is not valid URDF but "
-            f"{_OTHER_FORMATS.get(root.tag, 'something else')}: its root element is <{root.tag}>, "
-            "but a URDF has the root element <robot>. Export or convert it to URDF."
-        )
-    for element in [root, *root.findall("link"), *root.findall("joint")]:
-        unused = {child.tag for child in element} - set(_ELEMENTS_READ[element.tag])
-        _remove_children(element, unused)
-    for link in root.findall("link"):
-        for collision in link.findall("collision"):
-            # Other programs write forms of their own, such as planes.
-            form = [each.tag for each in collision.iterfind("geometry/*")][0:1]
-            if form not in _ACCEPTED_GEOMETRIES:
-                warn_once(
-                    f"A <collision> of link '{link.get('name', '')}' is "
-                    f"{f'a <{form[0]}>' if form else 'empty'}, which is not supported: give it "
-                    f"one of {', '.join(f'<{name}>' for name in _GEOMETRIES)}."
-                )
-                link.remove(collision)
-    ignored = {
-        name
-        for limit in root.iterfind("joint/limit")
-        for name in _LIMITS_NOT_READ
-        if limit.get(name) is not None
-    }
-    if ignored:
-        warn_once(
-            f"The limits of {' and '.join(sorted(ignored))} in the URDF of "
-            f"'{root.get('name', '')}' are ignored; only position, velocity and effort limits are "
-            "enforced."
-        )
-    if not root.get("name"):
-        raise _MalformedError("the <robot> has no name", '<robot name="...">')
-    for kind in ("link", "joint"):
-        for number, element in enumerate(root.findall(kind), 1):
-            name = element.get("name", "")
-            if not name:
-                flaw = f"the {kind} number {number} has no name"
-                raise _MalformedError(flaw, f'<{kind} name="...">')
-            where = f"{kind} '{name}'"
-            if kind == "joint":
-                _require_type(element, where)
-                if element.get("type") == "fixed":
-                    _remove_children(element, ("axis", "limit", "mimic", "wheel"))
-            _require_element(element, where)
-    for material in root.findall("material"):
-        _require_element(material, f"material '{material.get('name', '')}'")
-    return root
-
-
-def _remove_children(element: Element, tags: Collection[object]) -> None:
-    for child in list(element):
-        if child.tag in tags:
-            element.remove(child)
-
-
-class _MalformedError(RobotDescriptionError):
-    """A flaw of the form of a URDF, with the text to write instead."""
-
-    def __init__(self, flaw: str, remedy: str) -> None:
-        super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
-
-
-def _require_type(joint: Element, where: str) -> None:
-    kind = joint.get("type")
-    if kind is None:
-        remedy = f'type="..." with one of {", ".join(_JOINT_TYPES)}'
-        raise _MalformedError(f"the {where} has no type", remedy)
-    if kind not in _JOINT_TYPES:
-        raise RobotDescriptionError(
-            f"The type of {where} is '{kind}'; a free-floating tree has "
-            f"{', '.join(_JOINT_TYPES[:-1])} and {_JOINT_TYPES[-1]} joints. The base floats "
-            "freely: remove any joint that connects it to a world, and that world's link."
-        )
-
-
-def _require_element(element: Element, where: str) -> None:
-    if element.tag == "material":
-        _remove_children(
-            element, {child.tag for child in element} - set(_ELEMENTS_READ["material"])
-        )
-    owner = where if element.tag in ("link", "joint") else f"<{element.tag}> of {where}"
-    for child, remedy in _REQUIRED_ELEMENTS.get(element.tag, {}).items():
-        if element.find(child) is None:
-            raise _MalformedError(f"the {owner} has no <{child}>", remedy)
-    for tag, count in Counter(child.tag for child in element).items():
-        if count > 1 and tag not in ("visual", "collision") and element.tag != "geometry":
-            raise _MalformedError(f"the {owner} has {count} elements <{tag}>", "one of them")
-    if element.tag == "geometry":
-        _require_geometry(element, where)
-    attributes = _ATTRIBUTES.get(element.tag, ())
-    for attribute in attributes:
-        _require_attribute(element, attribute, where)
-    known = [attribute.name for attribute in attributes]
-    unknown = set(element.keys()).difference(known)
-    if unknown and element.tag in _EXACT_ELEMENTS:
-        flaw = f"the <{element.tag}> of {where} has the unknown attribute '{min(unknown)}'"
-        raise _MalformedError(flaw, f"one of {', '.join(known)}")
-    for child_element in element:
-        _require_element(child_element, where)
-
-
-def _require_geometry(geometry: Element, where: str) -> None:
-    shapes = [each.tag for each in geometry]
-    remedy = f"one of {', '.join(f'<{name}>' for name in _GEOMETRIES)}"
-    if len(shapes) != 1:
-        raise _MalformedError(f"a <geometry> of {where} has {len(shapes)} shapes", remedy)
-    if shapes[0] not in _GEOMETRIES:
-        raise _MalformedError(f"a <geometry> of {where} is a <{shapes[0]}>", remedy)
-
-
-def _require_attribute(element: Element, attribute: _Attribute, where: str) -> None:
-    given = element.get(attribute.name)
-    count = attribute.count
-    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by spaces, ")
-    remedy = f'<{element.tag} {attribute.name}="..."/>: {numbers}{attribute.meaning}'
-    owner = f"the <{element.tag}> of {where}"
-    if given is None:
-        if attribute.needed:
-            raise _MalformedError(f"{owner} has no '{attribute.name}'", remedy)
-        return
-    if not count:
-        return
-    words = given.split()
-    wrong = next((word for word in words if not _is_number(word)), None)
-    if wrong is not None:
-        raise _MalformedError(
-            f"'{attribute.name}' of {owner} has '{wrong}', which is not a number", remedy
-        )
-    if len(words) != count:
-        flaw = f"'{attribute.name}' of {owner} has {len(words)} numbers instead of {count}"
-        raise _MalformedError(flaw, remedy)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return "_" not in word

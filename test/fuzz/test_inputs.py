@@ -513,7 +513,7 @@ def test_a_size_that_is_no_size_is_refused(number: str) -> None:
     start = text.index('size="') + len('size="')
     with pytest.raises(RobotDescriptionError) as caught:
         parse_robot(text[:start] + f"{number} 1 1" + text[text.index('"', start) :])
-    assert_one_sentence(str(caught.value), "geometry of link")
+    assert_one_sentence(str(caught.value), "<box> of link")
 
 
 def test_a_chunk_that_claims_to_be_larger_than_the_memory_takes_no_more(tmp_path: Path) -> None:
