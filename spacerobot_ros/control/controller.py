@@ -13,7 +13,6 @@ import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.detumbling import Detumbling
-from spacerobot_ros.control.laws.computed_torque import ComputedTorqueLaw
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import (
@@ -140,17 +139,18 @@ class CoordinatedController:
         self._estimator: DeadReckoning | None = None
         self.gains_checked = False
         """Whether the gains were checked against the control period."""
-        self._brake: tuple[ComputedTorqueLaw, Reference] | None = None
+        self._stopped_at: Array | None = None
+        """Joint positions (n,) at which the robot stops while its base is unknown."""
         self.coming_to_rest = False
         """Whether the robot is being brought to rest, in any pose."""
-        self._to_rest: Callable[[ControlState], Actuation] = rates.braking_command
+        self._to_rest: Callable[[ControlState], Actuation] = self.detumbling(None, 0.0).command
 
     def reset(self) -> None:
         """Drop goals and measurements; the next state is treated as the first."""
         self.law.reset_integral()
         self.profile, self._followed = None, Reference()
         self.coming_to_rest = False
-        self._sent = self._estimator = self._brake = None
+        self._sent = self._estimator = self._stopped_at = None
         self.mode = Mode.MEASURED
         if self.wheels is not None:
             self.wheels.reset()
@@ -311,11 +311,10 @@ class CoordinatedController:
     def come_to_rest(self, law: Callable[[ControlState], Actuation] | None = None) -> None:
         """Bring the whole robot to rest, in any pose, until there is a new goal or reference.
 
-        ``law`` returns the unlimited command for a state; None:
-        :meth:`.JointRateLimits.braking_command`.
+        ``law`` returns the command for a state; None: that of a robot without a held body.
         """
         self.coming_to_rest = True
-        self._to_rest = law or self.joint_rate_limits.braking_command
+        self._to_rest = law or self.detumbling(None, 0.0).command
 
     def detumbling(self, payload: Payload | None, torque_limit: float) -> Detumbling:
         """Return the law that brings the robot to rest with its thrusters, wheels and joints.
@@ -548,7 +547,7 @@ class CoordinatedController:
         if measured is not None:
             if self._estimator is not None:
                 self._estimator.reset(measured)
-            self.mode, self._brake = Mode.MEASURED, None
+            self.mode, self._stopped_at = Mode.MEASURED, None
             return measured
         if self._sent is None or self.mode is Mode.STOPPED:
             self.mode = Mode.STOPPED
@@ -565,20 +564,11 @@ class CoordinatedController:
 
     def _braking_command(self, q: Array, qdot: Array) -> Actuation:
         """Return a command with thrusters off and joints to rest, whatever the pose of the base."""
-        robot = self.law.robot
-        if not robot.n:
-            return Actuation(np.zeros(6), np.zeros(0))
-        if self._brake is None:
-            outputs = ComputedTorqueLaw.default_outputs(robot, "")
-            gains = Gains.uniform(_BRAKE_RATE**2, 2 * _BRAKE_RATE)
+        if self._stopped_at is None:
             # The joints stop where a smooth deceleration from their present rates ends.
-            reference = Reference(joints=JointReference.at_rest(q + qdot / _BRAKE_RATE))
-            self._brake = ComputedTorqueLaw(robot, outputs, gains), reference
-        law, reference = self._brake
-        rest = np.zeros(3)
-        # Forces between base and arm depend on the rotation of the base alone; assumed to be zero.
-        state = ControlState(rest, np.array([0.0, 0.0, 0.0, 1.0]), rest, rest, q, qdot)
-        return law.command(state, reference)
+            self._stopped_at = q + qdot / _BRAKE_RATE
+        qddot = _BRAKE_RATE**2 * (self._stopped_at - q) - 2 * _BRAKE_RATE * qdot
+        return Actuation(np.zeros(6), self.joint_rate_limits.efforts(q, qdot, qddot))
 
 
 def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:

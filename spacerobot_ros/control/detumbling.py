@@ -15,13 +15,19 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.limits import decay_rate, limit_norm
+from spacerobot_ros.control.limits import limit_norm
 from spacerobot_ros.control.state import Actuation, ControlState
 from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import nonnegative, parameter
+
+_REST_RATE = 2.0
+"""Decay rate of joint rates and momenta as a robot is brought to rest, 1/s."""
+
+_REST_RATE_PER_PERIOD = 0.5
+"""Largest product of that decay rate and the control period."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,11 @@ class DetumbleOptions:
         0.002, "largest centre-of-mass speed considered to be at rest", "m/s", minimum=1e-9
     )
     settle_time: float = nonnegative(1.0, "time at rest", "s")
+
+
+def decay_rate(control_period: float) -> float:
+    """Return the decay rate (1/s) of motion while a robot is brought to rest."""
+    return min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
 
 
 def shortest_detumbling(momentum: float, torque: float) -> float:

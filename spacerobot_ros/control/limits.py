@@ -38,13 +38,6 @@ not evaluated."""
 _MOBILITY_SHAPES = 16
 
 
-_REST_RATE = 2.0
-"""Decay rate of joint rates and momenta as a robot is brought to rest, 1/s."""
-
-_REST_RATE_PER_PERIOD = 0.5
-"""Largest product of that decay rate and the control period."""
-
-
 @dataclass(frozen=True)
 class MotionLimits:
     """Largest speeds and accelerations of pose and joint references.
@@ -199,7 +192,6 @@ class JointRateLimits:
         """Largest rates (n,); infinite: no limit."""
         self._robot = robot
         self._control_period = control_period
-        self._rest_rate = decay_rate(control_period)
         self._dynamics = BufferedFunction(_joint_dynamics(robot))
         self._per_rate = 1 / (_SLOW_RATE_SHARE * self.rates)
         self._per_effort = self._largest_mobilities() * control_period * self._per_rate
@@ -261,22 +253,11 @@ class JointRateLimits:
         """Return the largest of the rates (n,) as a fraction of its limit."""
         return float(np.abs(qdot * (1 / self.rates)).max(initial=0.0))
 
-    def braking_command(self, state: ControlState) -> Actuation:
-        """Return the unlimited command under which joint rates and momenta decay.
-
-        The thrusters remove both total momenta, which joint efforts cannot change; the motors
-        remove the joint rates. Each decays independently, at any base pose.
-        """
-        robot, r = self._robot, self._rest_rate
-        J = robot.jacobian(robot.base_link, state.q)
-        v_cm = state.v_WB_B - J[:3, 3:6] @ state.omega_WB_B - J[:3, 6:] @ state.qdot
-        H = robot.inertia_matrix(state.q)
-        force = -r * robot.total_mass * v_cm
-        torque = -r * (H[3:6, 3:6] @ state.omega_WB_B + H[3:6, 6:] @ state.qdot)
-        # A force at the base has a moment about the center of mass.
-        wrench = np.concatenate([force, torque + np.cross(robot.center_of_mass(state.q), force)])
-        Js, Fs, G = self._evaluate_dynamics(state)
-        return Actuation(wrench, -r * (Js @ state.qdot) + Fs - G @ wrench)
+    def efforts(self, q: Array, qdot: Array, qddot: Array) -> Array:
+        """Return the efforts (n,) for joint accelerations (n,) without thrust and base rotation."""
+        rest = np.zeros(3)
+        Js, Fs, _ = self._evaluate_dynamics(ControlState(rest, rest, rest, rest, q, qdot))
+        return np.asarray(Js @ qddot + Fs)
 
     def _evaluate_dynamics(self, state: ControlState) -> tuple[Array, Array, Array]:
         inputs = self._dynamics.inputs
@@ -297,11 +278,6 @@ class JointRateLimits:
             Js, _, _ = self._evaluate_dynamics(ControlState(zero, zero, zero, zero, q, np.zeros(n)))
             largest = np.maximum(largest, np.diag(np.linalg.inv(Js)))
         return largest
-
-
-def decay_rate(control_period: float) -> float:
-    """Return the decay rate (1/s) of motion while a robot is brought to rest."""
-    return min(_REST_RATE, _REST_RATE_PER_PERIOD / control_period)
 
 
 def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:

@@ -19,10 +19,10 @@ from spacerobot_ros.control import ControlState, approach
 from spacerobot_ros.control.approach import NearestLinks, TargetClearance
 from spacerobot_ros.control.detumbling import (
     Detumbling,
+    decay_rate,
     largest_feasible_share,
     shortest_detumbling,
 )
-from spacerobot_ros.control.limits import decay_rate
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Inertia, Pose
 from spacerobot_ros.model.grasp import Payload

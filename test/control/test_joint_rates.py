@@ -21,10 +21,9 @@ from support.random_robots import random_robot_urdf
 from spacerobot_ros.control import Actuation, ControlState, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
+from spacerobot_ros.control.detumbling import Detumbling
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.control.limits import (
-    JointRateLimits,
-)
+from spacerobot_ros.control.limits import JointRateLimits
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -42,6 +41,10 @@ def random_robot(seed: int) -> SpaceRobot:
 
 def moving(rng: np.random.Generator, robot: SpaceRobot) -> ControlState:
     return random_state(rng, robot.n)
+
+
+def to_rest(robot: SpaceRobot) -> Detumbling:
+    return Detumbling(robot, None, math.inf, math.inf, 0.0, PERIOD)
 
 
 def energy(plant: PinocchioPlant) -> float:
@@ -98,7 +101,8 @@ def test_a_command_that_keeps_the_rates_is_not_touched() -> None:
     assert limits.apply(slow, given, robot.effort_limit) is given
     # As fast as may be, and slowed down.
     fast = replace(slow, qdot=0.99 * robot.velocity_limit)
-    _, qddot = plant_of(robot, fast).acceleration(braking := limits.braking_command(fast))
+    braking = to_rest(robot).command(fast)
+    _, qddot = plant_of(robot, fast).acceleration(braking)
     np.testing.assert_allclose(qddot, -2.0 * fast.qdot, rtol=1e-6)
     assert limits.apply(fast, braking, np.full(6, np.inf)) is braking
 
@@ -140,13 +144,12 @@ def test_thrust_that_the_motors_cannot_bear_is_lowered_and_keeps_its_direction()
 @pytest.mark.parametrize("seed", range(3))
 def test_momenta_and_rates_decay_and_energy_only_falls(seed: int) -> None:
     robot, rng = random_robot(seed), np.random.default_rng(seed)
-    limits = JointRateLimits(robot, np.full(robot.n, np.inf), PERIOD)
-    state = moving(rng, robot)
+    state, law = moving(rng, robot), to_rest(robot)
     plant = plant_of(robot, state, PERIOD / 2)
     began, rates, last = plant.momentum(), state.qdot, energy(plant)
     first = last
     for _ in range(50):
-        plant.step(limits.braking_command(plant.state), PERIOD)
+        plant.step(law.command(plant.state), PERIOD)
         now = energy(plant)
         assert now < last
         last = now
