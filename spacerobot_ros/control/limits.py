@@ -31,12 +31,6 @@ _MIN_PERIODS_TO_LIMIT = 2
 """Shortest time for a joint to reach its rate limit, in control periods: neither the held nor the
 next efforts may exceed the limit, even if the model is slightly wrong."""
 
-_SLOW_RATE_SHARE = 0.5
-"""Fraction of a joint's rate limit; if the rate after the next period is below it, the dynamics are
-not evaluated."""
-
-_MOBILITY_SHAPES = 16
-
 
 @dataclass(frozen=True)
 class MotionLimits:
@@ -192,10 +186,8 @@ class JointRateLimits:
         """Largest rates (n,); infinite: no limit."""
         self._robot = robot
         self._control_period = control_period
+        self._unlimited = not limited.any()
         self._dynamics = BufferedFunction(_joint_dynamics(robot))
-        self._per_rate = 1 / (_SLOW_RATE_SHARE * self.rates)
-        self._per_effort = self._largest_mobilities() * control_period * self._per_rate
-        self._shares = list(zip(self._per_rate.tolist(), self._per_effort.tolist(), strict=True))
 
     def apply(
         self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
@@ -205,7 +197,7 @@ class JointRateLimits:
         ``effort`` (n,) are the largest joint efforts, N m or N, not exceeded by ``given``;
         ``periods`` is the number of control periods for which the command will probably be held.
         """
-        if not self._may_exceed(state.qdot, given.tau, periods):
+        if self._unlimited:
             return given
         Js, Fs, G = self._evaluate_dynamics(state)
         pushed = G @ given.wrench_B
@@ -220,24 +212,13 @@ class JointRateLimits:
         tau = np.clip(wanted - share * pushed, -effort, effort)
         return Actuation(share * given.wrench_B, tau)
 
-    def _may_exceed(self, qdot: Array, tau: Array, periods: int) -> bool:
-        """Whether efforts may bring a joint near its rate: a bound, for any shape."""
-        rates, efforts = qdot.tolist(), tau.tolist()
-        for rate, effort, (per_rate, per_effort) in zip(rates, efforts, self._shares, strict=True):
-            if abs(rate) * per_rate + abs(effort) * (periods * per_effort) > 1.0:
-                return True
-        return False
-
     def exceeds_limits_expression(
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
     ) -> ca.SX:
         """Return whether :meth:`apply` changes the command ``[f; n; tau]`` (6 + n,)."""
-        if not np.isfinite(self.rates).any():
+        if self._unlimited:
             return ca.SX(0)
         n, tau = self._robot.n, actuation[6:]
-        # A joint cannot reach its largest rate while its share is at most 1.
-        shares = ca.fabs(qdot) * self._per_rate + ca.fabs(tau) * self._per_effort
-        near = ca.sum1(shares > 1.0)
         flat, Fs, columns = self._dynamics.function(q, omega, qdot)
         Js, G = ca.reshape(flat, n, n).T, ca.reshape(columns, 6, n).T
         qddot = solve_positive_definite(Js, tau + G @ actuation[:6] - Fs)
@@ -247,7 +228,7 @@ class JointRateLimits:
             if np.isfinite(rate):
                 lowest, highest = (-rate - qdot[i]) / soonest, (rate - qdot[i]) / soonest
                 beyond.append(ca.logic_or(qddot[i] < lowest, qddot[i] > highest))
-        return ca.logic_and(near > 0, ca.sum1(ca.vertcat(*beyond)) > 0)
+        return ca.sum1(ca.vertcat(*beyond)) > 0
 
     def largest_rate_share(self, qdot: Array) -> float:
         """Return the largest of the rates (n,) as a fraction of its limit."""
@@ -266,18 +247,6 @@ class JointRateLimits:
         Js, Fs, G = self._dynamics.outputs
         n = self._robot.n
         return Js.reshape((n, n)), Fs, G.reshape((n, 6))
-
-    def _largest_mobilities(self) -> Array:
-        """Return the largest acceleration (n,) of each joint by an effort of one of its own."""
-        n, rng = self._robot.n, np.random.default_rng(1)
-        lower = np.maximum(self._robot.lower, -np.pi)
-        upper = np.maximum(np.minimum(self._robot.upper, np.pi), lower)
-        zero, largest = np.zeros(3), np.zeros(n)
-        for shape in rng.uniform(0.0, 1.0, (_MOBILITY_SHAPES, n)):
-            q = lower + shape * (upper - lower)
-            Js, _, _ = self._evaluate_dynamics(ControlState(zero, zero, zero, zero, q, np.zeros(n)))
-            largest = np.maximum(largest, np.diag(np.linalg.inv(Js)))
-        return largest
 
 
 def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:
