@@ -238,7 +238,9 @@ def plan_approach(
     standoffs = [factor * np.array(options.standoff) for factor in _STANDOFF_FACTORS]
     ways = [(each, _closing_path(each, options, limits)) for each in standoffs]
     ways.insert(0, ways[0])  # Relative to the grapple frame; the others are short in W.
-    at_rest, failure = held.motion, _RefusalReasons()
+    at_rest, within = held.motion, f"within the next {options.horizon:g} s"
+    # Of two reasons for refusal, the greater one is that of the approach that came farther.
+    refused, blocked = (0, -math.inf, ""), 0
     longest = _LONGEST_PATH + options.standoff_time + ways[-1][1].duration + 2 * _SAMPLE_PERIOD
     samples = round((options.horizon + longest) / _SAMPLE_PERIOD)
     grapple = target.grapple(_SAMPLE_PERIOD * np.arange(samples))
@@ -266,12 +268,21 @@ def plan_approach(
                 share = _largest_limit_share(motion, limits, axes)
                 if share[0] > 1.0:
                     break
-            failure.limit = min(failure.limit, share)
             if share[0] > 1.0:
+                sentence = (
+                    "The target moves too fast to be reached: the end-effector's reference would "
+                    f"need {share[1]}."
+                )
+                refused = max(refused, (0, -share[0], sentence))
                 continue
             distance = reach.distance_to(motion, -1)
             if distance > REACHED_DISTANCE:
-                failure.nearest = min(failure.nearest, (distance, plan.contact))
+                sentence = (
+                    f"The target is out of reach {within}: at best, with contact at "
+                    f"{plan.contact:.4g} s, the end-effector stays {distance:.3g} m or rad away "
+                    "from its grapple frame while the base holds its place."
+                )
+                refused = max(refused, (1, -distance, sentence))
                 if way:
                     continue
                 break  # A longer path meets the target later, which other start times do, too.
@@ -290,16 +301,18 @@ def plan_approach(
                 near = clearance.nearest(reach.base, shapes, grapple.rows(ticks), closes)
                 if near is not None and near.distance < clearance.min_distance:
                     break
+            met = f"The target cannot be met {within}: with contact at {plan.contact:.4g} s, "
             if clearance and near and near.distance < clearance.min_distance:
-                in_the_way = True
-                failure.blocked(near, clearance.min_distance, plan.contact)
+                in_the_way, blocked = True, blocked + 1
+                sentence = f"{met}{near.describe(clearance.min_distance)}."
+                refused = max(refused, (3, near.distance, sentence))
             elif why:
-                failure.unreachable = why, plan.contact
+                refused = max(refused, (2, plan.contact, f"{met}{why}."))
             else:
                 return plan if near is None else replace(plan, distance=near.distance)
-            if failure.blocks == _MAX_BLOCKED_PATHS:
-                raise PlanningError(failure.message(options.horizon))
-    raise PlanningError(failure.message(options.horizon))
+            if blocked == _MAX_BLOCKED_PATHS:
+                raise PlanningError(refused[2])
+    raise PlanningError(refused[2])
 
 
 def _closing_path(standoff: Array, options: ApproachOptions, limits: MotionLimits) -> RelativePath:
@@ -338,62 +351,25 @@ def _largest_limit_share(
     return max(shares)
 
 
-class _RefusalReasons:
-    """The best refused approach of each kind."""
-
-    def __init__(self) -> None:
-        self.limit = math.inf, ""
-        """Share of a limit, and the clause about it."""
-        self.nearest = math.inf, 0.0
-        """Distance of the arm from the grapple frame at contact, and the time of contact, s."""
-        self.unreachable = "", 0.0
-        """Why the arm could not follow the last path, and its time of contact, s."""
-        self.beside = -math.inf, 0.0, ""
-        """Distance from the target body, m, the time of contact, s, and the clause about them."""
-        self.blocks = 0
-        """Number of paths that come too close to the target body."""
-
-    def blocked(self, nearest: NearestLinks, least: float, contact: float) -> None:
-        self.blocks += 1
-        first, second = nearest.links
-        near = f"come within {nearest.distance:.3g} m of"
-        limit = f", and 'target.clearance' is {least:g} m"
-        if nearest.distance <= 0.0:
-            near, limit = "touch", ""
-        why = f"link '{first}' would {near} '{second}' of the target{limit}"
-        self.beside = max(self.beside, (nearest.distance, contact, why))
-
-    def message(self, horizon: float) -> str:
-        excess, limit = self.limit
-        if excess > 1.0:
-            return (
-                "The target moves too fast to be reached: the end-effector's reference would need "
-                f"{limit}."
-            )
-        within = f"within the next {horizon:g} s"
-        (distance, contact), (why, tried_at) = self.nearest, self.unreachable
-        if self.blocks:
-            _, tried_at, why = self.beside
-        if why:
-            return f"The target cannot be met {within}: with contact at {tried_at:.4g} s, {why}."
-        return (
-            f"The target is out of reach {within}: at best, with contact at {contact:.4g} s, the "
-            f"end-effector stays {distance:.3g} m or rad away from its grapple frame while the "
-            "base holds its place."
-        )
-
-
 # -- distances from the target's body -------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class NearestLinks:
-    """Smallest distance during a motion, m, with the robot link, the target link and the sample
-    index."""
+    """Smallest distance during a motion, m, with the robot link and the target link."""
 
     distance: float
     links: LinkPair
-    sample: int
+
+    def describe(self, least: float) -> str:
+        """Return a clause on a distance below the permitted one, m."""
+        first, second = self.links
+        if self.distance <= 0.0:
+            return f"link '{first}' would touch '{second}' of the target"
+        return (
+            f"link '{first}' would come within {self.distance:.3g} m of '{second}' of the target, "
+            f"and 'target.clearance' is {least:g} m"
+        )
 
 
 class TargetClearance:
@@ -447,11 +423,9 @@ class TargetClearance:
         for pair in np.argsort(bounds.min(axis=0), kind="stable").tolist():
             at = np.flatnonzero(bounds[:, pair] < (np.inf if found is None else found.distance))
             if len(at):
-                distances = geometry.distances(pair, (poses[0][at], poses[1][at]))
-                k = int(distances.argmin())
-                if found is None or distances[k] < found.distance:
-                    links = geometry.links_of(pair)
-                    found = NearestLinks(float(distances[k]), links, int(at[k]))
+                distance = float(geometry.distances(pair, (poses[0][at], poses[1][at])).min())
+                if found is None or distance < found.distance:
+                    found = NearestLinks(distance, geometry.links_of(pair))
         return found
 
     def _base_in_target(self, base: Pose, grapple: FrameMotion) -> BasePoses:

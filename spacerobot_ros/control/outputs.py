@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -174,8 +175,7 @@ _POSE_REFERENCE_SIZE = 19
 accelerations."""
 
 
-@dataclass(frozen=True)
-class _OutputGroup:
+class _OutputGroup(NamedTuple):
     """Outputs of one kind: error, error rate, wanted acceleration, rows of J_z, bias."""
 
     error: ca.SX
@@ -183,15 +183,6 @@ class _OutputGroup:
     acceleration: ca.SX
     J: ca.SX
     bias_acceleration: ca.SX
-
-    def selected_rows(self, chosen: list[int]) -> _OutputGroup:
-        return _OutputGroup(
-            self.error[chosen],
-            self.error_rate[chosen],
-            self.acceleration[chosen],
-            self.J[chosen, :],
-            self.bias_acceleration[chosen],
-        )
 
 
 class OutputVector:
@@ -252,35 +243,30 @@ class OutputVector:
         self.J_q_inverse = ca.SX.eye(self.N)
         self.J_q_inverse[:3, 3:] = -J_base[:3, 3:]
 
-        groups = []
+        groups: list[_OutputGroup] = []
         references = []
         if selection.base:
             target = ca.SX.sym("base_reference", _POSE_REFERENCE_SIZE)
             references.append(target)
             pose = self._pose_group(J_base, r_WB, self._quaternion, target)
-            groups.append(pose.selected_rows([AXES.index(axis) for axis in selection.base]))
+            groups.append(_selected(pose, AXES, selection.base))
         if selection.end_effector:
             target = ca.SX.sym("end_effector_reference", _POSE_REFERENCE_SIZE)
             references.append(target)
             pose = self._end_effector_group(r_WB, target)
-            groups.append(pose.selected_rows([AXES.index(axis) for axis in selection.end_effector]))
+            groups.append(_selected(pose, AXES, selection.end_effector))
         if selection.joints:
             target = ca.SX.sym("joint_reference", 3 * n)
             references.append(target)
-            shape = self._joint_group(target)
-            groups.append(
-                shape.selected_rows([robot.joint_names.index(name) for name in selection.joints])
-            )
+            groups.append(_selected(self._joint_group(target), robot.joint_names, selection.joints))
         self.reference = ca.vertcat(*references)
-        self.error = ca.vertcat(*(group.error for group in groups))
-        self.error_rate = ca.vertcat(*(group.error_rate for group in groups))
         self._error_function: ca.Function | None = None
-        self.acceleration = ca.vertcat(*(group.acceleration for group in groups))
-        self.J_z = ca.vertcat(*(group.J for group in groups))
+        self.error, self.error_rate, self.acceleration, self.J_z, self.bias_acceleration = (
+            ca.vertcat(*parts) for parts in zip(*groups, strict=True)
+        )
         if not thrust:
             # No actuator moves the centre of mass.
             self.J_z[:, :3] = 0
-        self.bias_acceleration = ca.vertcat(*(group.bias_acceleration for group in groups))
 
     def pack_state(self, state: ControlState, memory: Array) -> None:
         """Write a state into memory (13 + 2 n,) for the symbol ``state``.
@@ -381,6 +367,11 @@ class OutputVector:
         q_des, qdot_des, qddot_des = ca.vertsplit(target, [0, n, 2 * n, 3 * n])
         J = ca.horzcat(ca.SX(n, 6), ca.SX.eye(n))
         return _OutputGroup(q_des - self.q, qdot_des - self.qdot, qddot_des, J, ca.SX(n, 1))
+
+
+def _selected(group: _OutputGroup, names: Sequence[str], chosen: Sequence[str]) -> _OutputGroup:
+    rows = [names.index(name) for name in chosen]
+    return _OutputGroup(*(part[rows, :] for part in group))
 
 
 def _pose_parts(frame: str, pose: PoseReference | None) -> list[Array]:
