@@ -46,7 +46,6 @@ from spacerobot_ros.control.state import (
 from spacerobot_ros.control.wheels import WheelControl
 from spacerobot_ros.errors import (
     ParameterError,
-    PlanningError,
     SpaceRobotError,
     describe_exception,
 )
@@ -61,9 +60,6 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
-
-_LONGEST_MOTION = 1e9
-"""Longest duration of a reference, s, equal to that of the longest flights."""
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion if the base state is unknown, 1/s."""
@@ -233,26 +229,6 @@ class CoordinatedController:
         self.profile, self._began = profile, time
         with self._failures_of_law(time):
             self.law.start(time, profile.start, profile.goal)
-
-    def require_bounded_duration(self, state: ControlState, goals: Reference) -> None:
-        """Reject goals whose reference would take longer than any flight.
-
-        Raises
-        ------
-        PlanningError
-            The reference takes too long; the message states its duration.
-        """
-        here = Reference.present(
-            self.law.robot, state, self.law.outputs.selection.end_effector_link
-        )
-        motion = self._motion_within_limits(state)
-        duration = self._profile_type(here, goals, motion).duration
-        if duration > _LONGEST_MOTION:
-            raise PlanningError(
-                f"The reference to the goal would take {duration:.3g} s, and the longest is "
-                f"{_LONGEST_MOTION:g} s: choose a nearer goal, or raise motion.speed, "
-                "motion.acceleration or the thruster limits."
-            )
 
     def _motion_within_limits(self, state: ControlState) -> MotionLimits:
         motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)

@@ -9,14 +9,13 @@ by commands held for a control period: :class:`JointRateLimits` lowers their eff
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from spacerobot_ros.control.state import Actuation, ControlState
-from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
@@ -38,11 +37,6 @@ class MotionLimits:
 
     ``joint_speed`` and ``joint_acceleration`` apply to every joint (m or rad, s); the controller
     node does not have these parameters, because its goals are poses.
-
-    Raises
-    ------
-    ParameterError
-        A limit is not positive; the message names it.
     """
 
     speed: float = parameter(0.1, "largest reference speed", "m/s", minimum=1e-06)
@@ -53,12 +47,6 @@ class MotionLimits:
     )
     joint_speed: float = 0.1
     joint_acceleration: float = 0.02
-
-    def __post_init__(self) -> None:
-        for limit in fields(self):
-            value = getattr(self, limit.name)
-            if not value > 0:
-                raise ParameterError(f"The limit '{limit.name}' is {value}; it must be positive.")
 
     def within_thruster_limits(
         self, actuators: ActuatorLimits, robot: SpaceRobot, q: Array
@@ -112,27 +100,11 @@ class ActuatorLimits:
     in Euclidean norm and independently of each other. A larger force or torque is scaled to its
     limit, preserving its direction. Each joint produces up to its ``effort`` (n,), N m or N.
     Infinite means no limit.
-
-    Raises
-    ------
-    ParameterError
-        A limit is negative or not a number.
     """
 
     force: float
     torque: float
     effort: Array
-
-    def __post_init__(self) -> None:
-        for name, value, unit in (("force", self.force, "N"), ("torque", self.torque, "N m")):
-            if math.isnan(value) or value < 0:
-                raise ParameterError(
-                    f"The thruster {name} limit is {value} {unit}; it must not be negative."
-                )
-        if not np.all(self.effort >= 0):
-            raise ParameterError(
-                f"The joint effort limits are {self.effort.tolist()}; none may be negative."
-            )
 
     def apply(self, commanded: Actuation) -> Saturated:
         """Return the command within the limits."""

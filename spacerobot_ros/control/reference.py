@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.control.limits import MotionLimits
-from spacerobot_ros.control.state import JointReference, PoseReference, Reference, TargetNotSetError
+from spacerobot_ros.control.state import JointReference, PoseReference, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
     attitude_error,
@@ -54,11 +54,6 @@ class ReferenceProfile(ABC):
     carries
         Whether the end-effector has no goal and moves with the base, so that the arm keeps its
         shape.
-
-    Raises
-    ------
-    TargetNotSetError
-        The goal has a group that the start lacks.
     """
 
     name: ClassVar[str]
@@ -66,11 +61,6 @@ class ReferenceProfile(ABC):
     def __init__(
         self, start: Reference, goal: Reference, limits: MotionLimits, *, carries: bool = False
     ) -> None:
-        for group in fields(goal):
-            wanted = getattr(goal, group.name) is not None
-            if wanted and getattr(start, group.name) is None:
-                name = group.name.replace("_", "-")
-                raise TargetNotSetError(f"The {name} has a goal, but no pose to start from.")
         self.start = start
         self.goal = goal
         self.limits = limits

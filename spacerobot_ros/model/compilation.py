@@ -21,7 +21,7 @@ import sys
 import sysconfig
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -37,10 +37,6 @@ from spacerobot_ros.termination import tool
 _FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off")
 """Compiler flags for all objects: with fused multiply-adds, results would depend on the
 processor."""
-
-_MIN_OPERATIONS_TO_KEEP = 200
-"""Smallest number of operations in a cached function: loading it is faster than deriving it, even
-if functions are derived together and only some are missing."""
 
 announcement_listeners: list[Callable[[str], None]] = []
 """Functions called with a message when a long computation begins, which the log has too."""
@@ -193,14 +189,7 @@ def load_library(
     file_name = f"{name}-{key[:32]}.so"
     cache = Cache(cache_directory())
     if kept := cache.load(file_name, key):
-        try:
-            return load(str(kept[0]))
-        except (OSError, RuntimeError):
-            warn_once(
-                f"The compiled functions in '{kept[0].parent}' are intact but cannot be loaded, "
-                "for example because the file system forbids execution; they are compiled at each "
-                "start."
-            )
+        return _loaded(load, kept[0])
     _announce_compilation()
     with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
         file, built = Path(folder, f"function.{language}"), Path(folder, "function.so")
@@ -210,13 +199,18 @@ def load_library(
             stored = cache.store(file_name, key, built.read_bytes())
         except OSError as error:
             raise NoLibraryError(error.strerror or str(error)) from None
-        for path in (stored, built):
-            # The cache's folder may forbid execution; the temporary file is then loaded, and a
-            # loaded object stays when its file is deleted.
-            with suppress(OSError, RuntimeError):
-                if path is not None:
-                    return load(str(path))
-    raise NoLibraryError("the compiled object cannot be loaded")
+        # A loaded object stays when its file is deleted.
+        return _loaded(load, stored or built)
+
+
+def _loaded(load: Callable[[str], _Loaded], path: Path) -> _Loaded:
+    try:
+        return load(str(path))
+    except (OSError, RuntimeError):
+        raise NoLibraryError(
+            f"the objects in '{path.parent}' cannot be loaded, for example because the file system "
+            "forbids execution; SPACEROBOT_CACHE_DIR selects another folder"
+        ) from None
 
 
 def _run_compiler(command: Sequence[str], folder: Path) -> None:
@@ -275,8 +269,7 @@ def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca
         except (RuntimeError, ValueError) as error:
             cache.discard(serialised, str(error))
     function = build()
-    if function.n_instructions() >= _MIN_OPERATIONS_TO_KEEP:
-        cache.store(serialised, key, function.serialize().encode())
+    cache.store(serialised, key, function.serialize().encode())
     return function
 
 

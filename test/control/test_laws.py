@@ -45,7 +45,6 @@ from spacerobot_ros.control import (
     Actuation,
     ControlLaw,
     ControlState,
-    GainPair,
     Gains,
     LawOptions,
     PoseReference,
@@ -78,14 +77,6 @@ def test_a_law_without_its_reference_says_which() -> None:
     state = random_state(np.random.default_rng(1), 6)
     with pytest.raises(TargetNotSetError, match="the end-effector"):
         law.command(state, Reference(base=pose([0, 0, 0])))
-
-
-@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
-def test_gains_that_are_refused(value: float) -> None:
-    with pytest.raises(ParameterError, match=r"base_position\.kp"):
-        Gains.uniform(value, 1.0)
-    with pytest.raises(ParameterError, match=r"end_effector_attitude\.kd"):
-        replace(GAINS, end_effector_attitude=GainPair(1.0, value))
 
 
 def test_gains_change_between_commands() -> None:

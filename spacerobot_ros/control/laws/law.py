@@ -3,10 +3,9 @@ reference."""
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -116,11 +115,6 @@ class Gains:
     """Diagonals of Kp, Kd (paper 4, eqs 27 and 29) and Ki by group; 0 in Kp or Kd: automatic.
 
     If given, ``kp_matrix`` and ``kd_matrix`` (m * m,) replace Kp and Kd for all outputs.
-
-    Raises
-    ------
-    ParameterError
-        A gain is negative or not finite; the message names it.
     """
 
     base_position: GainPair = group(GainPair())
@@ -130,15 +124,6 @@ class Gains:
     joints: GainPair = group(GainPair())
     kp_matrix: tuple[float, ...] = _matrix_parameter("Kp")
     kd_matrix: tuple[float, ...] = _matrix_parameter("Kd")
-
-    def __post_init__(self) -> None:
-        for group_name in _GAIN_GROUPS:
-            for name, value in vars(getattr(self, group_name)).items():
-                if not (math.isfinite(value) and value >= 0):
-                    raise ParameterError(
-                        f"The gain {group_name}.{name} is {value}; it must be finite and "
-                        "non-negative."
-                    )
 
     @classmethod
     def uniform(cls, kp: float, kd: float, ki: float = 0.0) -> Gains:
@@ -178,9 +163,6 @@ class Gains:
             ),
             *(self.joints for _ in selection.joints),
         ]
-
-
-_GAIN_GROUPS = tuple(each.name for each in fields(Gains) if not each.name.endswith("_matrix"))
 
 
 def _checked_matrix(
