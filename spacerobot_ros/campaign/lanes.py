@@ -32,9 +32,9 @@ from spacerobot_ros.campaign.one_by_one import FlightsEngine, nominal_robots, pl
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller, controlled_outputs
-from spacerobot_ros.control.goals import controlled_parts, decided_message
+from spacerobot_ros.control.goals import decided_message
 from spacerobot_ros.control.laws.registry import LAWS
-from spacerobot_ros.control.outputs import OutputDistance
+from spacerobot_ros.control.outputs import OutputDistance, controlled_parts
 from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError

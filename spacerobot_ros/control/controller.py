@@ -120,7 +120,7 @@ class CoordinatedController:
         self.wheels = wheels
         self.planner = planner
         self.law, selection = law, law.outputs.selection
-        self._kinds, self._distances = selection.error_kinds, selection.distances
+        self._distances = selection.distances
         self._limits, self.joint_rate_limits = limits, rates
         self._profile_type, self._motion = profile, motion
         self._control_period, self._estimation_time = control_period, estimation_time
@@ -487,9 +487,9 @@ class CoordinatedController:
         law, far = self.law, self.profile.distances()
         Kp, Kd = law.gain_diagonals
         reach = np.abs(law.error) + Kd / Kp * np.abs(law.error_rate)
-        bounds = np.empty(len(self._kinds))
-        for kind in set(self._kinds):
-            of_kind = np.array([each == kind for each in self._kinds])
+        bounds = np.empty(len(reach))
+        for kind in {kind for kind, _ in self._distances}:
+            of_kind = [i for each, places in self._distances if each == kind for i in places]
             largest = max(getattr(far, kind), float(reach[of_kind].max()))
             bounds[of_kind] = 2 * largest + getattr(margins, kind)
         return bounds

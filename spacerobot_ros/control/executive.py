@@ -10,10 +10,11 @@ from enum import IntEnum
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, Mode
-from spacerobot_ros.control.goal_planning import GoalPlanning, PlannedGoals
 from spacerobot_ros.control.goals import (
     END_EFFECTOR,
+    GoalPlanning,
     GoalWatch,
+    PlannedGoals,
     aims_of,
     config_with,
     goal_parts,

@@ -1,18 +1,27 @@
-"""Monitor for a controller's goal (reached, failed or lost), with numbers or symbols.
+"""Monitors of a controller's goal: reached, failed, lost, or stalled.
 
-The executive evaluates the monitor numerically, state by state; SIMD lanes are compiled
-from the same methods, called with CasADi symbols. Conditions are therefore numbers, 1 or 0,
+The executive evaluates :class:`GoalMonitor` numerically, state by state; SIMD lanes are compiled
+from the same methods, called with CasADi symbols. Its conditions are therefore numbers, 1 or 0,
 combined by arithmetic: ``a * b`` is "a and b", ``1 - a`` is "not a".
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.reference import OutputErrors
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.space_robot import SpaceRobot
+
+if TYPE_CHECKING:
+    from spacerobot_ros.control.controller import CoordinatedController
+    from spacerobot_ros.control.limits import Saturated
 
 Scalar = Any
 """A number or a CasADi symbol."""
@@ -155,3 +164,183 @@ class GoalMonitor:
         controlled = (1 - rates) * (1 - lost)
         outcome = self.decide_by_errors(time, at_rest, ends, errors, config)
         return (1 - controlled) * Decision.LOST + controlled * outcome
+
+
+# -- progress --------------------------------------------------------------------------------------
+
+_SHORTEST_WINDOW, _LONGEST_WINDOW = 2.0, 10.0
+"""Shortest and longest time over which errors are compared, s."""
+
+_LIMITED_WINDOW = 5.0
+"""Comparison time while commands are limited, which slows the loop, s."""
+
+_LEAST_WINDOW_PERIODS = 20
+"""Shortest comparison time, in control periods."""
+
+_SAMPLES = 32
+"""Number of states whose errors are checked within a comparison time."""
+
+_LEAST_PROGRESS = 0.02
+"""Smallest fraction by which errors must shrink between windows; in a linear loop they shrink by
+0.6 per time constant."""
+
+_LAG_SHARE = 0.5
+"""Largest lag of an unimpeded robot behind its reference, as a fraction of the distance."""
+
+_LEAST_SMALLEST_TOLERANCE = 1e-9
+"""Tolerance (m, rad) used in place of zero."""
+
+_STOP_SHARE = 0.005
+"""Distance, as a fraction of its range, at which a joint is considered to be at its stop."""
+
+_SINGULAR_SHARE = 0.7
+"""Fraction of the error in singular directions above which a singularity is taken as the cause."""
+
+
+class StallMonitor:
+    """Compares the largest error, as a fraction of its tolerance, between successive time windows.
+
+    A window is the time in which the slowest error of the closed loop decays to a third
+    (:meth:`.ControlLaw.slowest_decay`), clamped to 2 to 10 s; 5 s while commands are limited. The
+    robot
+    is stalled if the largest error shrinks from one window to the next by less than 2 % and by less
+    than before:
+
+    * after the reference has come to rest, and while an error is beyond its tolerance;
+    * while the reference moves, if the robot lags behind by more than half the distance and more
+    than its tolerance, and the error has not begun to shrink.
+
+    The stall ends when the errors shrink again.
+    """
+
+    def __init__(self) -> None:
+        self.cause = ""
+        """Cause of the stall, as the second half of a sentence; empty if not stalled."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Restart, at a new goal or after a jump in time or position."""
+        self.cause = ""
+        self._ends = self._next_sample = -math.inf
+        self._window = 0.0
+        self._at_rest = False
+        """Whether the reference was at rest when the current window began."""
+        self._largest: list[float] = []
+        """Largest fractions in the current and earlier windows, the latest first."""
+        self._share = self._lag = 0.0
+        """Largest fraction, and lag behind the reference, in the last state."""
+        self._samples = self._limited = 0
+
+    def observe(
+        self,
+        time: float,
+        controller: CoordinatedController,
+        result: Saturated,
+        config: ControllerConfig,
+    ) -> None:
+        """Process the controller's state and command at a given time (s)."""
+        if time < self._next_sample:
+            return
+        if not self._largest:
+            self._begin(time, controller, config)
+        elif not self._at_rest and controller.reference_at_rest(time):
+            # Errors of a reference at rest are compared only with each other: those before
+            # say how fast it moved.
+            self._largest = []
+            self._begin(time, controller, config)
+        self._next_sample = time + self._window / _SAMPLES
+        errors = controller.errors()
+        self._share, self._lag = _largest_share(errors, config), _lag(errors, controller, config)
+        self._largest[0] = max(self._largest[0], self._share)
+        self._samples += 1
+        self._limited += result.limited
+        if time >= self._ends:
+            self._compare(controller, result)
+            self._begin(time, controller, config)
+
+    def _begin(
+        self, time: float, controller: CoordinatedController, config: ControllerConfig
+    ) -> None:
+        rate = 1 / _LIMITED_WINDOW if self._is_limited else controller.law.slowest_decay()
+        shortest = max(_SHORTEST_WINDOW, _LEAST_WINDOW_PERIODS * config.control_period)
+        self._window = max(1 / max(rate, 1 / _LONGEST_WINDOW), shortest)
+        self._ends = time + self._window
+        self._at_rest = controller.reference_at_rest(time)
+        self._largest = [0.0, *self._largest[:2]]
+        self._samples = self._limited = 0
+
+    @property
+    def _is_limited(self) -> bool:
+        return 2 * self._limited > self._samples
+
+    def _compare(self, controller: CoordinatedController, result: Saturated) -> None:
+        if len(self._largest) < 2:
+            return
+        now, before = self._largest[:2]
+        progress = before - now
+        earlier = self._largest[2] - before if len(self._largest) > 2 else 0.0
+        if now <= 1.0 or progress >= _LEAST_PROGRESS * before:
+            self.cause = ""
+        elif not self._at_rest and self._share < (1 - _LEAST_PROGRESS) * now:
+            self.cause = ""  # The errors grew on the way, and shrink again.
+        # Robots with little thrust begin slowly, and make more and more way.
+        elif progress > max(earlier, 0.0) and not self.cause:
+            pass
+        elif self._at_rest or (self._lag > _LAG_SHARE and progress <= 0.0):
+            self.cause = self._find_cause(controller, result)
+
+    def _find_cause(self, controller: CoordinatedController, result: Saturated) -> str:
+        law, limited = controller.law, self._is_limited
+        stop = _joint_at_stop(law.robot, law.state.q)
+        if stop and limited:
+            return stop
+        if law.singular_error_share > _SINGULAR_SHARE:
+            cause = "the arm is stretched out or folded (singular)"
+            profile = controller.profile
+            if profile is not None and not profile.carries:
+                cause += "; the end-effector keeps its own goal until ~/abort"
+            return cause
+        if limited:
+            for part, name in (
+                (result.excess.wrench_B[:3], "the thruster force is at its limit"),
+                (result.excess.wrench_B[3:], "the base torque is at its limit"),
+            ):
+                if np.any(part):
+                    return name
+            return "joint efforts are at their limits"
+        return stop or "its errors no longer shrink"
+
+
+def _joint_at_stop(robot: SpaceRobot, q: Array) -> str:
+    span = robot.upper - robot.lower
+    margin = _STOP_SHARE * np.where(np.isfinite(span), span, 0.0)
+    for name, at_stop in zip(
+        robot.joint_names, (q <= robot.lower + margin) | (q >= robot.upper - margin), strict=True
+    ):
+        if at_stop:
+            return f"joint '{name}' is at its stop"
+    return ""
+
+
+def _largest_share(errors: OutputErrors, config: ControllerConfig) -> float:
+    return max(
+        error / max(tolerance, _LEAST_SMALLEST_TOLERANCE)
+        for error, tolerance in (
+            (errors.position, config.position_tolerance),
+            (errors.attitude, config.attitude_tolerance),
+            (errors.joints, config.joint_tolerance),
+        )
+    )
+
+
+def _lag(
+    errors: OutputErrors, controller: CoordinatedController, config: ControllerConfig
+) -> float:
+    assert controller.profile is not None
+    ways = controller.profile.distances()
+    pairs = (
+        (errors.position, ways.position, config.position_tolerance),
+        (errors.attitude, ways.attitude, config.attitude_tolerance),
+        (errors.joints, ways.joints, config.joint_tolerance),
+    )
+    return max((e / way for e, way, tolerance in pairs if min(e, way) > tolerance), default=0.0)

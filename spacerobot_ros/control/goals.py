@@ -1,20 +1,22 @@
-"""Goals of a controller: their parts, what a law controls of them, and how they end."""
+"""Goals of a controller: their parts, what a law controls of them, how they end, and the planning
+of their references, in parallel with the control loop.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
-from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
-from spacerobot_ros.control.goal_planning import Aims
+from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor, StallMonitor
 from spacerobot_ros.control.laws.law import ControlLaw
-from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.stall_monitor import StallMonitor
+from spacerobot_ros.control.outputs import OutputDistance, controlled_parts
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlannedReference
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import PlanningError
@@ -25,6 +27,7 @@ from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.core.goal import (
     POSE,
     Controlled,
@@ -51,6 +54,17 @@ _NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
 
 _PLACE: frozenset[Controlled] = frozenset({"position"})
 """Components requested by an end-effector goal with free attitude."""
+
+
+class Aims(TypedDict):
+    """Poses and joint positions requested by goals; None: not requested. The base rests at each of
+    the ``waypoints``, poses (7,), before its goal.
+    """
+
+    base: PoseReference | None
+    waypoints: tuple[Array, ...]
+    end_effector: PoseReference | None
+    joints: Array | None
 
 
 def goal_parts(
@@ -142,12 +156,6 @@ def _require_controlled(
             f"The goal has {len(goal.waypoints)} waypoint(s), which require a planned motion: set "
             "profile to planned."
         )
-
-
-def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
-    """Return the goal components controlled by outputs: pose axes and joints."""
-    parts: set[Controlled] = {"attitude" if axis.startswith("r") else "position" for axis in axes}
-    return frozenset(parts | {"shape"} if joints else parts)
 
 
 def require_controlled_axes(
@@ -407,3 +415,135 @@ def decided_message(
     if not any(off > most for off, most in limits):
         away += f", within tolerance for less than the settling time of {config.settle_time:g} s"
     return f"The goal is {late}: {away}."
+
+
+# -- planned references ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PlannedGoals:
+    """Pending goals, their poses and joints, the requested parts of the base pose, and the job that
+    plans their reference.
+    """
+
+    pending: Mapping[str, IdentifiedGoal]
+    aims: Aims
+    asked: frozenset[Controlled]
+    job: PlanningJob[PlannedReference]
+
+
+class GoalPlanning:
+    """Plans references for pending goals, one at a time.
+
+    Parameters
+    ----------
+    in_background
+        Whether to plan in a thread while states are handled.
+    """
+
+    def __init__(self, *, in_background: bool) -> None:
+        self.in_background = in_background
+        self.time = 0.0
+        """Total wall time spent planning references, s."""
+        self._plan: PlannedGoals | None = None
+        self._job: PlanningJob[PlannedReference] | None = None
+        """The last job, which may still be running although cancelled."""
+        self._lead = PLANNING_TIME
+
+    @property
+    def active(self) -> bool:
+        """Whether a reference is being planned."""
+        return self._plan is not None
+
+    def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
+        """Whether a reference for these goals is being planned."""
+        if self._plan is None or self._plan.pending.keys() != pending.keys():
+            return False
+        return all(goal is pending[part] for part, goal in self._plan.pending.items())
+
+    def planned(
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        pending: Mapping[str, IdentifiedGoal],
+        aims: Callable[[], tuple[Aims, frozenset[Controlled]]],
+    ) -> PlannedGoals | None:
+        """Return pending goals with their planned reference; None while it is being planned, and
+        before it begins.
+
+        ``aims`` returns the goal poses and joints, and the requested components.
+
+        Raises
+        ------
+        PlanningError
+            No motion is found.
+        """
+        if not self.is_for(pending):
+            self.cancel()
+            if self._plan is None:
+                self._lead = PLANNING_TIME
+            self._begin(time, state, controller, pending, *aims())
+        plan = self._plan
+        assert plan is not None
+        job, waits = plan.job, self.in_background and plan.job.begins > time
+        if not job.done:
+            return None
+        try:
+            job.result()
+        except PlanningError:
+            waits = False
+            raise
+        finally:
+            if not waits:
+                self.time += job.wall_time
+                self._plan = None
+        if waits:
+            return None
+        if self.in_background and -math.inf < job.begins < time:
+            # The reference has gone on: a plan from where it will be in twice the time.
+            self._lead *= 2
+            self._begin(time, state, controller, pending, plan.aims, plan.asked)
+            return None
+        return plan
+
+    def _begin(
+        self,
+        time: float,
+        state: ControlState,
+        controller: CoordinatedController,
+        pending: Mapping[str, IdentifiedGoal],
+        aims: Aims,
+        asked: frozenset[Controlled],
+    ) -> None:
+        planner = controller.planner
+        assert planner is not None
+        seen, begins = state.copied(), -math.inf
+        if controller.reference_moves(time):
+            begins = time + (self._lead if self.in_background else 0.0)
+        motion = controller.motion_to(max(begins, time), seen, **aims)
+
+        def work(cancellation: Cancellation) -> PlannedReference:
+            return planner.plan(motion, seen, cancellation)
+
+        last, self._job = self._job, PlanningJob(work, begins)
+        # Known before the work begins, so that it can be cancelled.
+        self._plan = PlannedGoals(dict(pending), aims, asked, self._job)
+        self._job.start(in_background=self.in_background, after=last)
+
+    def cancel(self) -> None:
+        """Cancel the job; any thread may call this."""
+        plan = self._plan
+        if plan is not None:
+            plan.job.cancel()
+
+    def drop(self) -> None:
+        """Cancel the job and drop its result."""
+        self.cancel()
+        self._plan = None
+
+    def close(self) -> None:
+        """Cancel the job and wait for its thread to end."""
+        self._plan = None
+        if self._job is not None:
+            self._job.close()

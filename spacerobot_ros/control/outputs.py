@@ -38,6 +38,7 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_multiply,
     rotation_error,
 )
+from spacerobot_ros.planning.core.goal import Controlled
 
 _PARALLEL_TOLERANCE = 1e-6
 """Sine of the largest angle between axes that are considered parallel."""
@@ -55,13 +56,6 @@ class OutputSelection:
     end_effector: tuple[str, ...] = ()
     joints: tuple[str, ...] = ()
     end_effector_link: str = ""
-
-    @property
-    def error_kinds(self) -> tuple[str, ...]:
-        """The kind of each output's error: ``position``, ``attitude`` or ``joints``."""
-        axes = (*self.base, *self.end_effector)
-        poses = ("attitude" if axis.startswith("r") else "position" for axis in axes)
-        return (*poses, *("joints" for _ in self.joints))
 
     @property
     def distances(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
@@ -168,6 +162,12 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
     selection = OutputSelection(base, point, (), end_effector_link)
     selection.require_valid(description)
     return selection
+
+
+def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:
+    """Return the goal components controlled by outputs: pose axes and joints."""
+    parts: set[Controlled] = {"attitude" if axis.startswith("r") else "position" for axis in axes}
+    return frozenset(parts | {"shape"} if joints else parts)
 
 
 _POSE_REFERENCE_SIZE = 19

@@ -102,11 +102,11 @@ class PoseReference:
         return cls(position, quaternion_WB, R_WB @ v_B, R_WB @ omega_B)
 
     @classmethod
-    def of_motion(cls, motion: FrameMotion, k: int = 0) -> PoseReference:
-        """Return a frame's motion at the k-th time as a reference."""
+    def of_motion(cls, motion: FrameMotion) -> PoseReference:
+        """Return a frame's motion at the first time as a reference."""
         numbers = (motion.v, motion.omega, motion.a, motion.alpha)
-        quaternion = quaternion_from_matrix(motion.R[k])
-        return cls(motion.r[k], quaternion, *(each[k] for each in numbers))
+        quaternion = quaternion_from_matrix(motion.R[0])
+        return cls(motion.r[0], quaternion, *(each[0] for each in numbers))
 
     @property
     def motion(self) -> FrameMotion:

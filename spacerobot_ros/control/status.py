@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from spacerobot_ros.control.outputs import controlled_parts
 from spacerobot_ros.events import (
     BOOLEAN,
     KeyValueField,
@@ -102,16 +103,9 @@ class CommandReport:
 
         ``part`` is ``base`` or ``end_effector``.
         """
-        kinds: dict[Controlled, tuple[str, ...]] = {
-            "position": (f"{part}.x", f"{part}.y", f"{part}.z"),
-            "attitude": (f"{part}.r",),
-            "shape": ("joint.",),
-        }
-        return frozenset(
-            part
-            for part, beginnings in kinds.items()
-            if any(label.startswith(beginnings) for label in self.errors)
-        )
+        labels = [label.split(".", 1) for label in self.errors]
+        axes = [axis for group, axis in labels if group == part]
+        return controlled_parts(axes, [name for group, name in labels if group == "joint"])
 
 
 @dataclass(frozen=True)

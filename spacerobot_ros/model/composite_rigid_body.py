@@ -189,18 +189,13 @@ class ShapeSystem:
     D: SymmetricFactor
     K: ca.SX
 
-    def base_rate(self, L_B: ca.SX, qdot: ca.SX) -> ca.SX:
-        """Return ``omega_WB_B`` (3,) for angular momentum ``L_B`` and joint rates ``qdot``."""
-        return self.D.solve(L_B) - self._reaction(qdot)
-
-    def base_acceleration(self, moment: ca.SX, qddot: ca.SX) -> ca.SX:
-        """Return the derivative (3,) of ``omega_WB_B`` for a moment (3,) and ``qddot``."""
-        return self.D.solve(moment) - self._reaction(qddot)
-
-    def _reaction(self, rates: ca.SX) -> ca.SX:
+    def base_motion(self, moment: ca.SX, rates: ca.SX) -> ca.SX:
+        """Return ``omega_WB_B`` (3,) for an angular momentum (3,) and joint rates (n,), or its
+        derivative for a moment and joint accelerations.
+        """
         rates = self.parts.kin.spread(rates)
-        terms = (B[:3] * rates[j] for j, B in enumerate(self.B[1:]))
-        return sum(terms, ca.SX(3, 1))
+        reaction = (B[:3] * rates[j] for j, B in enumerate(self.B[1:]))
+        return self.D.solve(moment) - sum(reaction, ca.SX(3, 1))
 
 
 def shape_system(kin: TreeKinematics) -> ShapeSystem:
@@ -353,7 +348,7 @@ def composite_dynamics(
     qddot = SymmetricFactor(system.K).solve(Q)
     return ca.vertcat(
         external[3:] / kin.total_mass - ca.cross(omega, v_cm),
-        system.base_acceleration(moment, qddot),
+        system.base_motion(moment, qddot),
         qddot,
     )
 
@@ -473,7 +468,7 @@ def _equations(kin: TreeKinematics, x: ca.SX, command: ca.SX, *, loaded: bool) -
         vector, time = command[kin.n + 6 :], x[-1]
         loads = external_loads(kin, system.parts.J, quaternion, r_WC_W, vector, time)
     external = external_force(kin, wrench_B)
-    omega = system.base_rate(matrix_from_quaternion(quaternion).T @ L_W, qdot)
+    omega = system.base_motion(matrix_from_quaternion(quaternion).T @ L_W, qdot)
     Q, _ = shape_forces(system, omega, qdot, external, tau, loads)
     return _Equations(system, omega, external, Q, loads)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from support.oracles import (
     Array,
     MujocoOracle,
@@ -15,13 +14,10 @@ from support.oracles import (
     assert_agrees,
     random_motion,
 )
-from support.oracles.orbit import relative_motion
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import RobotDescription, SpaceRobot, parse_robot
 from spacerobot_ros.model.external_loads import (
-    EARTH_GRAVITATION,
-    EARTH_RADIUS,
     mean_motion_at,
 )
 
@@ -199,50 +195,6 @@ def test_table_of_the_planar_manipulator() -> None:
         assert body.inertia.com.tolist() == [0.5, 0.0, 0.0]
 
 
-# -- relative motion on a circular orbit, against integrations of two bodies ---------------------
-
-
-R0, V0 = np.array([3.0, -7.0, 2.0]), np.array([0.02, -0.01, 0.015])
-
-
 def test_the_period_of_low_and_geosynchronous_orbits() -> None:
     assert 2 * np.pi / mean_motion_at(400e3) == pytest.approx(5553.6, abs=0.1)
     assert 2 * np.pi / mean_motion_at(35786e3) == pytest.approx(86164.0, abs=1.0)
-
-
-@pytest.mark.parametrize("n", [0.0011, 0.7])
-def test_the_solution_solves_the_equations(n: float) -> None:
-    def rate(_: float, x: Array) -> Array:
-        (r_x, _, r_z), (v_x, v_y, _) = x[:3], x[3:]
-        return np.array(
-            [*x[3:], 3 * n**2 * r_x + 2 * n * v_y, -2 * n * v_x, -(n**2) * r_z],
-        )
-
-    times = np.array([0.3, 1.1, 5.0]) / n
-    flown = solve_ivp(rate, (0.0, times[-1]), [*R0, *V0], t_eval=times, rtol=1e-12, atol=1e-12)
-    r, v = relative_motion(n, R0, V0, times)
-    np.testing.assert_allclose(r, flown.y[:3].T, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(v, flown.y[3:].T, rtol=1e-8, atol=1e-8)
-
-
-def test_two_bodies_in_an_inverse_square_field_part_like_this() -> None:
-    """To first order in the distance over the radius of the orbit: 6800 km against 10 m."""
-    radius = EARTH_RADIUS + 400e3
-    n = mean_motion_at(400e3)
-    circle = np.array([radius, 0.0, 0.0]), np.array([0.0, radius * n, 0.0])
-    spin = np.array([0.0, 0.0, n])
-
-    def rate(_: float, x: Array) -> Array:
-        return np.concatenate([x[3:], -EARTH_GRAVITATION * x[:3] / np.linalg.norm(x[:3]) ** 3])
-
-    def flown(r: Array, v: Array, t: float) -> Array:
-        return np.asarray(solve_ivp(rate, (0.0, t), [*r, *v], rtol=1e-13, atol=1e-9).y[:, -1])
-
-    t = 900.0
-    other = flown(circle[0] + R0, circle[1] + V0 + np.cross(spin, R0), t)
-    c, s = np.cos(n * t), np.sin(n * t)
-    R_IO = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    apart = (other - flown(*circle, t)).reshape(2, 3) @ R_IO
-    r, v = relative_motion(n, R0, V0, t)
-    np.testing.assert_allclose(r, apart[0], atol=1e-4)
-    np.testing.assert_allclose(v, apart[1] - np.cross(spin, apart[0]), atol=1e-6)
