@@ -3,9 +3,9 @@
 //
 // native.py generates the declarations before this file: the first row of each name (namespace row),
 // sizes, enumerations, struct Job, and the rows of the arguments and results of CasADi's functions.
-// FLIGHT and REPORT step a tick; REPORT also gives the results of reports. MOMENTUMLESS is FLIGHT for
-// flights without angular momentum. CONTROL gives a controller's command and decision for a state.
-// HOLDING_STEP and SHAPE_EQUATIONS are those of robots whose joints have stops.
+// FLIGHT and REPORT step a tick; REPORT also gives the results of reports. CONTROL gives a
+// controller's command and decision for a state. HOLDING_STEP and SHAPE_EQUATIONS are those of robots
+// whose joints have stops.
 
 static bool any(V flags) {
   for (int lane = 0; lane < LANES; ++lane)
@@ -41,21 +41,9 @@ static void call(V *group, const long long (&arguments)[ARGUMENTS],
   run<function>(in, out);
 }
 
-#ifdef MOMENTUMLESS
-// Return whether no flight of a group has angular momentum.
-static bool is_momentumless(const V *group) {
-  const V *L_W = group + row::momenta + 3;
-  return !any(L_W[0] != V(0.0) || L_W[1] != V(0.0) || L_W[2] != V(0.0));
-}
-#endif
-
 static void evaluate(V *group, bool report) {
   if (report)
     call<REPORT>(group, REPORT_ARGUMENTS, REPORT_RESULTS);
-#ifdef MOMENTUMLESS
-  else if (is_momentumless(group))
-    call<MOMENTUMLESS>(group, MOMENTUMLESS_ARGUMENTS, MOMENTUMLESS_RESULTS);
-#endif
   else
     call<FLIGHT>(group, FLIGHT_ARGUMENTS, FLIGHT_RESULTS);
 }

@@ -8,7 +8,7 @@ as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -156,20 +156,16 @@ class CompiledTick:
     ) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
         names, n = _TICK_VARIABLES[flights.actuation], robot.n
-        make: Callable[..., ca.Function] = velocity_plant.tick_function
+        make = effort_plant.tick_function if effort else velocity_plant.tick_function
         # Reports need all results except the poses of links.
         reported = [name for name in names.outputs if not name.startswith("link")]
-        ticks: dict[str, tuple[Sequence[str], dict[str, bool]]] = {
-            "FLIGHT": (names.results_of_every_tick, {}),
-            "REPORT": (reported + ["place"] * bool(link), {}),
+        ticks: dict[str, Sequence[str]] = {
+            "FLIGHT": names.results_of_every_tick,
+            "REPORT": reported + ["place"] * bool(link),
         }
-        if effort:
-            make = effort_plant.tick_function
-        else:
-            ticks["MOMENTUMLESS"] = names.results_of_every_tick, {"momentumless": True}
         functions: dict[str, ca.Function] = {}
-        for kind, (results, options) in ticks.items():
-            tick = make(robot, Composition(model, ca.MX), flights.substeps, **options)
+        for kind, results in ticks.items():
+            tick = make(robot, Composition(model, ca.MX), flights.substeps)
             inputs = tick.mx_in()
             outputs = dict(zip(names.outputs, tick.call(inputs, True, False), strict=True))
             if link:

@@ -101,8 +101,7 @@ class Target:
         Parameters
         ----------
         functions CasADi functions by driver name: ``FLIGHT`` and ``REPORT``, the tick without and
-            with report results; ``MOMENTUMLESS``, ``FLIGHT`` for robots without angular
-            momentum; ``CONTROL``, the command for a state; ``HOLDING_STEP`` and
+            with report results; ``CONTROL``, the command for a state; ``HOLDING_STEP`` and
             ``SHAPE_EQUATIONS``, for joints on their stops.
         declarations
             Declarations from :mod:`.native`.

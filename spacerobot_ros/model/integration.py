@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from functools import partial
 
 import casadi as ca
 
@@ -88,72 +88,21 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     # Two of the four stages are evaluated at the middle of the step.
     shapes = [locked_inertia(q + fraction * h * qdot, *p) for fraction in (0.0, 0.5, 1.0)]
 
-    def body_rate(stage: int, at: ca.SX) -> ca.SX:
+    def rate(stage: int, at: ca.SX) -> ca.SX:
         D, D_q = shapes[stage]
-        L_B = matrix_from_quaternion(at).T @ L_W
-        return _solution(D, L_B - D_q @ qdot, p)
+        L_B = matrix_from_quaternion(at).T @ L_W - D_q @ qdot
+        # The factor needs no roots and a quarter of the divisions, which take most of the time in
+        # vector registers. Recorded flights used Cholesky's, which is equal up to rounding.
+        solve = SymmetricFactor(D).solve if p else partial(solve_positive_definite, D)
+        return quaternion_rate(at, solve(L_B))
 
-    turned = _turned_quaternion(quaternion, h, body_rate)
-    x_next = ca.vertcat(q + h * qdot, turned)
-    return ca.Function("attitude_step", [x, qdot, L_W, h, *p], [ca.cse(x_next)])
-
-
-def attitude_steps_without_momentum(locked_inertia: ca.Function, count: int) -> ca.Function:
-    """Return ``count`` steps of :func:`attitude_step` at zero momentum, ``(x, qdot, h, p) -> x``.
-
-    Together they span the time ``h``; ``locked_inertia`` takes the argument ``p``.
-
-    The body rate is then ``-D^-1 D_q qdot``, independent of the attitude: it is computed once for
-    the end of one step and the start of the next. This saves half of the operations; the results
-    equal those of :func:`attitude_step`.
-    """
-    p = ca.SX.sym("p", locked_inertia.size1_in(1))
-    n = locked_inertia.size1_in(0)
-    x, qdot, h = ca.SX.sym("x", n + 4), ca.SX.sym("qdot", n), ca.SX.sym("h")
-    beginning = ca.SX.sym("omega", 3)
-
-    def body_rate(q: ca.SX) -> ca.SX:
-        D, D_q = locked_inertia(q, p)
-        return _solution(D, -(D_q @ qdot), [p])
-
-    q, quaternion = x[:n], x[n:]
-    rates = [beginning, body_rate(q + 0.5 * h * qdot), body_rate(q + h * qdot)]
-    turned = _turned_quaternion(quaternion, h, lambda stage, at: rates[stage])
-    results = ca.cse([ca.vertcat(q + h * qdot, turned, rates[-1])])
-    # The state of the steps ends with the body rate of its shape.
-    step = ca.Function("momentumless_step", [ca.vertcat(x, beginning), qdot, h, p], results)
-    first = ca.Function("body_rate", [q, qdot, p], [ca.cse(body_rate(q))])
-    held = [ca.MX.sym(name, size) for name, size in (("qdot", n), ("h", 1), ("p", p.numel()))]
-    start = ca.MX.sym("x", n + 4)
-    rate = first(start[:n], held[0], held[2])
-    end = repeat_step(step, count)(ca.vertcat(start, rate), held[0], held[1] / count, held[2])
-    return ca.Function(f"momentumless_steps_{count}", [start, *held], [end[: n + 4]])
-
-
-def _solution(matrix: ca.SX, right: ca.SX, p: Sequence[ca.SX]) -> ca.SX:
-    """Return x of ``matrix x = right``; ``p`` are symbols of mass properties, if there are any."""
-    # The factor needs no roots and a quarter of the divisions, which take most of the time in
-    # vector registers. Recorded flights used Cholesky's, which is equal up to rounding.
-    return SymmetricFactor(matrix).solve(right) if p else solve_positive_definite(matrix, right)
-
-
-def _turned_quaternion(
-    quaternion: ca.SX, h: ca.SX, body_rate: Callable[[int, ca.SX], ca.SX]
-) -> ca.SX:
-    """Return the quaternion (4,) after a step of Runge-Kutta 4.
-
-    ``body_rate`` gives the rate (3,) at the beginning (0), middle (1) or end (2) of the step, and
-    at a quaternion.
-    """
-    k1 = quaternion_rate(quaternion, body_rate(0, quaternion))
-    at = quaternion + h / 2 * k1
-    k2 = quaternion_rate(at, body_rate(1, at))
-    at = quaternion + h / 2 * k2
-    k3 = quaternion_rate(at, body_rate(1, at))
-    at = quaternion + h * k3
-    k4 = quaternion_rate(at, body_rate(2, at))
+    k1 = rate(0, quaternion)
+    k2 = rate(1, quaternion + h / 2 * k1)
+    k3 = rate(1, quaternion + h / 2 * k2)
+    k4 = rate(2, quaternion + h * k3)
     turned = quaternion + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return turned / ca.norm_2(turned)
+    x_next = ca.vertcat(q + h * qdot, turned / ca.norm_2(turned))
+    return ca.Function("attitude_step", [x, qdot, L_W, h, *p], [ca.cse(x_next)])
 
 
 def _symbols_for_inputs(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:

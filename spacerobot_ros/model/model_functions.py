@@ -47,7 +47,6 @@ from spacerobot_ros.model.inertial_parameters import (
 )
 from spacerobot_ros.model.integration import (
     attitude_step,
-    attitude_steps_without_momentum,
     repeat_step,
     runge_kutta_step,
 )
@@ -166,7 +165,6 @@ class ModelFunctions:
             "base_twist": self._base_twist,
             "rotate": self._rotate,
             "velocity_step": self._velocity_step,
-            "momentumless_velocity_step": self._momentumless_velocity_step,
             "loaded_velocity_step": self._loaded_velocity_step,
             "total_mass": self._total_mass,
         }
@@ -303,9 +301,6 @@ class ModelFunctions:
         p = [ca.MX.sym(name, each.numel()) for name, each in self.mass_inputs.items()]
         x_next = repeat_step(step, count)(x, qdot, L_W, h / count, *p)
         return ca.Function(f"velocity_step_{count}", [x, qdot, L_W, h, *p], [x_next])
-
-    def _momentumless_velocity_step(self, substeps: str) -> ca.Function:
-        return attitude_steps_without_momentum(self._locked_inertia(), int(substeps))
 
     def _loaded_velocity_step(self, substeps: str) -> ca.Function:
         """Return ``(x, qdot, loads, h) -> x`` of :func:`.servo_rate` in some Runge-Kutta steps."""

@@ -146,14 +146,11 @@ def tick_function(
     substeps: int,
     *,
     loaded: bool = False,
-    momentumless: bool = False,
 ) -> ca.Function:
     """Compose the tick from model functions; see :class:`VelocityPlant` for its results.
 
     With ``loaded``, the external load vector is the last input, and the momenta after the tick
-    are the last output. ``momentumless`` ticks have fewer operations and the same results if the
-    angular momentum is zero; they ignore the argument for it. The model has a parameter argument
-    ``p``.
+    are the last output. The model has a parameter argument ``p``.
     """
     n = robot.n
     state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
@@ -183,12 +180,8 @@ def tick_function(
         next_state, r_cm_next = x_next[: n + 4], x_next[n + 10 : n + 13]
         p_W, L_W = x_next[n + 4 : n + 7], x_next[n + 7 : n + 10]
     else:
-        if momentumless:
-            effort = model("joint_efforts", q, (before + qdot) / 2, (qdot - before) / duration)
-            next_state = model(f"momentumless_velocity_step:{substeps}", state, qdot, h)
-        else:
-            effort = model("servo_efforts", state[n:], q, before, qdot, L_W, duration)
-            next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
+        effort = model("servo_efforts", state[n:], q, before, qdot, L_W, duration)
+        next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
         r_cm_next = r_cm + p_W * (h / model.total_mass)
     q_next, quaternion = next_state[:n], next_state[n:]
     v, omega = model("base_twist", quaternion, q_next, qdot, p_W, L_W)

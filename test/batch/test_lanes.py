@@ -154,32 +154,6 @@ def test_velocity_flights_in_lanes_are_those_of_the_plant(
     assert not here.fallback_ticks.any()
 
 
-@needs_compiler
-def test_flights_without_momentum_are_those_of_the_plant_and_of_neighbours_of_moving_ones(
-    robots: dict[str, SpaceRobot],
-) -> None:
-    flights = velocity_flights(robots["sliding_masses"], 19, each=True, deadband=0.0)
-    momenta = flights.initial_states.momenta.copy()
-    momenta[:, 3:] = 0.0
-    without = dataclasses.replace(
-        flights, initial_states=dataclasses.replace(flights.initial_states, momenta=momenta)
-    )
-    here = fly_lanes(without)
-    assert "lanes" in here.engine
-    assert_equal_flights(here, fly_one_by_one(without))
-    # One flight of every group turns: all flights of the group have the tick of such flights.
-    turning = momenta.copy()
-    turning[::2, 3:] = 0.1
-    mixed = fly_lanes(
-        dataclasses.replace(
-            flights, initial_states=dataclasses.replace(flights.initial_states, momenta=turning)
-        )
-    )
-    for name in NUMBERS:
-        np.testing.assert_array_equal(getattr(mixed, name)[1::2], getattr(here, name)[1::2])
-    assert (mixed.pose[::2, -1] != here.pose[::2, -1]).any(axis=1).all()
-
-
 @on_targets()
 def test_effort_flights_in_lanes_are_those_of_the_plant(
     robots: dict[str, SpaceRobot], target_name: str
