@@ -52,24 +52,11 @@ class InertialParameters:
         (..., B, 3) centres of mass in the body frames (those of their first links), m.
     inertias
         (..., B, 3, 3) about the centres of mass, along the axes of the body frames, kg m^2.
-
-    Raises
-    ------
-    ValueError
-        The shapes of the three arrays do not match.
     """
 
     masses: Array
     centers: Array
     inertias: Array
-
-    def __post_init__(self) -> None:
-        shape = self.masses.shape
-        if self.centers.shape != (*shape, 3) or self.inertias.shape != (*shape, 3, 3):
-            raise ValueError(
-                f"masses {shape}, centers {self.centers.shape} and inertias "
-                f"{self.inertias.shape} do not match"
-            )
 
     @classmethod
     def of(cls, robot: RobotDescription) -> InertialParameters:
