@@ -11,7 +11,6 @@ import copy
 from collections.abc import Callable, Hashable
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
 
 import casadi as ca
 import numpy as np
@@ -24,8 +23,6 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions, SymbolicModels
 from spacerobot_ros.model.rotations import hat
 from spacerobot_ros.model.urdf import load_robot, parse_robot
-
-_Made = TypeVar("_Made")
 
 _MIN_RELATIVE_INERTIA = 1e-6
 """Largest joint component that counts as zero in a motion without inertia."""
@@ -342,23 +339,21 @@ class SpaceRobot:
         :meth:`view`."""
         return Composition(self._model, ca.SX)
 
-    def view(self, function: ca.Function, key: Hashable) -> BufferedFunction:
-        """Compile a function of :meth:`expressions`, and return it with its own buffers.
+    def view(
+        self, key: Hashable, make: Callable[[], ca.Function]
+    ) -> tuple[ca.Function, BufferedFunction]:
+        """Return a function made from :meth:`expressions`, and the same compiled with its own
+        buffers, whose argument ``p``, if any, is set to this robot's mass properties.
 
-        The argument ``p``, if any, is set to this robot's mass properties. Functions with
-        equal ``key`` are the same function, compiled once (:meth:`cached_object`).
-        """
-        return BufferedFunction(self._model.composed(key, lambda: function), self._p)
-
-    def cached_object(self, key: Hashable, make: Callable[[], _Made]) -> _Made:
-        """Return an object built from :meth:`expressions`, once per key for all robots that share
-        them: robots with equal mass properties, or with mass properties as an argument.
+        It is made and compiled once per key for all robots that share the expressions: robots with
+        equal mass properties, or with mass properties as an argument.
         """
         derived = self._model.derived
         if key not in derived:
             derived[key] = make()
-        made: _Made = derived[key]
-        return made
+        function: ca.Function = derived[key]
+        compiled = self._model.composed(("view", key), lambda: function)
+        return function, BufferedFunction(compiled, self._p)
 
     @property
     def mass_arguments(self) -> dict[str, Array]:

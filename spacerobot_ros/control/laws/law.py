@@ -286,10 +286,12 @@ class ControlLaw(ABC):
         )
         if weighs:
             key += (self._damping_rate,)
-        self.function, self._has_integral = robot.cached_object(
-            key, lambda: self._make_function(inputs)
+        self.function, self._function = robot.view(key, lambda: self._make_function(inputs))
+        command, integral = (
+            self.function.index_out("actuation"),
+            self.function.index_in("integral"),
         )
-        self._function = robot.view(self.function, ("compiled", *key))
+        self._has_integral = self.function.jac_sparsity(command, integral).nnz() > 0
         names = self.function.name_in()[: self.function.n_in() - len(robot.mass_arguments)]
         self._in = dict(zip(names, self._function.inputs, strict=True))
         self._out = dict(zip(self.function.name_out(), self._function.outputs, strict=True))
@@ -301,10 +303,8 @@ class ControlLaw(ABC):
         force = self.gain_units != ACCELERATION_GAINS
         return force and not all(each.all() for each in gains.diagonals(self.outputs.selection))
 
-    def _make_function(self, inputs: Mapping[str, Array]) -> tuple[ca.Function, bool]:
-        """Return the law as expressions of state, reference, kp, kd, integral and its own inputs,
-        and whether it depends on the integral.
-        """
+    def _make_function(self, inputs: Mapping[str, Array]) -> ca.Function:
+        """Return the law as expressions of state, reference, kp, kd, integral and its inputs."""
         symbols = {
             "state": self.outputs.state,
             "reference": self.outputs.reference,
@@ -327,9 +327,7 @@ class ControlLaw(ABC):
                     f"The law '{self.name}' has no automatic gains: set kp and kd for all its "
                     f"output groups ({', '.join(self.outputs.labels)})."
                 )
-        function = dense_function(f"law_{self.name}", symbols | weights, results)
-        has_integral = bool(ca.depends_on(results["actuation"], symbols["integral"]))
-        return function, has_integral
+        return dense_function(f"law_{self.name}", symbols | weights, results)
 
     @property
     def follows_accelerations(self) -> bool:
