@@ -259,15 +259,9 @@ def plan_approach(
                 outward = PathInWorld(relative, target, start, at_rest, standoff)
             plan = ApproachPlan(start, outward, closing, options.standoff_time)
             last = first + math.ceil((plan.contact - start) / _SAMPLE_PERIOD) + 1
-            # Few samples refuse most of the paths.
-            for every in (_COARSE_STRIDE, 1):
-                times = _SAMPLE_PERIOD * np.arange(first, last, every)
-                motion = grapple.rows(slice(first, last, every)).with_relative_motion(
-                    plan.relative(times)
-                )
-                share = _largest_limit_share(motion, limits, axes)
-                if share[0] > 1.0:
-                    break
+            times, rows = _SAMPLE_PERIOD * np.arange(first, last), slice(first, last)
+            motion = grapple.rows(rows).with_relative_motion(plan.relative(times))
+            share = _largest_limit_share(motion, limits, axes)
             if share[0] > 1.0:
                 sentence = (
                     "The target moves too fast to be reached: the end-effector's reference would "
@@ -287,6 +281,7 @@ def plan_approach(
                     continue
                 break  # A longer path meets the target later, which other start times do, too.
             near: NearestLinks | None = None
+            # Few samples refuse most of the paths beside the target.
             for every in (_COARSE_STRIDE, 1):
                 shapes, why = reach.shapes_along(
                     motion.rows(slice(None, None, every)), every * _SAMPLE_PERIOD
