@@ -209,7 +209,6 @@ MUTABLE = {
     "spacerobot_ros.planning.execution.status.ActiveGoal",
     "spacerobot_ros.planning.execution.status.PlannerStatistics",
     "spacerobot_ros.planning.execution.teleoperation._Following",
-    "spacerobot_ros.planning.methods.optimal.search._SearchState",
     "spacerobot_ros.flight.verification._Resimulation",
 }
 """Dataclasses that change: records in the making. All others are values."""

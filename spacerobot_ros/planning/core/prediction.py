@@ -120,12 +120,12 @@ class BasePrediction:
     def poses(
         self, state: RobotState, positions: Array, attitudes: Array | None = None
     ) -> BasePoses:
-        """Return the base poses at every tick for the shapes (N + 1, n), at zero momentum.
+        """Return the base poses at every tick for the shapes (N + 1, n), without linear momentum.
 
         ``attitudes`` (N + 1, 4) at the ticks may be given if already known.
         """
         if attitudes is None:
-            attitudes = self.attitudes(positions, state.quaternion, np.zeros(3))
+            attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)
         R_0B = matrix_from_quaternion(state.quaternion)
         r_WC = state.position + R_0B @ self._robot.center_of_mass(state.q)
         centers = self._robot.function("center_of_mass", compile=False)(positions.T).full().T

@@ -175,6 +175,11 @@ class ManoeuvreModel:
             ticks = max(ticks + 1, math.ceil(ticks * factor - 1e-9))
         return None
 
+    def slowed(self, guess: Trajectory, boundary: BoundaryConditions) -> Trajectory:
+        """Return a trajectory, slowed until it keeps the efforts and the rate of the base."""
+        guess = self.constraints.slowed(guess)
+        return guess if self.efforts is None else self.efforts.slowed(guess, boundary)
+
     def _slowing_factor(
         self, held: HeldCommands, boundary: BoundaryConditions, before: Array | float
     ) -> float:

@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 from typing_extensions import override
 
+from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
 from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
@@ -105,56 +106,30 @@ _MAX_COASTING_ENDS = 3
 _MAX_DURATION_RATIO = 2.5
 """Longest duration of a manoeuvre that ends at a pass, as a multiple of that at zero momentum."""
 
-_STARTS_BEFORE_FASTEST = 2
+_STARTS_BEFORE_FASTEST = 8
 """Number of guesses without a manoeuvre in the requested time after which the fastest manoeuvre is
 searched for."""
-
-_MAX_FASTEST_RATIO = 1.25
-"""Largest ratio of the fastest duration found to the requested time at which the search continues:
-there may be a faster manoeuvre, but not so much faster."""
 
 _LIMIT_ROUNDING = 1e-8
 
 
 @dataclass(frozen=True)
-class _PlanResult:
-    """A manoeuvre, the shapes (N + 1, n) at ticks from the start of the plan to its end, and notes
-    on the search.
+class _GoalKind:
+    """Goals with the same parts: these parts, and the searches for their manoeuvres.
+
+    Most manoeuvres of most robots keep the limits of efforts without a search ``within_efforts``.
     """
 
-    manoeuvre: Manoeuvre
-    positions: Array
-    notes: Notes
-
-
-@dataclass(frozen=True)
-class _BaseMotion:
-    """Shapes (N + 1, n), attitudes (N + 1, 4) and positions (N + 1, 3) of the base, at ticks."""
-
-    shapes: Array
-    attitudes: Array
-    positions: Array
-
-    def state_at(self, state: RobotState, tick: int) -> RobotState:
-        """Return a state with the base pose at a tick."""
-        return replace(state, position=self.positions[tick], quaternion=self.attitudes[tick])
-
-
-@dataclass(frozen=True)
-class _GoalKind:
-    """Goals with the same parts: these parts, and the searches for their manoeuvres."""
-
     specification: GoalSpecification | EndEffectorSpecification
-    model: ManoeuvreModel
+    search: ManoeuvreSearch
+    within_efforts: ManoeuvreSearch
 
-    @cached_property
-    def without_effort_limits(self) -> ManoeuvreSearch:
-        return ManoeuvreSearch(replace(self.model, efforts=None))
-
-    @cached_property
-    def within_efforts(self) -> ManoeuvreSearch:
-        """The search with effort limits, which most manoeuvres of most robots do not need."""
-        return ManoeuvreSearch(self.model)
+    @classmethod
+    def of(
+        cls, specification: GoalSpecification | EndEffectorSpecification, model: ManoeuvreModel
+    ) -> _GoalKind:
+        free = ManoeuvreSearch(replace(model, efforts=None))
+        return cls(specification, free, ManoeuvreSearch(model))
 
 
 class OptimalGait(GaitMethod):
@@ -201,7 +176,7 @@ class OptimalGait(GaitMethod):
                 else DistanceLibrary(self.clearance, robot, self._prediction)
             ),
         )
-        self._base_goals = _GoalKind(self._specification, self._model)
+        self._base_goals = _GoalKind.of(self._specification, self._model)
         self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
@@ -214,7 +189,7 @@ class OptimalGait(GaitMethod):
         if key not in self._end_effector_goals:
             of = EndEffectorSpecification.of(self.robot, self._specification, goal)
             model = replace(self._model, axes=of.axes, end_effectors=of.rows_at_end)
-            self._end_effector_goals[key] = _GoalKind(of, model)
+            self._end_effector_goals[key] = _GoalKind.of(of, model)
         return self._end_effector_goals[key]
 
     @classmethod
@@ -426,12 +401,11 @@ class OptimalGait(GaitMethod):
             return self._build_schedule(state, goal, positions, notes, boundary.velocity, end)
         found = self._plan_from_rest(task, final_is_given=shape is not None or same_shape)
         # A result of a busy machine is not cached, as an idle machine finds a better one.
-        within = self._is_within_efforts(task, found.manoeuvre) and not found.manoeuvre.cut_short
-        if cache is not None and within:
-            cache.store(f"{key[:32]}.npz", key, _packed_plan(found.positions, found.notes))
+        if cache is not None and self._is_within_efforts(task, found) and not found.cut_short:
+            cache.store(f"{key[:32]}.npz", key, _packed_plan(found.positions, self._notes(found)))
         return self._schedule(task, found)
 
-    def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> _PlanResult:
+    def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> Manoeuvre:
         """Return a manoeuvre whose joints rest at the start; see :meth:`_require_enough_time`."""
         bound = self._require_enough_time(task, final_is_given=final_is_given)
         boundary, options = task.boundary, task.options
@@ -463,10 +437,21 @@ class OptimalGait(GaitMethod):
             angular_momentum=R_BW @ state.angular_momentum,
         )
 
-    def _schedule(self, task: SearchProblem, found: _PlanResult) -> GaitSchedule:
-        request, after = task.request, task.boundary.final_velocity
+    def _notes(self, found: Manoeuvre) -> Notes:
+        notes: Notes = {"starts": float(found.starts), "solution_time": found.solution.duration}
+        if len(found.coasting):
+            notes["coasting_time"] = len(found.coasting) * self.control_period
+        if found.cut_short:
+            notes["cut_short"] = (
+                f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
+                f"{found.starts} start(s); a larger budget may find a faster manoeuvre."
+            )
+        return notes
+
+    def _schedule(self, task: SearchProblem, found: Manoeuvre) -> GaitSchedule:
+        request, notes, after = task.request, self._notes(found), task.boundary.final_velocity
         return self._build_schedule(
-            request.state, request.goal, found.positions, found.notes, task.velocity, after
+            request.state, request.goal, found.positions, notes, task.velocity, after
         )
 
     @cached_property
@@ -501,7 +486,7 @@ class OptimalGait(GaitMethod):
             )
         return bound
 
-    def _begin_in_asked_time(self, task: SearchProblem) -> _PlanResult:
+    def _begin_in_asked_time(self, task: SearchProblem) -> Manoeuvre:
         """Return a manoeuvre from rest that takes no longer than the options ask for.
 
         NotFoundError if none was found; if a longer one was, the message has its duration.
@@ -519,45 +504,30 @@ class OptimalGait(GaitMethod):
             found = self._begin_now(replace(task, options=unlimited))
         except NotFoundError:
             raise none_found from None
-        fastest, refusal = found.manoeuvre.duration, ""
-        if chosen.duration == 0 and fastest <= given:
+        if chosen.duration == 0 and found.duration <= given:
             return found
-        if fastest <= _MAX_FASTEST_RATIO * given:
-            try:
-                return self._begin_now(task)
-            except NotFoundError as reason:
-                refusal = f" {reason}"
         raise NotFoundError(
             f"No manoeuvre to the goal was found within optimal.{name} = {given:g} s: the fastest "
-            f"one found takes {fastest:.6g} s. Allow more time.{refusal}"
+            f"one found takes {found.duration:.6g} s. Allow more time."
         )
 
-    def _begin_now(self, task: SearchProblem) -> _PlanResult:
+    def _begin_now(self, task: SearchProblem) -> Manoeuvre:
         """Return a manoeuvre that begins at once.
 
         Without effort limits if that keeps them, and otherwise with them. Limits that are the
         robot's own, and that no manoeuvre is found to keep, are not kept.
         """
         kind = self._kind_of(task.request.goal)
-        found = kind.without_effort_limits.search(task)
+        found = kind.search.search(task)
         if not self._is_within_efforts(task, found):
             try:
                 found = kind.within_efforts.search(task)
             except NotFoundError:
                 if self._efforts_are_strict:
                     raise
-        notes: Notes = {
-            "starts": float(found.starts),
-            "solution_time": found.solution.duration,
-        }
-        if found.cut_short:
-            notes["cut_short"] = (
-                f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
-                f"{found.starts} start(s); a larger budget may find a faster manoeuvre."
-            )
-        return _PlanResult(found, found.held.positions, notes)
+        return found
 
-    def _begin_now_or_coast(self, task: SearchProblem) -> _PlanResult:
+    def _begin_now_or_coast(self, task: SearchProblem) -> Manoeuvre:
         """Return a manoeuvre of a robot that drifts: joints may rest until the goal is in reach.
 
         The drift may lead away from the goal faster than the joints turn the base back; later, it
@@ -573,7 +543,7 @@ class OptimalGait(GaitMethod):
             return self._begin_now(replace(brief, max_failed_starts=_STARTS_BEFORE_COASTING))
         last = min(longest, _COASTING_TURNS * 2 * math.pi / rate)
         ticks = math.ceil(last / self.control_period)
-        coast = self._motion_along(state, np.tile(state.q, (ticks + 1, 1)))
+        coast = self._prediction.poses(state, np.tile(state.q, (ticks + 1, 1)))
         step = max(1, round(_COASTING_ANGLE / rate / self.control_period))
         for end in self._goal_passing_ticks(task, coast, step):
             try:
@@ -582,21 +552,17 @@ class OptimalGait(GaitMethod):
                 task.cancellation.raise_if_requested()
         return self._begin_now(task.within_time(last))
 
-    def _motion_along(self, state: RobotState, shapes: Array) -> _BaseMotion:
-        attitudes = self._prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
-        times = self.control_period * np.arange(len(shapes), dtype=np.float64)
-        positions = self._prediction.positions(state, times, shapes, attitudes)
-        return _BaseMotion(shapes, attitudes, positions)
-
-    def _later(self, task: SearchProblem, coast: _BaseMotion, ticks: int) -> SearchProblem:
+    def _later(self, task: SearchProblem, coast: BasePoses, ticks: int) -> SearchProblem:
         """Return the task of a manoeuvre that begins after some ticks of coasting."""
-        later = replace(task.request, state=coast.state_at(task.request.state, ticks))
+        r_WB, attitude = coast.position[ticks], coast.quaternion[ticks]
+        state = replace(task.request.state, position=r_WB, quaternion=attitude)
+        later = replace(task.request, state=state)
         aimed = self._boundary(later, self.goal_shape(later.goal))
         return replace(task, request=later, boundary=aimed)
 
-    def _goal_passing_ticks(self, task: SearchProblem, coast: _BaseMotion, step: int) -> list[int]:
+    def _goal_passing_ticks(self, task: SearchProblem, coast: BasePoses, step: int) -> list[int]:
         """Return the ticks at which the coasting base passes the goal, the closest pass first."""
-        grid = np.arange(0, len(coast.shapes), step)
+        grid = np.arange(0, len(coast.position), step)
         turns = np.array([self._later(task, coast, int(k)).boundary.goal_rotation for k in grid])
         # The cosine of half the angle that is left.
         near = np.abs(turns[:, 3])
@@ -604,9 +570,7 @@ class OptimalGait(GaitMethod):
         closest = passes[np.argsort(-near[passes], kind="stable")]
         return [int(tick) for tick in grid[closest][:_MAX_COASTING_ENDS]]
 
-    def _plan_for_coasting_time(
-        self, task: SearchProblem, coast: _BaseMotion, end: int
-    ) -> _PlanResult:
+    def _plan_for_coasting_time(self, task: SearchProblem, coast: BasePoses, end: int) -> Manoeuvre:
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
         ``end``.
 
@@ -619,19 +583,13 @@ class OptimalGait(GaitMethod):
         at_rest = replace(there.boundary, angular_momentum=np.zeros(3))
         few = replace(task.options, starts=min(task.options.starts, _STARTS_BEFORE_COASTING))
         free = self._begin_now(replace(there, boundary=at_rest, options=few))
-        takes = len(free.positions) - 1
+        takes = len(free.held.positions) - 1
         begin = max(0, end - takes)
         later = self._later(task, coast, begin).within_time(_MAX_DURATION_RATIO * takes * h)
-        few_failed = replace(
-            later, guess=free.manoeuvre.solution, max_failed_starts=_STARTS_AFTER_COASTING
-        )
-        found = self._begin_now(few_failed)
-        self._constraints.check(coast.shapes[:begin], coast.attitudes[:begin], h)
-        return replace(
-            found,
-            positions=np.vstack([coast.shapes[:begin], found.positions]),
-            notes={**found.notes, "coasting_time": begin * h},
-        )
+        few_failed = replace(later, guess=free.solution, max_failed_starts=_STARTS_AFTER_COASTING)
+        coasting = np.tile(task.request.state.q, (begin, 1))
+        self._constraints.check(coasting, coast.quaternion[:begin], h)
+        return replace(self._begin_now(few_failed), coasting=coasting)
 
     def _plan_in_motion(self, task: SearchProblem, motion: InitialMotion) -> GaitSchedule:
         """Plan from moving joints; the remaining previous motion is the first guess."""
@@ -669,17 +627,18 @@ class OptimalGait(GaitMethod):
         shares = 1 - np.arange(1, ticks + 1) / ticks
         travel = np.append(0.0, period * np.cumsum(shares))
         braking = state.q + travel[:, np.newaxis] * motion.velocity
-        along = self._motion_along(state, braking)
+        base = self._prediction.poses(state, braking)
         beyond = np.any(braking < limits.lower) or np.any(braking > limits.upper)
         if self._efforts is not None and self._efforts_are_strict:
             beyond |= self._efforts.excess(braking, motion.velocity) > 1 + _LIMIT_ROUNDING
-        if beyond or self._too_near(braking, self._base_poses(state, braking)):
+        if beyond or self._too_near(braking, base if self._has_obstacles else None):
             raise refusal
         try:
-            self._constraints.check(braking, along.attitudes, period)
+            self._constraints.check(braking, base.quaternion, period)
         except UnusableCandidateError:
             raise refusal from None
-        at_rest = replace(along.state_at(state, -1), q=braking[-1])
+        r_WB, attitude = base.position[-1], base.quaternion[-1]
+        at_rest = replace(state, position=r_WB, quaternion=attitude, q=braking[-1])
         request = replace(task.request, state=at_rest, motion=None)
         gait = self._plan_about_center(request, task.cancellation, task.clock)
         notes: Notes = {**gait.notes, "braking_time": ticks * period}

@@ -27,7 +27,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -182,6 +181,8 @@ class Manoeuvre:
         Guesses that were tried.
     cut_short
         Whether the wall time was used up before the search was complete.
+    coasting
+        (k, n) shapes at the ticks before, while the robot coasts with its joints at rest.
     """
 
     held: HeldCommands
@@ -189,6 +190,16 @@ class Manoeuvre:
     solution: Trajectory
     starts: int = 1
     cut_short: bool = False
+    coasting: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def positions(self) -> Array:
+        """Shapes (N + 1, n) at all ticks."""
+        return (
+            np.vstack([self.coasting, self.held.positions])
+            if len(self.coasting)
+            else self.held.positions
+        )
 
 
 @dataclass(frozen=True)
@@ -308,96 +319,8 @@ class _Grid(NamedTuple):
     tolerance: float = TOLERANCE
 
 
-@dataclass
-class _SearchState:
-    """The progress of one search.
-
-    ``starts`` guesses were tried, ``rejection`` is the reason against the last candidate, ``best``
-    the duration of the fastest path so far, s: of the clear ones if it ``is_clearing``. ``solved``
-    are solutions on the coarse grid, a guess each, ``work`` is that on clear paths.
-    """
-
-    problem: SearchProblem
-    coarse: _Grid
-    full: _Grid
-    phase: SearchPhase | None = None
-    starts: int = 0
-    rejection: str = ""
-    best: float = math.inf
-    is_clearing: bool = False
-    work: float = 0.0
-    solved: list[Trajectory | None] = field(default_factory=list)
-    _reported: float = 0.0
-
-    def is_over(self, *, found: bool) -> bool:
-        """Whether the wall time or the work on clear paths is used up; ``found``: whether there is
-        such a path."""
-        most = _MAX_WORK_PER_ITERATION * self.problem.options.iterations
-        if not found:
-            most *= _WORK_FACTOR_WITHOUT_PATH
-        return self.work > most or self.problem.clock.is_over(found=found)
-
-    def stop_rule(self, *, found: bool = False, work: float = 0.0) -> StopRule:
-        """Return the solver's stop conditions in the current phase; ``work`` is the work per
-        step."""
-        problem, iterations = self.problem, self.problem.options.iterations
-        if self.phase in (SearchPhase.CLEARING, SearchPhase.SHORTENING):
-            iterations = min(iterations, _MAX_CLEARING_ITERATIONS)
-
-        def is_over(feasible: bool) -> bool:
-            # A path on the way to a clear one is no manoeuvre.
-            is_manoeuvre = self.phase is not SearchPhase.CLEARING and (found or feasible)
-            return problem.clock.is_over(found=is_manoeuvre)
-
-        def watch() -> None:
-            self.work += work
-            if problem.clock.elapsed >= self._reported + _REPORT_PERIOD:
-                self.report("going on")
-
-        return StopRule(iterations, problem.cancellation, is_over, watch)
-
-    def begin(self, phase: SearchPhase) -> None:
-        """Begin a phase and report it."""
-        if phase is not self.phase:
-            self.phase = phase
-            self.report("begun")
-
-    def report(self, result: str, duration: float = math.inf) -> None:
-        """Report a result; ``duration``, s, is that of a path that may be the best."""
-        self.best = min(self.best, duration)
-        self._reported = elapsed = self.problem.clock.elapsed
-        phase, most = self.phase or SearchPhase.SEARCHING, self.problem.options.starts
-        progress = SearchProgress(self.starts, most, self.best, phase, elapsed)
-        log_progress(_LOG, progress, f"{phase.value}: {result} after {elapsed:.2f} s")
-
-    @contextmanager
-    def attempt(self) -> Iterator[None]:
-        """Record the reason why there is no manoeuvre, instead of raising an error."""
-        try:
-            yield
-        except UnusableCandidateError as reason:
-            self.rejection = str(reason)
-            self.report(self.rejection)
-        self.problem.cancellation.raise_if_requested()
-
-
-def _touch(near: Sequence[Approach]) -> bool:
-    return any(each.distance < 0 for each in near)
-
-
-class _Apart(NamedTuple):
-    """Pairs that are kept apart on a grid; those that come too near on the way are added.
-
-    ``hold`` makes the held commands that are to keep clear; None: the path itself is.
-    """
-
-    kept: KeptDistances
-    grid: _Grid
-    hold: Callable[[Trajectory], Manoeuvre] | None = None
-
-
 class ManoeuvreSearch:
-    """Searches for a robot's manoeuvres.
+    """Searches for a robot's manoeuvres, and keeps its solvers for the next ones.
 
     Parameters
     ----------
@@ -406,10 +329,9 @@ class ManoeuvreSearch:
     """
 
     def __init__(self, model: ManoeuvreModel) -> None:
-        self._model, self._period = model, model.control_period
-        self._wheels = ReactionWheels.of(model.robot.description)
+        self._model = model
         self._stages: dict[tuple[bool, bool], Stages] = {}
-        self._solvers: dict[tuple[_Grid, bool, tuple[int, ...], bool], MultipleShooting] = {}
+        self._solvers: dict[tuple[_Grid, bool, bool, tuple[int, ...]], MultipleShooting] = {}
 
     def search(self, problem: SearchProblem) -> Manoeuvre:
         """Return the fastest manoeuvre found.
@@ -423,26 +345,22 @@ class ManoeuvreSearch:
         PlanningCancelled
             The search was cancelled.
         """
-        options = problem.options
-        if options.longest < _MIN_TICKS * self._period:
+        options, model = problem.options, self._model
+        if options.longest < _MIN_TICKS * model.control_period:
             raise PlanningError(
-                f"Manoeuvres take at least {_MIN_TICKS} control periods of {self._period:g} s, "
-                f"more than optimal.longest = {options.longest:g} s."
+                f"Manoeuvres take at least {_MIN_TICKS} control periods of "
+                f"{model.control_period:g} s, more than optimal.longest = {options.longest:g} s."
             )
         if problem.motion is not None:
-            velocity = self._initial_velocity(problem.motion, problem.limits)
+            velocity = _initial_velocity(problem.motion, problem.limits, model.control_period)
             problem = replace(problem, boundary=replace(problem.boundary, velocity=velocity))
-        kept, knows_turn = None, len(self._model.axes) == 3
-        if self._model.distances is not None:
-            kept = self._model.distances.begin(problem.boundary, turn_is_known=knows_turn)
-        if self._wheels_stop_base(problem):
-            # Guesses with wheels are near to solutions.
-            iterations = min(options.iterations, _MAX_ITERATIONS_OF_STOPS)
-            problem = replace(problem, options=replace(options, answers=1, iterations=iterations))
-        state = _SearchState(problem, *self._grids(problem))
-        found = self._search_from_guesses(state)
+        kept, knows_turn = None, len(model.axes) == 3
+        if model.distances is not None:
+            kept = model.distances.begin(problem.boundary, turn_is_known=knows_turn)
+        search = _Search(model, problem, self._solver)
+        found = search.search_from_guesses()
         if found is not None and kept is not None:
-            found = self._keep_clear(state, kept, found)
+            found = search.keep_clear(kept, found)
         cut_short = problem.clock.is_over(found=found is not None)
         if found is None:
             within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
@@ -450,17 +368,98 @@ class ManoeuvreSearch:
             limit = "duration" if options.duration > 0 else "longest"
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
             raise NotFoundError(
-                f"No manoeuvre to the goal{in_motion} was found from {state.starts} start(s)"
-                f"{within}: {state.rejection}. {longer} optimal.starts, optimal.iterations or "
+                f"No manoeuvre to the goal{in_motion} was found from {search.starts} start(s)"
+                f"{within}: {search.rejection}. {longer} optimal.starts, optimal.iterations or "
                 f"optimal.intervals, a longer optimal.{limit}, or a smaller goal may help."
             )
-        return replace(found, starts=state.starts, cut_short=cut_short)
+        return replace(found, starts=search.starts, cut_short=cut_short)
+
+    def _solver(
+        self, grid: _Grid, boundary: BoundaryConditions, pairs: tuple[int, ...]
+    ) -> MultipleShooting:
+        """Return the solver on a grid, which keeps pairs of links apart."""
+        position, drifting, model = boundary.center is not None, boundary.drifts, self._model
+        if (position, drifting) not in self._stages:
+            self._stages[position, drifting] = Stages.of(
+                model.robot,
+                model.axes,
+                position,
+                model.constraints,
+                inequality=model.efforts and model.efforts.inequality(drifting=drifting),
+                end_effectors=model.end_effectors and model.end_effectors.function,
+                drifting=drifting,
+            )
+        key = grid, position, drifting, pairs
+        if key not in self._solvers:
+            stages = self._stages[position, drifting]
+            if pairs and model.distances is not None:
+                rows = model.distances.of(pairs)
+                stages = stages.with_distances(rows, instants_of(grid.intervals))
+            self._solvers[key] = MultipleShooting(stages, *grid)
+        return self._solvers[key]
+
+
+def _initial_velocity(motion: InitialMotion, limits: MotionLimits, period: float) -> Array:
+    """Return the velocities (n,) at the start: between those that are held before and after."""
+    between = motion.velocity
+    if len(motion.remaining) > 1:
+        after = (motion.remaining[1] - motion.remaining[0]) / period
+        between = (motion.velocity + after) / 2
+    return np.clip(between, -limits.velocity, limits.velocity)
+
+
+def _touch(near: Sequence[Approach]) -> bool:
+    return any(each.distance < 0 for each in near)
+
+
+class _Search:
+    """One search.
+
+    Attributes
+    ----------
+    starts
+        Number of guesses that were tried.
+    rejection
+        Reason against the last candidate.
+    """
+
+    def __init__(
+        self,
+        model: ManoeuvreModel,
+        problem: SearchProblem,
+        solver: Callable[[_Grid, BoundaryConditions, tuple[int, ...]], MultipleShooting],
+    ) -> None:
+        self._model, self._period, self._solver = model, model.control_period, solver
+        self._wheels = ReactionWheels.of(model.robot.description)
+        self._wheels_stop_base = (
+            len(self._wheels) > 0 and problem.boundary.is_timed and problem.motion is None
+        )
+        if self._wheels_stop_base:
+            # Guesses with wheels are near to solutions.
+            iterations = min(problem.options.iterations, _MAX_ITERATIONS_OF_STOPS)
+            options = replace(problem.options, answers=1, iterations=iterations)
+            problem = replace(problem, options=options)
+        self._problem = problem
+        self._full = self._coarse = _Grid(problem.intervals)
+        coarse = _Grid(problem.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
+        # On a coarse grid the attitude of a base that wheels stop is too far off.
+        if coarse.intervals >= _MIN_COARSE_INTERVALS and not self._wheels_stop_base:
+            self._coarse = coarse
+            # A single answer in motion is for the rest of a manoeuvre, which is short.
+            if problem.motion is not None and problem.options.answers == 1:
+                self._full = coarse
+        self.starts, self.rejection = 0, ""
+        self._phase, self._reported = SearchPhase.SEARCHING, 0.0
+        # Of the clear paths once there are some in collision.
+        self._best, self._is_clearing = math.inf, False
+        self._work = 0.0
+        self._coarse_solutions: list[Trajectory | None] = []
 
     # -- 1. guesses -------------------------------------------------------------------------------
 
-    def _guesses(self, state: _SearchState, grid: MultipleShooting) -> Iterator[Trajectory]:
+    def _guesses(self, grid: _Grid) -> Iterator[Trajectory]:
         """Yield guesses on a grid without end, in the same order for equal problems."""
-        problem, source = state.problem, self._guesses_on(grid, state.problem.boundary)
+        problem, source = self._problem, self._source(grid)
         boundary, limits, motion = problem.boundary, problem.limits, problem.motion
         if motion is not None:
             velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
@@ -475,138 +474,115 @@ class ManoeuvreSearch:
             yield from source.generate_with_wheels(self._wheels, boundary, limits, robot)
         yield from source.generate(boundary, limits)
 
-    def _guesses_on(self, grid: MultipleShooting, boundary: BoundaryConditions) -> InitialGuesses:
-        curvature = self._model.robot.function("curvature", compile=False)
+    def _source(self, grid: _Grid) -> InitialGuesses:
+        boundary, curvature = (
+            self._problem.boundary,
+            self._model.robot.function("curvature", compile=False),
+        )
         L_0 = boundary.angular_momentum if boundary.drifts else None
-        return InitialGuesses(grid.turn, curvature, grid.intervals, L_0)
+        turn = self._solver(grid, boundary, ()).turn
+        return InitialGuesses(turn, curvature, grid.intervals, L_0)
 
     # -- 2. coarse solutions ----------------------------------------------------------------------
 
-    def _search_from_guesses(self, state: _SearchState) -> Manoeuvre | None:
+    def search_from_guesses(self) -> Manoeuvre | None:
         """Return a manoeuvre that need not keep clear, from guesses on a coarse grid first; None:
         none was found.
         """
-        problem, enough = state.problem, state.problem.options.answers
+        self._report("begun")
+        problem, enough = self._problem, self._problem.options.answers
         # A single answer from rest costs less without a coarse grid.
-        grid = state.full if enough == 1 else state.coarse
-        solver = self._solver(problem, grid)
+        grid = self._full if enough == 1 else self._coarse
         solutions: list[Trajectory] = []
-        for guess in itertools.islice(self._guesses(state, solver), problem.options.starts):
-            solution = self._solve_start(state, solver, guess, found=bool(solutions))
-            if grid == state.coarse:
-                state.solved.append(solution)
+        for guess in itertools.islice(self._guesses(grid), problem.options.starts):
+            solution = self._solve_start(grid, guess, found=bool(solutions))
+            if grid == self._coarse:
+                self._coarse_solutions.append(solution)
             if solution is not None:
                 solutions.append(solution)
             # A search may also be cut short within its last start.
             cut_short = problem.clock.is_over(found=bool(solutions)) or not (
-                solutions or state.starts < problem.max_failed_starts
+                solutions or self.starts < problem.max_failed_starts
             )
             if cut_short or len(solutions) >= enough or problem.solutions_agree(solutions):
-                found = self._refine_best(state, solutions, grid)
+                found = self._refine_best(solutions, grid)
                 if found is not None or cut_short:
                     return found
                 # These are none; the next ones count one by one.
                 solutions, enough = [], 1
-        return self._refine_best(state, solutions, grid)
+        return self._refine_best(solutions, grid)
 
     def _solve_start(
-        self, state: _SearchState, grid: MultipleShooting, guess: Trajectory, *, found: bool = False
+        self, grid: _Grid, guess: Trajectory, *, found: bool = False
     ) -> Trajectory | None:
         """Return the solution from the next guess; None: none was found."""
-        state.begin(SearchPhase.SEARCHING)
-        solution = self._solve_from_guess(state, grid, guess, found=found)
-        state.starts += 1
-        if solution is None:
-            state.rejection = _NO_PATH_FOUND
-            state.report(f"start {state.starts}, {_NO_PATH_FOUND}")
-        else:
-            duration = math.inf if state.is_clearing else solution.duration
-            state.report(f"start {state.starts}, {solution.duration:.6g} s", duration)
-        return solution
+        self._begin(SearchPhase.SEARCHING)
+        self.starts += 1
+        with self._attempt():
+            solution = self._solve_from_guess(grid, guess, found=found)
+            duration = math.inf if self._is_clearing else solution.duration
+            self._report(f"start {self.starts}, {solution.duration:.6g} s", duration)
+            return solution
+        return None
 
     def _solve_from_guess(
-        self,
-        state: _SearchState,
-        grid: MultipleShooting,
-        guess: Trajectory,
-        *,
-        found: bool = False,
-        refining: bool = False,
-    ) -> Trajectory | None:
+        self, grid: _Grid, guess: Trajectory, *, found: bool = False, refining: bool = False
+    ) -> Trajectory:
         """Return the solution from a guess: the fastest one, that of least effort in the time that
-        is given, or a gentle one; None: none was found."""
-        problem, boundary, limits = state.problem, state.problem.boundary, state.problem.limits
-        shortest, T = self._shortest_duration(problem), problem.options.duration
-        guess = self._slow_to_effort_limits(self._model.constraints.slowed(guess), boundary)
+        is given, or a gentle one; UnusableCandidateError if none was found.
+        """
+        problem, slowed = self._problem, self._model.slowed
+        shortest, T = self._shortest_duration, problem.options.duration
+        guess = slowed(guess, problem.boundary)
         if problem.hastens:
-            bounds = DurationBounds(shortest, problem.options.longest)
-        else:
-            if problem.gentle and T == 0:
-                T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
-            else:
-                T = self._given_duration(problem.options)
-            guess, bounds = guess.stretched(T / guess.duration), DurationBounds(T, T)
-        solution = grid.solve(
-            boundary,
-            limits,
-            guess,
-            state.stop_rule(found=found),
-            bounds,
-            refining=refining and problem.hastens,
-        )
-        problem.cancellation.raise_if_requested()
-        if solution is None or problem.hastens or problem.options.duration > 0:
-            return solution
-        return self._slow_to_effort_limits(solution.at_full_speed(limits, shortest), boundary)
+            longest = problem.options.longest
+            return self._solve(grid, guess, shortest, longest, found=found, refining=refining)
+        if T == 0:
+            T = max(_GENTLE_DURATION_FACTOR * guess.duration, shortest)
+            solution = self._solve(grid, guess, T, found=found)
+            return slowed(solution.at_full_speed(problem.limits, shortest), problem.boundary)
+        return self._solve(grid, guess, self._given_duration, found=found)
 
     # -- 3. full grid -----------------------------------------------------------------------------
 
-    def _refine_best(
-        self, state: _SearchState, solutions: list[Trajectory], grid: _Grid
-    ) -> Manoeuvre | None:
+    def _refine_best(self, solutions: list[Trajectory], grid: _Grid) -> Manoeuvre | None:
         """Return a manoeuvre from the best solution on a grid, refined on the full grid, or from
         the next one if that fails; None: from none of them.
         """
-        problem = state.problem
-        state.begin(SearchPhase.REFINING)
-        for solution in sorted(solutions, key=problem.cost):
-            with state.attempt():
-                refined: Trajectory | None = solution
-                if grid != state.full:
-                    full = self._solver(problem, state.full)
-                    guess = self._guesses_on(full, problem.boundary).resample(solution)
-                    refined = self._solve_from_guess(state, full, guess, refining=True)
-                if refined is None:
-                    raise UnusableCandidateError(_NO_PATH_FOUND)
-                manoeuvre = self._make_held_commands(state, refined)
-                state.report(f"manoeuvre of {manoeuvre.duration:.6g} s")
-                return manoeuvre
+        self._begin(SearchPhase.REFINING)
+        for solution in sorted(solutions, key=self._problem.cost):
+            with self._attempt():
+                if grid != self._full:
+                    guess = self._source(self._full).resample(solution)
+                    solution = self._solve_from_guess(self._full, guess, refining=True)
+                return self._make_held_commands(solution)
         return None
 
     # -- 4. held commands -------------------------------------------------------------------------
 
     def _make_held_commands(
-        self, state: _SearchState, trajectory: Trajectory, kept: KeptDistances | None = None
+        self, trajectory: Trajectory, kept: KeptDistances | None = None
     ) -> Manoeuvre:
         """Return a solution as held commands, near to it if pairs are kept apart;
         UnusableCandidateError if none reach the goal within the constraints.
         """
-        problem, constraints = state.problem, self._model.constraints
+        problem, model = self._problem, self._model
         fixed = problem.options.duration > 0
         if problem.is_timed:
-            held = self._hold_in_whole_ticks(state, trajectory, kept)
+            held = self._hold_in_whole_ticks(trajectory, kept)
         else:
-            held = self._model.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
+            held = model.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
         if held is None:
             raise UnusableCandidateError(_NO_HELD_COMMANDS)
         start = problem.request.state.quaternion
         attitudes = quaternion_multiply(start, held.quaternions)
-        constraints.check(held.positions, attitudes, self._period)
+        model.constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
+        self._report(f"manoeuvre of {duration:.6g} s")
         return Manoeuvre(held, duration, trajectory)
 
     def _hold_in_whole_ticks(
-        self, state: _SearchState, trajectory: Trajectory, kept: KeptDistances | None
+        self, trajectory: Trajectory, kept: KeptDistances | None
     ) -> HeldCommands | None:
         """Return a solution whose duration matters as held commands; None where that fails.
 
@@ -614,7 +590,7 @@ class ManoeuvreSearch:
         begin at other rates. So the trajectory of least effort in as many control periods, or a few
         more, is solved for.
         """
-        problem, limits, near = state.problem, state.problem.limits, None
+        problem, limits, near = self._problem, self._problem.limits, None
         if problem.motion is None:
             velocity, acceleration = (
                 _HELD_SHARE * limits.velocity,
@@ -622,10 +598,8 @@ class ManoeuvreSearch:
             )
             limits = replace(limits, velocity=velocity, acceleration=acceleration)
         if kept is not None and kept.pairs:
-            limits = kept.within(limits, trajectory)
             near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
-        pairs = () if kept is None else kept.pairs
-        solver = self._solver(problem, _Grid(len(trajectory.shapes) - 1), pairs)
+        grid = _Grid(len(trajectory.shapes) - 1)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
         guess, aim = trajectory, problem.boundary
         additional = list(_ADDITIONAL_TICKS)
@@ -635,37 +609,32 @@ class ManoeuvreSearch:
         most = 2 if problem.options.duration > 0 else len(additional)
         for more in additional[:most]:
             T = (ticks + more) * self._period
-            guess = guess.stretched(T / guess.duration)
-            stop = state.stop_rule()
-            solution = solver.solve(aim, limits, guess, stop, DurationBounds(T, T), near)
-            problem.cancellation.raise_if_requested()
-            if solution is None:
+            try:
+                guess = self._solve(grid, guess, T, aim=aim, limits=limits, kept=kept, near=near)
+            except UnusableCandidateError:
                 continue
             held = self._model.hold(
-                solution, problem.boundary, problem.limits, fixed=True, before=problem.velocity
+                guess, problem.boundary, problem.limits, fixed=True, before=problem.velocity
             )
             if held is not None:
                 return held
-            guess = solution
-            aim = self._model.corrected_end(solution, problem.boundary, ticks + more)
+            aim = self._model.corrected_end(guess, problem.boundary, ticks + more)
         return None
 
     # -- 5. clear ---------------------------------------------------------------------------------
 
-    def _keep_clear(
-        self, state: _SearchState, kept: KeptDistances, found: Manoeuvre
-    ) -> Manoeuvre | None:
+    def keep_clear(self, kept: KeptDistances, found: Manoeuvre) -> Manoeuvre | None:
         """Return a manoeuvre that keeps clear: the one that was found, if it does; else one near to
         it, or near to other paths; None: none is found.
         """
-        problem = state.problem
+        problem = self._problem
         if not kept.approaches(found.held.positions, found.held.quaternions):
             return found
-        state.best, state.is_clearing = math.inf, True
+        self._best, self._is_clearing = math.inf, True
         clear: list[tuple[KeptDistances, Trajectory, float]] = []
-        others = self._other_paths(state, kept, found.solution, clear)
+        others = self._other_paths(kept, found.solution, clear)
         # A motion that is timed is too far off on a coarse grid: joints run on in long intervals.
-        coarsely = problem.hastens and state.coarse != state.full and not problem.is_timed
+        coarsely = problem.hastens and self._coarse != self._full and not problem.is_timed
         if not coarsely:
             others = itertools.islice(others, _MAX_FULL_GRID_STARTS)
         for number, (path, reach) in enumerate(itertools.chain([(found.solution, 1.0)], others)):
@@ -673,50 +642,44 @@ class ManoeuvreSearch:
             if not coarsely:
                 clear.append((apart, path, reach))
             elif all(path.duration < each.duration for _, each, _ in clear):
-                with state.attempt():
-                    fast = self._clear_coarsely(state, apart, path, reach)
-                    clear.append((apart, fast, 1.0))
+                with self._attempt():
+                    clear.append((apart, self._clear_coarsely(apart, path, reach), 1.0))
             if number == 0 or not coarsely or len(clear) == _CLEAR_ANSWERS:
-                if (freed := self._finely_cleared(state, clear)) is not None:
+                if (freed := self._finely_cleared(clear)) is not None:
                     return freed
                 clear.clear()
-        return self._finely_cleared(state, clear)
+        return self._finely_cleared(clear)
 
     def _finely_cleared(
-        self, state: _SearchState, clear: list[tuple[KeptDistances, Trajectory, float]]
+        self, clear: list[tuple[KeptDistances, Trajectory, float]]
     ) -> Manoeuvre | None:
         """Return a manoeuvre near to the fastest of clear paths on the coarse grid, or to the next;
         None: none is found.
         """
         for each in sorted(clear, key=lambda each: each[1].duration):
-            with state.attempt():
-                return self._clear_finely(state, *each)
+            with self._attempt():
+                return self._clear_finely(*each)
         return None
 
     def _other_paths(
-        self,
-        state: _SearchState,
-        kept: KeptDistances,
-        known: Trajectory,
-        found: Sequence[object],
+        self, kept: KeptDistances, known: Trajectory, found: Sequence[object]
     ) -> Iterator[tuple[Trajectory, float]]:
         """Yield other paths with the share of the largest reach in which clear ones are looked for:
         solutions that need not keep clear, from guesses on a coarse grid, then, while nothing is
         ``found``, guesses that keep clear, but do not end at the goal.
         """
-        problem = state.problem
+        problem, grid = self._problem, self._coarse
         if problem.boundary.drifts and problem.motion is None:
             # A robot that drifts finds others sooner after it has coasted.
             return
         costs = [problem.cost(known)]
-        solver = self._solver(problem, state.coarse)
         brakes = problem.motion is not None and not problem.boundary.drifts
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
         starts = min(problem.options.starts, most)
-        others = itertools.islice(self._guesses(state, solver), len(state.solved), starts)
-        solved = (self._solve_start(state, solver, guess) for guess in others)
-        for solution in itertools.chain(state.solved[:starts], solved):
-            if state.is_over(found=bool(found)):
+        others = itertools.islice(self._guesses(grid), len(self._coarse_solutions), starts)
+        solved = (self._solve_start(grid, guess) for guess in others)
+        for solution in itertools.chain(self._coarse_solutions[:starts], solved):
+            if self._is_over(found=bool(found)):
                 return
             if solution is None:
                 continue
@@ -725,57 +688,45 @@ class ManoeuvreSearch:
                 costs.append(cost)
                 yield solution, 1.0
         few = starts if brakes else problem.options.starts
-        for guess in itertools.islice(self._guesses(state, solver), few):
-            if found or state.is_over(found=False):
+        for guess in itertools.islice(self._guesses(grid), few):
+            if found or self._is_over(found=False):
                 return
             if not kept.approaches_of(guess):
                 yield guess, _REACH_FROM_GUESS
 
-    def _clear_coarsely(
-        self, state: _SearchState, kept: KeptDistances, path: Trajectory, reach: float
-    ) -> Trajectory:
+    def _clear_coarsely(self, kept: KeptDistances, path: Trajectory, reach: float) -> Trajectory:
         """Return a fast path near to another one that keeps clear on the coarse grid;
         UnusableCandidateError if none was found.
         """
-        apart = _Apart(kept, state.coarse)
-        slow, _ = self._clear(state, apart, path, _CLEARING_TIME_FACTOR * path.duration, reach)
-        fast, _ = self._shorten(state, apart, slow, None)
-        return fast
+        duration = _CLEARING_TIME_FACTOR * path.duration
+        slow, _ = self._clear(kept, self._coarse, path, duration, reach)
+        return self._shorten(kept, self._coarse, slow, None)[0]
 
-    def _clear_finely(
-        self, state: _SearchState, kept: KeptDistances, path: Trajectory, reach: float
-    ) -> Manoeuvre:
+    def _clear_finely(self, kept: KeptDistances, path: Trajectory, reach: float) -> Manoeuvre:
         """Return a manoeuvre near to a path that keeps clear, by the full grid;
         UnusableCandidateError if none was found.
         """
-        options = state.problem.options
-        hold = partial(self._make_held_commands, state, kept=kept)
-        apart = _Apart(kept, state.full, hold)
+        options, grid = self._problem.options, self._full
         duration, made = _CLEARING_TIME_FACTOR * path.duration, None
         if kept.pairs:
             # A path that is clear on the coarse grid mostly is on the full one, as fast.
             path = path.stretched(_RESAMPLED_TIME_FACTOR)
             duration = path.duration
-            path, made = self._shorten(state, apart, path, None)
+            path, made = self._shorten(kept, grid, path, None)
         elif options.duration > 0:
-            duration = self._given_duration(options)
+            duration = self._given_duration
         if made is None:
-            path, made = self._clear(state, apart, path, duration, reach)
+            path, made = self._clear(kept, grid, path, duration, reach)
             if options.duration == 0:
-                path, made = self._shorten(state, apart, path, made)
+                path, made = self._shorten(kept, grid, path, made)
         assert made is not None
         if made.duration > max(options.longest, options.duration) + self._period / 2:
             raise UnusableCandidateError(_NO_PATH_FOUND)
-        state.report(f"manoeuvre of {made.duration:.6g} s", made.duration)
+        self._report(f"manoeuvre of {made.duration:.6g} s", made.duration)
         return made
 
     def _clear(
-        self,
-        state: _SearchState,
-        apart: _Apart,
-        path: Trajectory,
-        duration: float,
-        reach: float,
+        self, kept: KeptDistances, grid: _Grid, path: Trajectory, duration: float, reach: float
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a clear path near to one, in a given duration (s), and its held commands; by
         steps of a share of the largest reach at first. UnusableCandidateError if none was found.
@@ -783,8 +734,8 @@ class ManoeuvreSearch:
         Planes separate links along a path on which they do not touch. So if a path without contacts
         leads to one with some, the latter's pairs are kept apart near to the former.
         """
-        state.begin(SearchPhase.CLEARING)
-        kept, limits, lacks = apart.kept, state.problem.limits, [math.inf, math.inf]
+        self._begin(SearchPhase.CLEARING)
+        limits, lacks = self._problem.limits, [math.inf, math.inf]
         near, made = kept.approaches_of(path), None
         is_free = not _touch(near)
         kept.add(near)
@@ -792,17 +743,17 @@ class ManoeuvreSearch:
             deepest = min((each.distance for each in near), default=0.0)
             largest_lack = max(_MIN_LARGEST_LACK, -_LACK_PER_DEPTH * deepest)
             around = Neighbourhood.within(limits, reach, largest_lack)
-            guess = path.stretched(duration / path.duration)
             pairs = kept.pairs
-            solution, lack = self._solve_apart(state, apart, guess, duration, around)
-            near, made = self._approaches(apart, solution)
+            solution = self._solve_apart(kept, grid, path, duration, around)
+            lack = self._lack
+            near, made = self._approaches(kept, grid, solution)
             if not near:
                 return solution, made
             # Pairs that are new may lack more than those before did.
             is_new = any(each.pair not in pairs for each in near)
             lacks = [math.inf, math.inf] if is_new else [*lacks, lack]
             goes_on = is_new or lack < _NO_LACK or lack <= _PROGRESS_SHARE * lacks[-3]
-            if not goes_on or (apart.hold is None and state.is_over(found=False)):
+            if not goes_on or (grid != self._full and self._is_over(found=False)):
                 break
             if is_free and _touch(near):
                 kept.add(near)
@@ -816,21 +767,20 @@ class ManoeuvreSearch:
         raise UnusableCandidateError(kept.message(near[0], period))
 
     def _shorten(
-        self, state: _SearchState, apart: _Apart, path: Trajectory, made: Manoeuvre | None
+        self, kept: KeptDistances, grid: _Grid, path: Trajectory, made: Manoeuvre | None
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a faster path near to a clear one, and its held commands; else that one itself."""
-        state.begin(SearchPhase.SHORTENING)
-        reach, limits, begin = 1.0, state.problem.limits, path
+        self._begin(SearchPhase.SHORTENING)
+        reach, limits, begin = 1.0, self._problem.limits, path
         for number in range(_MAX_SHORTENING_ROUNDS):
-            state.report("clear path", path.duration)
-            is_over = number >= _MIN_SHORTENING_ROUNDS and state.is_over(found=True)
-            if is_over or reach < _MIN_REACH_SHARE or state.problem.clock.is_over(found=True):
+            self._report("clear path", path.duration)
+            is_over = number >= _MIN_SHORTENING_ROUNDS and self._is_over(found=True)
+            if is_over or reach < _MIN_REACH_SHARE or self._problem.clock.is_over(found=True):
                 break
             try:
-                faster, _ = self._solve_apart(
-                    state, apart, begin, None, Neighbourhood.within(limits, reach)
-                )
-                near, found = self._approaches(apart, faster)
+                around = Neighbourhood.within(limits, reach)
+                faster = self._solve_apart(kept, grid, begin, None, around)
+                near, found = self._approaches(kept, grid, faster)
             except UnusableCandidateError:
                 reach, begin = reach / _REACH_DIVISOR, path
                 continue
@@ -838,10 +788,10 @@ class ManoeuvreSearch:
                 # Planes between links that do not touch lead to a clear path nearby.
                 begin = path if _touch(near) else faster
                 # A pair that is new has no planes yet.
-                if all(each.pair in apart.kept.pairs for each in near):
+                if all(each.pair in kept.pairs for each in near):
                     reach /= _REACH_DIVISOR
-                apart.kept.add(near)
-                if made is None and apart.hold is not None:
+                kept.add(near)
+                if made is None and grid == self._full:
                     # It is no path that is clear by its held commands, either.
                     break
                 continue
@@ -855,114 +805,140 @@ class ManoeuvreSearch:
         return path, made
 
     def _approaches(
-        self, apart: _Apart, path: Trajectory
+        self, kept: KeptDistances, grid: _Grid, path: Trajectory
     ) -> tuple[list[Approach], Manoeuvre | None]:
-        """Return the pairs that come too near along a path, or else along its held commands."""
-        near = apart.kept.approaches_of(path)
-        if near or apart.hold is None:
+        """Return the pairs that come too near along a path, or else, on the full grid, along its
+        held commands, and those.
+        """
+        near = kept.approaches_of(path)
+        if near or grid != self._full:
             return near, None
-        made = apart.hold(path)
-        return apart.kept.approaches(made.held.positions, made.held.quaternions), made
+        made = self._make_held_commands(path, kept)
+        return kept.approaches(made.held.positions, made.held.quaternions), made
 
     def _solve_apart(
         self,
-        state: _SearchState,
-        apart: _Apart,
+        kept: KeptDistances,
+        grid: _Grid,
         guess: Trajectory,
         duration: float | None,
         near: Neighbourhood,
-    ) -> tuple[Trajectory, float]:
+    ) -> Trajectory:
         """Return a solution near to a guess that keeps pairs of links apart, in a duration, s
-        (None: the fastest one), and by how much they are too near all the same, m;
-        UnusableCandidateError if none was found.
+        (None: the fastest one); UnusableCandidateError if none was found.
         """
-        problem, boundary, kept = state.problem, state.problem.boundary, apart.kept
-        solver = self._solver(problem, apart.grid, kept.pairs)
-        if len(guess.shapes) != apart.grid.intervals + 1:
-            guess = self._guesses_on(solver, boundary).resample(guess)
-        bounds = DurationBounds(self._shortest_duration(problem), problem.options.longest)
+        problem, boundary = self._problem, self._problem.boundary
         if duration is not None:
-            bounds = DurationBounds(duration, duration)
+            guess = guess.stretched(duration / guess.duration)
+        if len(guess.shapes) != grid.intervals + 1:
+            guess = self._source(grid).resample(guess)
         if problem.motion is not None and duration is not None:
             # A path that takes longer begins as fast all the same.
-            source, lacking = self._guesses_on(solver, boundary), boundary.velocity
-            lacking = lacking - guess.velocities[0]
-            guess = source.with_initial_velocity(guess, lacking, problem.limits)
-        within = kept.within(problem.limits, guess, pushing=near.largest_lack > 0)
-        stop = state.stop_rule(found=True, work=solver.nonzeros)
-        solution = solver.solve(boundary, within, guess, stop, bounds, near)
-        problem.cancellation.raise_if_requested()
-        pairs = f"{len(kept.pairs)} pair(s) apart"
-        if solution is None:
-            state.report(f"{pairs}, {_NO_PATH_FOUND}")
-            raise UnusableCandidateError(_NO_PATH_FOUND)
-        lack = f"{1e3 * solver.lack:.3g} mm too close"
-        state.report(f"{pairs}, {solution.duration:.6g} s, {lack}")
-        return solution, solver.lack
+            lacking = boundary.velocity - guess.velocities[0]
+            guess = self._source(grid).with_initial_velocity(guess, lacking, problem.limits)
+        longest = problem.options.longest if duration is None else None
+        shortest = duration or self._shortest_duration
+        return self._solve(grid, guess, shortest, longest, kept=kept, near=near, found=True)
 
     # -- what the steps share ---------------------------------------------------------------------
 
-    def _grids(self, problem: SearchProblem) -> tuple[_Grid, _Grid]:
-        """Return the coarse grid and the full one: the same one if there is no coarse one."""
-        full = _Grid(problem.intervals)
-        coarse = _Grid(full.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
-        # On a coarse grid the attitude of a base that wheels stop is too far off.
-        if coarse.intervals < _MIN_COARSE_INTERVALS or self._wheels_stop_base(problem):
-            return full, full
-        # A single answer in motion is for the rest of a manoeuvre, which is short.
-        is_rest = problem.motion is not None and problem.options.answers == 1
-        return coarse, (coarse if is_rest else full)
+    def _solve(
+        self,
+        grid: _Grid,
+        guess: Trajectory,
+        shortest: float,
+        longest: float | None = None,
+        *,
+        aim: BoundaryConditions | None = None,
+        limits: MotionLimits | None = None,
+        kept: KeptDistances | None = None,
+        near: Neighbourhood | None = None,
+        found: bool = False,
+        refining: bool = False,
+    ) -> Trajectory:
+        """Return the fastest solution near a guess, at most ``longest``, s; None: that of least
+        effort in the ``shortest`` time.
 
-    def _wheels_stop_base(self, problem: SearchProblem) -> bool:
-        return len(self._wheels) > 0 and problem.boundary.is_timed and problem.motion is None
+        ``aim``, ``limits`` are others than the problem's, ``kept`` pairs are apart, ``found``:
+        whether there is a manoeuvre. UnusableCandidateError if none was found.
+        """
+        problem, pairs = self._problem, () if kept is None else kept.pairs
+        aim, limits = aim or problem.boundary, limits or problem.limits
+        solver = self._solver(grid, problem.boundary, pairs)
+        if longest is None:
+            guess = guess.stretched(shortest / guess.duration)
+        if kept is not None and near is not None:
+            limits = kept.within(limits, guess, pushing=near.largest_lack > 0)
+        stop = self._stop_rule(found=found, work=solver.nonzeros if pairs else 0)
+        bounds = DurationBounds(shortest, shortest if longest is None else longest)
+        solution = solver.solve(aim, limits, guess, stop, bounds, near, refining=refining)
+        problem.cancellation.raise_if_requested()
+        self._lack = solver.lack
+        if solution is None:
+            raise UnusableCandidateError(_NO_PATH_FOUND)
+        if pairs:
+            apart, lack = f"{len(pairs)} pair(s) apart", f"{1e3 * solver.lack:.3g} mm too close"
+            self._report(f"{apart}, {solution.duration:.6g} s, {lack}")
+        return solution
 
-    def _solver(
-        self, problem: SearchProblem, grid: _Grid, pairs: tuple[int, ...] = ()
-    ) -> MultipleShooting:
-        """Return the solver on a grid, which keeps pairs of links apart."""
-        position, drifting = problem.boundary.center is not None, problem.boundary.drifts
-        key = grid, position, pairs, drifting
-        if key not in self._solvers:
-            stages = self._stages_of(position=position, drifting=drifting)
-            if pairs and self._model.distances is not None:
-                rows = self._model.distances.of(pairs)
-                stages = stages.with_distances(rows, instants_of(grid.intervals))
-            self._solvers[key] = MultipleShooting(stages, *grid)
-        return self._solvers[key]
-
-    def _stages_of(self, *, position: bool, drifting: bool) -> Stages:
-        key, model = (position, drifting), self._model
-        if key not in self._stages:
-            self._stages[key] = Stages.of(
-                model.robot,
-                model.axes,
-                position,
-                model.constraints,
-                inequality=model.efforts and model.efforts.inequality(drifting=drifting),
-                end_effectors=model.end_effectors and model.end_effectors.function,
-                drifting=drifting,
-            )
-        return self._stages[key]
-
-    def _initial_velocity(self, motion: InitialMotion, limits: MotionLimits) -> Array:
-        """Return the velocities (n,) at the start: between those that are held before and after."""
-        between = motion.velocity
-        if len(motion.remaining) > 1:
-            after = (motion.remaining[1] - motion.remaining[0]) / self._period
-            between = (motion.velocity + after) / 2
-        return np.clip(between, -limits.velocity, limits.velocity)
-
-    def _shortest_duration(self, problem: SearchProblem) -> float:
-        """Return the duration that a manoeuvre has at least, s."""
-        gentle = min(_GENTLE_TICKS * self._period, _GENTLE_TIME) if problem.gentle else 0.0
+    @property
+    def _shortest_duration(self) -> float:
+        """Duration that a manoeuvre has at least, s."""
+        gentle = min(_GENTLE_TICKS * self._period, _GENTLE_TIME) if self._problem.gentle else 0.0
         return max(_MIN_TICKS * self._period, gentle)
 
-    def _given_duration(self, options: OptimalOptions) -> float:
-        """Return the duration that is asked for in whole ticks, s."""
-        return max(round(options.duration / self._period), 1) * self._period
+    @property
+    def _given_duration(self) -> float:
+        """The duration that is asked for in whole ticks, s."""
+        return max(round(self._problem.options.duration / self._period), 1) * self._period
 
-    def _slow_to_effort_limits(
-        self, trajectory: Trajectory, boundary: BoundaryConditions
-    ) -> Trajectory:
-        efforts = self._model.efforts
-        return trajectory if efforts is None else efforts.slowed(trajectory, boundary)
+    def _is_over(self, *, found: bool) -> bool:
+        """Whether the wall time or the work on clear paths is used up; ``found``: whether there is
+        such a path."""
+        most = _MAX_WORK_PER_ITERATION * self._problem.options.iterations
+        if not found:
+            most *= _WORK_FACTOR_WITHOUT_PATH
+        return self._work > most or self._problem.clock.is_over(found=found)
+
+    def _stop_rule(self, *, found: bool, work: int) -> StopRule:
+        """Return the solver's stop conditions in the current phase; ``work`` is the work per
+        step."""
+        problem, iterations = self._problem, self._problem.options.iterations
+        if self._is_clearing and work:
+            iterations = min(iterations, _MAX_CLEARING_ITERATIONS)
+
+        def is_over(feasible: bool) -> bool:
+            # A path on the way to a clear one is no manoeuvre.
+            is_manoeuvre = self._phase is not SearchPhase.CLEARING and (found or feasible)
+            return problem.clock.is_over(found=is_manoeuvre)
+
+        def watch() -> None:
+            self._work += work
+            if problem.clock.elapsed >= self._reported + _REPORT_PERIOD:
+                self._report("going on")
+
+        return StopRule(iterations, problem.cancellation, is_over, watch)
+
+    def _begin(self, phase: SearchPhase) -> None:
+        """Begin a phase and report it."""
+        if phase is not self._phase:
+            self._phase = phase
+            self._report("begun")
+
+    def _report(self, result: str, duration: float = math.inf) -> None:
+        """Report a result; ``duration``, s, is that of a path that may be the best."""
+        self._best = min(self._best, duration)
+        self._reported = elapsed = self._problem.clock.elapsed
+        most = self._problem.options.starts
+        progress = SearchProgress(self.starts, most, self._best, self._phase, elapsed)
+        log_progress(_LOG, progress, f"{self._phase.value}: {result} after {elapsed:.2f} s")
+
+    @contextmanager
+    def _attempt(self) -> Iterator[None]:
+        """Record the reason why there is no manoeuvre, instead of raising an error."""
+        try:
+            yield
+        except UnusableCandidateError as reason:
+            self.rejection = str(reason)
+            self._report(self.rejection)
+        self._problem.cancellation.raise_if_requested()
