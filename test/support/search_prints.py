@@ -17,7 +17,6 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.methods.optimal import initial_guesses
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
@@ -93,13 +92,6 @@ def guesses() -> dict[str, Any]:
     ends = (PossibleEnd(FINAL, TURN), PossibleEnd(-FINAL / 2, np.array([0.6, 0.0, 0.0, 0.8])))
     sequence = source.generate(BoundaryConditions(START, TURN, FINAL, possible_ends=ends), LIMITS)
     found["to two ends"] = [_trajectory(next(sequence)) for _ in range(5)]
-    instants = np.linspace(0.0, 1.0, 31)
-    for name in ("_trigonometric_loop", "_three_frequency_loop", "_square_loop"):
-        loop = getattr(initial_guesses, name)
-        found[name] = [
-            _sums(loop(np.random.default_rng(seed), instants, n))
-            for seed, n in itertools.product((1, 2), (2, 5))
-        ]
     first = next(source.generate(boundary, LIMITS))
     velocity = np.array([0.2, -0.3, 0.5])
     found["moving at the start"] = _trajectory(

@@ -1,18 +1,15 @@
 """Initial guesses for the manoeuvre search: loops on the direct path.
 
 A path that leads directly from one shape to the other is a saddle: to first order, no small path
-change alters the base rotation. So guesses are the direct path with loops, sized such that their
-areas
-times the curvature are about the desired rotation. The loops are taken from the papers, a cycle of
-three frequencies (paper 1, section 5) and a square (paper 3, section III), or are random and
-trigonometric.
+change alters the base rotation. So guesses are the direct path with random loops, sized such that
+their areas times the curvature are about the desired rotation.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import casadi as ca
 import numpy as np
@@ -37,7 +34,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _CANDIDATES_PER_GUESS = 24
-"""Number of random loops of one kind, of which the one closest to the goal becomes the guess."""
+"""Number of random loops, of which the one closest to the goal becomes the guess."""
 
 _MIN_LOOP_SIZE = 0.1
 """Smallest loop size on the path to a possible end, in half ranges, after the first guess."""
@@ -55,9 +52,6 @@ _TURNED_GUESSES = 3
 _BRAKING_TIME_FACTOR = 4.0
 """A joint that moves at the start is back on the path of its guess after this multiple of its
 braking time."""
-
-Loop = Callable[[np.random.Generator, Array, int], Array]
-"""A function for a closed path (N + 1, n) of about unit size at instants (N + 1,) in [0, 1]."""
 
 
 class InitialGuesses:
@@ -102,9 +96,8 @@ class InitialGuesses:
             final, turn = ends[place].shape, ends[place].base_rotation
             # The direct way to an end may be all that it takes, and is no guess twice.
             size = max(sizes[place], _MIN_LOOP_SIZE if boundary.possible_ends and around else 0.0)
-            loop = _LOOPS[around % len(_LOOPS)]
             rounds = [
-                size * rng.uniform(0.3, 1.5) * loop(rng, self._instants, len(half))
+                size * rng.uniform(0.3, 1.5) * _loop(rng, self._instants, len(half))
                 for _ in range(_CANDIDATES_PER_GUESS)
             ]
             shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
@@ -367,8 +360,9 @@ def _interpolate(instants: Array, known: Array, values: Array) -> Array:
     return np.column_stack([np.interp(instants, known, column) for column in values.T])
 
 
-def _trigonometric_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
-    """Random harmonics under an envelope that is zero at both ends."""
+def _loop(rng: np.random.Generator, s: Array, n: int) -> Array:
+    """Return a closed path (N + 1, n) of about unit size at instants (N + 1,) in [0, 1]: random
+    harmonics under an envelope that is zero at both ends."""
     rounds = rng.integers(1, 4)
     path = np.zeros((len(s), n))
     for harmonic in range(rounds, rounds + 3):
@@ -376,41 +370,3 @@ def _trigonometric_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
         a, b = rng.normal(size=(2, n)) / (harmonic - rounds + 1)
         path += a * np.sin(phase) + b * np.cos(phase)
     return np.asarray(path * np.sin(math.pi * s)[:, np.newaxis] ** 2)
-
-
-def _three_frequency_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
-    """A cycle of step 3 of paper 1 with three random joints (two joints, if n = 2)."""
-    phi = 2 * math.pi * s
-    b11, b12, b21, a22, a31 = rng.normal(size=5)
-    cycle = (
-        b11 * (1 - np.cos(phi)) + b12 * (1 - np.cos(2 * phi)) / 2,
-        b21 * (1 - np.cos(phi)) + a22 * (np.sin(2 * phi) / 2 - np.sin(3 * phi) / 3),
-        a31 * (np.sin(phi) - np.sin(3 * phi) / 3),
-    )
-    path = np.zeros((len(s), n))
-    for joint, motion in zip(rng.permutation(n)[:3], cycle, strict=False):
-        path[:, joint] = motion
-    return path
-
-
-def _square_loop(rng: np.random.Generator, s: Array, n: int) -> Array:
-    """A path to a square of two joints, once or twice around it, and back (paper 3)."""
-    path = np.zeros((len(s), n))
-    pair = rng.permutation(n)[:2]
-    corner = rng.uniform(-1, 1, len(pair))
-    side = rng.uniform(0.5, 1.5, len(pair)) * rng.choice([-1.0, 1.0], len(pair))
-    rounds = int(rng.integers(1, 3))
-    legs = np.tile([[0, 0], [1, 0], [1, 1], [0, 1]], (rounds, 1))[:, : len(pair)]
-    knots = np.vstack([np.zeros(len(pair)), corner + side * legs, corner, np.zeros(len(pair))])
-    at = np.linspace(0.0, 1.0, len(knots))
-    for column, joint in enumerate(pair):
-        path[:, joint] = np.interp(s, at, knots[:, column])
-    return path
-
-
-_LOOPS: tuple[Loop, ...] = (
-    _trigonometric_loop,
-    _three_frequency_loop,
-    _trigonometric_loop,
-    _square_loop,
-)
