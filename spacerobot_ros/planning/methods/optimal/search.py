@@ -86,9 +86,6 @@ _COARSE_GRID_RATIO, _MIN_COARSE_INTERVALS = 5, 8
 """Ratio of the full grid to the coarse one, and the smallest number of intervals of that; with
 fewer there is none."""
 
-_MAX_CORRECTION_INTERVALS = 40
-"""Largest number of intervals of corrections, which are short."""
-
 _COARSE_TOLERANCE = 1e-4
 """Tolerance on a coarse grid, whose solutions differ more from later ones."""
 
@@ -268,13 +265,6 @@ class SearchProblem:
         return self.boundary.velocity if self.motion is None else self.motion.velocity
 
     @property
-    def intervals(self) -> int:
-        """Those of the full grid."""
-        is_correction = self.request.correction and self.motion is None
-        most = _MAX_CORRECTION_INTERVALS if is_correction else sys.maxsize
-        return min(self.options.intervals, most)
-
-    @property
     def is_timed(self) -> bool:
         """Whether the end of the motion depends on its duration."""
         return self.boundary.is_timed or self.motion is not None
@@ -440,8 +430,8 @@ class _Search:
             options = replace(problem.options, answers=1, iterations=iterations)
             problem = replace(problem, options=options)
         self._problem = problem
-        self._full = self._coarse = _Grid(problem.intervals)
-        coarse = _Grid(problem.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
+        self._full = self._coarse = _Grid(problem.options.intervals)
+        coarse = _Grid(problem.options.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
         # On a coarse grid the attitude of a base that wheels stop is too far off.
         if coarse.intervals >= _MIN_COARSE_INTERVALS and not self._wheels_stop_base:
             self._coarse = coarse
