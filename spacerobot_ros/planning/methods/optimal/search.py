@@ -123,9 +123,8 @@ _MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
 """Largest number of paths on the way to a clear path, and from there to a fast one: most take a
 few, but a servicer's plan is not found in seven."""
 
-_MIN_LARGEST_LACK, _LACK_PER_DEPTH = 0.1, 2.0
-"""Distance by which links on the way to a clear path may be closer than required, m: a minimum, and
-a multiple of their penetration depth."""
+_LARGEST_LACK = 0.3
+"""Distance by which links on the way to a clear path may be closer than required, m."""
 
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
@@ -720,19 +719,13 @@ class _Search:
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a clear path near to one, in a given duration (s), and its held commands; by
         steps of a share of the largest reach at first. UnusableCandidateError if none was found.
-
-        Planes separate links along a path on which they do not touch. So if a path without contacts
-        leads to one with some, the latter's pairs are kept apart near to the former.
         """
         self._begin(SearchPhase.CLEARING)
         limits, lacks = self._problem.limits, [math.inf, math.inf]
         near, made = kept.approaches_of(path), None
-        is_free = not _touch(near)
         kept.add(near)
         for _ in range(_MAX_CLEARING_ROUNDS):
-            deepest = min((each.distance for each in near), default=0.0)
-            largest_lack = max(_MIN_LARGEST_LACK, -_LACK_PER_DEPTH * deepest)
-            around = Neighbourhood.within(limits, reach, largest_lack)
+            around = Neighbourhood.within(limits, reach, _LARGEST_LACK)
             pairs = kept.pairs
             solution = self._solve_apart(kept, grid, path, duration, around)
             lack = self._lack
@@ -745,13 +738,8 @@ class _Search:
             goes_on = is_new or lack < _NO_LACK or lack <= _PROGRESS_SHARE * lacks[-3]
             if not goes_on or (grid != self._full and self._is_over(found=False)):
                 break
-            if is_free and _touch(near):
-                kept.add(near)
-                if kept.pairs == pairs:
-                    reach /= 2
-                continue
             (kept.widen if lack < _NO_LACK else kept.add)(near)
-            path, is_free = solution, not _touch(near)
+            path = solution
             reach = min(reach, 1.0) / 2 if lack < _NO_LACK else 1.0
         period = None if made is None else self._period
         raise UnusableCandidateError(kept.message(near[0], period))
