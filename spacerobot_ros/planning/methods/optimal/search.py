@@ -138,9 +138,6 @@ _MIN_SHORTENING_ROUNDS = 3
 _NO_LACK = 1e-3
 """Missing distance below which all planes are kept, m."""
 
-_PROGRESS_SHARE = 0.9
-"""Largest ratio of the missing distance to that two paths earlier that counts as progress."""
-
 _MIN_GAIN = 0.01
 """Relative time gain below which a clear path is no longer made faster, at the full reach."""
 
@@ -718,29 +715,21 @@ class _Search:
         self, kept: KeptDistances, grid: _Grid, path: Trajectory, duration: float, reach: float
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a clear path near to one, in a given duration (s), and its held commands; by
-        steps of a share of the largest reach at first. UnusableCandidateError if none was found.
+        steps of a share of the largest reach. UnusableCandidateError if none was found.
         """
         self._begin(SearchPhase.CLEARING)
-        limits, lacks = self._problem.limits, [math.inf, math.inf]
-        near, made = kept.approaches_of(path), None
+        around = Neighbourhood.within(self._problem.limits, reach, _LARGEST_LACK)
+        near = kept.approaches_of(path)
         kept.add(near)
         for _ in range(_MAX_CLEARING_ROUNDS):
-            around = Neighbourhood.within(limits, reach, _LARGEST_LACK)
-            pairs = kept.pairs
-            solution = self._solve_apart(kept, grid, path, duration, around)
+            path = self._solve_apart(kept, grid, path, duration, around)
             lack = self._lack
-            near, made = self._approaches(kept, grid, solution)
+            near, made = self._approaches(kept, grid, path)
             if not near:
-                return solution, made
-            # Pairs that are new may lack more than those before did.
-            is_new = any(each.pair not in pairs for each in near)
-            lacks = [math.inf, math.inf] if is_new else [*lacks, lack]
-            goes_on = is_new or lack < _NO_LACK or lack <= _PROGRESS_SHARE * lacks[-3]
-            if not goes_on or (grid != self._full and self._is_over(found=False)):
+                return path, made
+            if grid != self._full and self._is_over(found=False):
                 break
             (kept.widen if lack < _NO_LACK else kept.add)(near)
-            path = solution
-            reach = min(reach, 1.0) / 2 if lack < _NO_LACK else 1.0
         period = None if made is None else self._period
         raise UnusableCandidateError(kept.message(near[0], period))
 
