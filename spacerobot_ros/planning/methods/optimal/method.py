@@ -14,7 +14,7 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -132,6 +132,14 @@ class _GoalKind:
         return cls(specification, free, ManoeuvreSearch(model))
 
 
+class _Plan(NamedTuple):
+    """Shapes (N + 1, n) at the ticks, notes on the search, and the velocities (n,) kept after."""
+
+    positions: Array
+    notes: Notes
+    final_velocity: Array | float = 0.0
+
+
 class OptimalGait(GaitMethod):
     """Minimum time, or least effort in a given time, from rest to rest.
 
@@ -230,16 +238,9 @@ class OptimalGait(GaitMethod):
             goal = replace(goal, quaternion=state.quaternion, base=base)
         request = replace(request, state=state, goal=goal)
         clock = SearchClock(self.options.time_budget)
-        if not state.linear_momentum.any():
-            return self._plan_about_center(request, cancellation, clock)
-        schedule = self._plan_while_coasting(request, cancellation, clock)
-        velocity: Array | float = self._wheel_rates(state.qdot)
-        if request.motion is not None:
-            velocity = request.motion.velocity
-        end = 0.0 if schedule.end_velocities is None else schedule.end_velocities
-        return self._build_schedule(
-            state, goal, schedule.positions, {**schedule.notes}, velocity, end
-        )
+        coasts = state.linear_momentum.any()
+        of = self._plan_while_coasting if coasts else self._plan_about_center
+        return self._build_schedule(request, of(request, cancellation, clock))
 
     def _wheel_rates(self, qdot: Array | None) -> Array:
         """Return velocities (n,) of the joints with those of wheels alone; none where they rest."""
@@ -304,8 +305,8 @@ class OptimalGait(GaitMethod):
 
     def _plan_while_coasting(
         self, request: PlanRequest, cancellation: Cancellation, clock: SearchClock
-    ) -> GaitSchedule:
-        """Return the schedule of a robot whose centre of mass coasts, in the frame of that.
+    ) -> _Plan:
+        """Plan for a robot whose centre of mass coasts, in the frame of that.
 
         PlanningError if there are obstacles, or no manoeuvre ends when the goal is where it leads.
         """
@@ -327,7 +328,7 @@ class OptimalGait(GaitMethod):
                 "the position with optimal.base_position 2."
             )
 
-        def plan_for_end(end: float, duration: float | None) -> GaitSchedule:
+        def plan_for_end(end: float, duration: float | None) -> _Plan:
             moved = goal.displaced(-velocity * end)
             aimed = replace(in_frame, goal=moved)
             return self._plan_about_center(aimed, cancellation, clock, duration)
@@ -338,10 +339,11 @@ class OptimalGait(GaitMethod):
         refusal, end = "", 0.0
         try:
             for _ in range(_MAX_MOVING_AIMS):
-                schedule = plan_for_end(end, None)
-                if schedule.duration == end:
-                    return schedule
-                end = schedule.duration
+                found = plan_for_end(end, None)
+                takes = (len(found.positions) - 1) * self.control_period
+                if takes == end:
+                    return found
+                end = takes
         except PlanningError as reason:
             refusal = str(reason)
         # The fastest manoeuvre ends too early or too late: one of a given duration does not.
@@ -363,7 +365,7 @@ class OptimalGait(GaitMethod):
         cancellation: Cancellation,
         clock: SearchClock,
         duration: float | None = None,
-    ) -> GaitSchedule:
+    ) -> _Plan:
         """Plan where the centre of mass rests; in a ``duration``, s, or that of the options."""
         state, goal, correction = request.state, request.goal, request.correction
         q, motion, shape = state.q, request.motion, self.goal_shape(goal)
@@ -387,7 +389,7 @@ class OptimalGait(GaitMethod):
             return self._plan_in_motion(task, motion)
         end = boundary.final_velocity
         if self._is_reached(state, goal) and np.allclose(end, boundary.velocity, rtol=_ZERO_ERROR):
-            return self._build_schedule(state, goal, q[np.newaxis], {"starts": 0.0}, 0.0, end)
+            return _Plan(q[np.newaxis], {"starts": 0.0}, end)
         attitude = state.quaternion[np.newaxis]
         try:
             self._constraints.check(q[np.newaxis], attitude, self.control_period)
@@ -397,13 +399,13 @@ class OptimalGait(GaitMethod):
         key = "" if cache is None else self._request_key(request)
         if cache is not None and (kept := cache.load(f"{key[:32]}.npz", key)):
             positions, notes = _unpacked_plan(kept[1])
-            notes = {**notes, "from_cache": 1.0}
-            return self._build_schedule(state, goal, positions, notes, boundary.velocity, end)
+            return _Plan(positions, {**notes, "from_cache": 1.0}, end)
         found = self._plan_from_rest(task, final_is_given=shape is not None or same_shape)
+        plan = self._found(task, found)
         # A result of a busy machine is not cached, as an idle machine finds a better one.
         if cache is not None and self._is_within_efforts(task, found) and not found.cut_short:
-            cache.store(f"{key[:32]}.npz", key, _packed_plan(found.positions, self._notes(found)))
-        return self._schedule(task, found)
+            cache.store(f"{key[:32]}.npz", key, _packed_plan(plan))
+        return plan
 
     def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> Manoeuvre:
         """Return a manoeuvre whose joints rest at the start; see :meth:`_require_enough_time`."""
@@ -437,7 +439,7 @@ class OptimalGait(GaitMethod):
             angular_momentum=R_BW @ state.angular_momentum,
         )
 
-    def _notes(self, found: Manoeuvre) -> Notes:
+    def _found(self, task: SearchProblem, found: Manoeuvre) -> _Plan:
         notes: Notes = {"starts": float(found.starts), "solution_time": found.solution.duration}
         if len(found.coasting):
             notes["coasting_time"] = len(found.coasting) * self.control_period
@@ -446,13 +448,7 @@ class OptimalGait(GaitMethod):
                 f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
                 f"{found.starts} start(s); a larger budget may find a faster manoeuvre."
             )
-        return notes
-
-    def _schedule(self, task: SearchProblem, found: Manoeuvre) -> GaitSchedule:
-        request, notes, after = task.request, self._notes(found), task.boundary.final_velocity
-        return self._build_schedule(
-            request.state, request.goal, found.positions, notes, task.velocity, after
-        )
+        return _Plan(found.positions, notes, task.boundary.final_velocity)
 
     @cached_property
     def _connection_bounds(self) -> ConnectionBounds:
@@ -591,7 +587,7 @@ class OptimalGait(GaitMethod):
         self._constraints.check(coasting, coast.quaternion[:begin], h)
         return replace(self._begin_now(few_failed), coasting=coasting)
 
-    def _plan_in_motion(self, task: SearchProblem, motion: InitialMotion) -> GaitSchedule:
+    def _plan_in_motion(self, task: SearchProblem, motion: InitialMotion) -> _Plan:
         """Plan from moving joints; the remaining previous motion is the first guess."""
         self._require_speeds(motion.velocity)
         again, chosen = task.request.previous is not None, task.options
@@ -609,11 +605,11 @@ class OptimalGait(GaitMethod):
             if again or chosen.duration > 0 or not rests or not motion.velocity.any():
                 raise
             return self._plan_with_braking(task, motion, refusal)
-        return self._schedule(task, found)
+        return self._found(task, found)
 
     def _plan_with_braking(
         self, task: SearchProblem, motion: InitialMotion, refusal: NotFoundError
-    ) -> GaitSchedule:
+    ) -> _Plan:
         """Plan from the shape in which joints that brake as fast as they may come to rest.
 
         Raises
@@ -640,11 +636,9 @@ class OptimalGait(GaitMethod):
         r_WB, attitude = base.position[-1], base.quaternion[-1]
         at_rest = replace(state, position=r_WB, quaternion=attitude, q=braking[-1])
         request = replace(task.request, state=at_rest, motion=None)
-        gait = self._plan_about_center(request, task.cancellation, task.clock)
-        notes: Notes = {**gait.notes, "braking_time": ticks * period}
-        shapes = np.vstack([braking[:-1], gait.positions])
-        after = task.boundary.final_velocity
-        return self._build_schedule(state, request.goal, shapes, notes, motion.velocity, after)
+        plan = self._plan_about_center(request, task.cancellation, task.clock)
+        shapes = np.vstack([braking[:-1], plan.positions])
+        return _Plan(shapes, {**plan.notes, "braking_time": ticks * period})
 
     @property
     def _efforts_are_strict(self) -> bool:
@@ -664,18 +658,18 @@ class OptimalGait(GaitMethod):
         nothing = Tolerance(_ZERO_ERROR, _ZERO_ERROR, _ZERO_ERROR)
         return nothing.admits(error, self._kind_of(goal).specification.controls)
 
-    def _build_schedule(
-        self,
-        state: RobotState,
-        goal: Goal,
-        positions: Array,
-        notes: Notes,
-        velocity: Array | float = 0.0,
-        after: Array | float = 0.0,
-    ) -> GaitSchedule:
-        """Return shapes (N + 1, n) at the ticks as a schedule; the velocities ``velocity`` and
-        ``after`` (n,) are held before and after.
-        """
+    def _build_schedule(self, request: PlanRequest, plan: _Plan) -> GaitSchedule:
+        """Return a plan as a schedule, with notes on its end."""
+        state, goal, positions, after = (
+            request.state,
+            request.goal,
+            plan.positions,
+            np.zeros(self.robot.n),
+        )
+        after[:] = plan.final_velocity
+        before = (
+            self._wheel_rates(state.qdot) if request.motion is None else request.motion.velocity
+        )
         attitudes = self._prediction.attitudes(positions, state.quaternion, state.angular_momentum)
         path = self._prediction.path(state, positions, attitudes)
         L_B: Array | None = None
@@ -688,35 +682,28 @@ class OptimalGait(GaitMethod):
         )
         controls = self._kind_of(goal).specification.controls
         at_end = self._end_notes(goal, positions[-1], true_position, true_end, controls)
-        notes = {**notes, **at_end}
+        notes = {**plan.notes, **at_end}
         if L_B is not None:
             momenta = state.linear_momentum, state.angular_momentum
-            kept = np.broadcast_to(after, self.robot.n).copy()
-            _, omega = self.robot.base_twist(attitudes[-1], positions[-1], kept, *momenta)
+            _, omega = self.robot.base_twist(attitudes[-1], positions[-1], after, *momenta)
             notes["final_base_rate"] = omega.tolist()
-        end_velocities = None
-        if np.any(after):
-            end_velocities = np.broadcast_to(after, self.robot.n).copy()
-            notes["final_wheel_rates"] = end_velocities[self._wheels.index].tolist()
-        notes["limited_by"] = self._list_active_limits(positions, velocity, L_B, after)
+        if after.any():
+            notes["final_wheel_rates"] = after[self._wheels.index].tolist()
+        notes["limited_by"] = self._list_active_limits(positions, before, L_B, after)
         schedule = self.schedule_of(
             goal,
             positions,
             path,
             notes,
             is_clear=True,
-            velocity=velocity,
+            velocity=before,
             L_B=L_B,
-            end_velocities=end_velocities,
+            end_velocities=after if after.any() else None,
         )
         return replace(schedule, controls=controls)
 
     def _list_active_limits(
-        self,
-        positions: Array,
-        velocity: Array | float,
-        L_B: Array | None = None,
-        after: Array | float = 0.0,
+        self, positions: Array, velocity: Array, L_B: Array | None, after: Array
     ) -> str:
         if len(positions) < 2:
             return "nothing"
@@ -768,10 +755,10 @@ def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:
     return "longest", chosen.longest
 
 
-def _packed_plan(positions: Array, notes: Notes) -> bytes:
-    """Return shapes (N + 1, n) at the ticks, and notes, as the content of a file."""
+def _packed_plan(plan: _Plan) -> bytes:
+    """Return a plan as the content of a file."""
     file = io.BytesIO()
-    np.savez(file, positions=positions, notes=json.dumps(notes))
+    np.savez(file, positions=plan.positions, notes=json.dumps(plan.notes))
     return file.getvalue()
 
 
