@@ -8,7 +8,6 @@ from guesses with loops (:mod:`.initial_guesses`), converted to held commands th
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import math
 from contextlib import suppress
@@ -397,14 +396,15 @@ class OptimalGait(GaitMethod):
             raise PlanningError(f"The start violates a path constraint: {reason}.") from None
         cache = None if correction or duration is not None else self._cache
         key = "" if cache is None else self._request_key(request)
-        if cache is not None and (kept := cache.load(f"{key[:32]}.npz", key)):
-            positions, notes = _unpacked_plan(kept[1])
-            return _Plan(positions, {**notes, "from_cache": 1.0}, end)
+        name = f"{key[:32]}.json"
+        if cache is not None and (kept := cache.load(name, key)):
+            positions, notes = json.loads(kept[1])
+            return _Plan(np.array(positions), {**notes, "from_cache": 1.0}, end)
         found = self._plan_from_rest(task, final_is_given=shape is not None or same_shape)
         plan = self._found(task, found)
         # A result of a busy machine is not cached, as an idle machine finds a better one.
         if cache is not None and self._is_within_efforts(task, found) and not found.cut_short:
-            cache.store(f"{key[:32]}.npz", key, _packed_plan(plan))
+            cache.store(name, key, json.dumps([plan.positions.tolist(), plan.notes]).encode())
         return plan
 
     def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> Manoeuvre:
@@ -753,15 +753,3 @@ def _asked_time(chosen: OptimalOptions) -> tuple[str, float]:
     if chosen.duration > 0:
         return "duration", chosen.duration
     return "longest", chosen.longest
-
-
-def _packed_plan(plan: _Plan) -> bytes:
-    """Return a plan as the content of a file."""
-    file = io.BytesIO()
-    np.savez(file, positions=plan.positions, notes=json.dumps(plan.notes))
-    return file.getvalue()
-
-
-def _unpacked_plan(content: bytes) -> tuple[Array, Notes]:
-    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-        return arrays["positions"], json.loads(str(arrays["notes"]))
