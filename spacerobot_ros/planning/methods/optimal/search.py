@@ -144,11 +144,10 @@ largest reach at which paths are no longer made faster."""
 _REACH_FROM_GUESS = 4.0
 """Factor applied to the largest reach from a guess, which is far from the goal."""
 
-_MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION, _CLEAR_ANSWERS = 16, 1, 2
-"""Largest number of guesses whose solutions are searched nearby for clear manoeuvres (in motion,
+_MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION = 16, 1
+"""Largest number of guesses whose solutions are searched nearby for clear manoeuvres: in motion,
 unless the base drifts, only the rest of the motion: from rest, after braking, others are found
-sooner), and the number of clear paths on a coarse grid that ends the search. With 8 guesses, a plan
-for a quadruped took 40 % longer."""
+sooner. With 8 guesses, a plan for a quadruped took 40 % longer."""
 
 _REPORT_PERIOD = 1.0
 """Wall time after which a solver reports that it is still busy, s."""
@@ -602,46 +601,23 @@ class _Search:
         """Return a manoeuvre that keeps clear: the one that was found, if it does; else one near to
         it, or near to other paths; None: none is found.
         """
-        problem = self._problem
         if not kept.approaches(found.held.positions, found.held.quaternions):
             return found
         self._best, self._is_clearing = math.inf, True
-        clear: list[tuple[KeptDistances, Trajectory, float]] = []
-        others = self._other_paths(kept, found.solution, clear)
-        # A motion that is timed is too far off on a coarse grid: joints run on in long intervals.
-        coarsely = problem.hastens and self._coarse != self._full and not problem.is_timed
-        if not coarsely:
+        others = self._other_paths(kept, found.solution)
+        if not self._clears_coarsely:
             others = itertools.islice(others, _MAX_FULL_GRID_STARTS)
-        for number, (path, reach) in enumerate(itertools.chain([(found.solution, 1.0)], others)):
-            apart = kept.anew()
-            if not coarsely:
-                clear.append((apart, path, reach))
-            elif all(path.duration < each.duration for _, each, _ in clear):
-                with self._attempt():
-                    clear.append((apart, self._clear_coarsely(apart, path, reach), 1.0))
-            if number == 0 or not coarsely or len(clear) == _CLEAR_ANSWERS:
-                if (freed := self._finely_cleared(clear)) is not None:
-                    return freed
-                clear.clear()
-        return self._finely_cleared(clear)
-
-    def _finely_cleared(
-        self, clear: list[tuple[KeptDistances, Trajectory, float]]
-    ) -> Manoeuvre | None:
-        """Return a manoeuvre near to the fastest of clear paths on the coarse grid, or to the next;
-        None: none is found.
-        """
-        for each in sorted(clear, key=lambda each: each[1].duration):
+        for path, reach in itertools.chain([(found.solution, 1.0)], others):
             with self._attempt():
-                return self._clear_finely(*each)
+                return self._clear_near(kept.anew(), path, reach)
         return None
 
     def _other_paths(
-        self, kept: KeptDistances, known: Trajectory, found: Sequence[object]
+        self, kept: KeptDistances, known: Trajectory
     ) -> Iterator[tuple[Trajectory, float]]:
         """Yield other paths with the share of the largest reach in which clear ones are looked for:
-        solutions that need not keep clear, from guesses on a coarse grid, then, while nothing is
-        ``found``, guesses that keep clear, but do not end at the goal.
+        solutions that need not keep clear, from guesses on a coarse grid, then guesses that keep
+        clear, but do not end at the goal.
         """
         problem, grid = self._problem, self._coarse
         if problem.boundary.drifts and problem.motion is None:
@@ -654,7 +630,7 @@ class _Search:
         others = itertools.islice(self._guesses(grid), len(self._coarse_solutions), starts)
         solved = (self._solve_start(grid, guess) for guess in others)
         for solution in itertools.chain(self._coarse_solutions[:starts], solved):
-            if self._is_over(found=bool(found)):
+            if self._is_over(found=False):
                 return
             if solution is None:
                 continue
@@ -664,32 +640,30 @@ class _Search:
                 yield solution, 1.0
         few = starts if brakes else problem.options.starts
         for guess in itertools.islice(self._guesses(grid), few):
-            if found or self._is_over(found=False):
+            if self._is_over(found=False):
                 return
             if not kept.approaches_of(guess):
                 yield guess, _REACH_FROM_GUESS
 
-    def _clear_coarsely(self, kept: KeptDistances, path: Trajectory, reach: float) -> Trajectory:
-        """Return a fast path near to another one that keeps clear on the coarse grid;
-        UnusableCandidateError if none was found.
-        """
-        duration = _CLEARING_TIME_FACTOR * path.duration
-        slow, _ = self._clear(kept, self._coarse, path, duration, reach)
-        return self._shorten(kept, self._coarse, slow, None)[0]
+    @property
+    def _clears_coarsely(self) -> bool:
+        # A motion that is timed is too far off on a coarse grid: joints run on in long intervals.
+        problem = self._problem
+        return problem.hastens and self._coarse != self._full and not problem.is_timed
 
-    def _clear_finely(self, kept: KeptDistances, path: Trajectory, reach: float) -> Manoeuvre:
-        """Return a manoeuvre near to a path that keeps clear, by the full grid;
-        UnusableCandidateError if none was found.
-        """
-        options, grid = self._problem.options, self._full
-        duration, made = _CLEARING_TIME_FACTOR * path.duration, None
-        if kept.pairs:
+    def _clear_near(self, kept: KeptDistances, path: Trajectory, reach: float) -> Manoeuvre:
+        """Return a clear manoeuvre near to a path; UnusableCandidateError if none was found."""
+        options, grid, made = self._problem.options, self._full, None
+        duration = _CLEARING_TIME_FACTOR * path.duration
+        if options.duration > 0:
+            duration = self._given_duration
+        if self._clears_coarsely:
+            path, _ = self._clear(kept, self._coarse, path, duration, reach)
+            path, _ = self._shorten(kept, self._coarse, path, None)
             # A path that is clear on the coarse grid mostly is on the full one, as fast.
-            path = path.stretched(_RESAMPLED_TIME_FACTOR)
+            path, reach = path.stretched(_RESAMPLED_TIME_FACTOR), 1.0
             duration = path.duration
             path, made = self._shorten(kept, grid, path, None)
-        elif options.duration > 0:
-            duration = self._given_duration
         if made is None:
             path, made = self._clear(kept, grid, path, duration, reach)
             if options.duration == 0:
@@ -815,11 +789,11 @@ class _Search:
         """Return the fastest solution near a guess, at most ``longest``, s; None: that of least
         effort in the ``shortest`` time.
 
-        ``aim``, ``limits`` are others than the problem's, ``kept`` pairs are apart, ``found``:
+        ``aim`` and ``limits`` are others than the problem's, ``kept`` pairs are apart, ``found``:
         whether there is a manoeuvre. UnusableCandidateError if none was found.
         """
         problem, pairs = self._problem, () if kept is None else kept.pairs
-        aim, limits = aim or problem.boundary, limits or problem.limits
+        limits = limits or problem.limits
         solver = self._solver(grid, problem.boundary, pairs)
         if longest is None:
             guess = guess.stretched(shortest / guess.duration)
@@ -827,7 +801,9 @@ class _Search:
             limits = kept.within(limits, guess, pushing=near.largest_lack > 0)
         stop = self._stop_rule(found=found, work=solver.nonzeros if pairs else 0)
         bounds = DurationBounds(shortest, shortest if longest is None else longest)
-        solution = solver.solve(aim, limits, guess, stop, bounds, near, refining=refining)
+        solution = solver.solve(
+            aim or problem.boundary, limits, guess, stop, bounds, near, refining=refining
+        )
         problem.cancellation.raise_if_requested()
         self._lack = solver.lack
         if solution is None:
