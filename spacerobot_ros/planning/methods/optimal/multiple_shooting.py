@@ -148,8 +148,8 @@ class MultipleShooting:
 
     def __init__(self, stages: Stages, intervals: int, tolerance: float = TOLERANCE) -> None:
         self.intervals = intervals
-        self.iterations, self.converged = 0, False
-        """Number of solver steps for the last solution, and whether the solver converged."""
+        self.converged = False
+        """Whether the solver converged to the last solution."""
         self.lack = 0.0
         """Distance by which links are closer than required in the last solution, m."""
         self.turn = stages.rotation_of_step
@@ -240,7 +240,7 @@ class MultipleShooting:
             ),
         )
         stats = solver.stats()
-        self.iterations, self.converged = int(stats["iter_count"]), bool(stats["success"])
+        self.converged = bool(stats["success"])
         x = result["x"].full().ravel()
         if not self.converged:
             # Where the goal drifts away, no time makes up for what each interval violates.
