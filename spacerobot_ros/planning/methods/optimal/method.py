@@ -570,7 +570,7 @@ class OptimalGait(GaitMethod):
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
         ``end``.
 
-        Its first guess turns the base at zero momentum by the angle that is left there.
+        It begins as long before as a manoeuvre at zero momentum takes from there.
         PlanningError if none was found, UnusableCandidateError if coasting violates a path
         constraint.
         """
@@ -582,7 +582,7 @@ class OptimalGait(GaitMethod):
         takes = len(free.held.positions) - 1
         begin = max(0, end - takes)
         later = self._later(task, coast, begin).within_time(_MAX_DURATION_RATIO * takes * h)
-        few_failed = replace(later, guess=free.solution, max_failed_starts=_STARTS_AFTER_COASTING)
+        few_failed = replace(later, max_failed_starts=_STARTS_AFTER_COASTING)
         coasting = np.tile(task.request.state.q, (begin, 1))
         self._constraints.check(coasting, coast.quaternion[:begin], h)
         return replace(self._begin_now(few_failed), coasting=coasting)

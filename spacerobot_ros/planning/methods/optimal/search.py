@@ -235,8 +235,6 @@ class SearchProblem:
         The options of this search.
     clock, cancellation
         The wall time of the plan, and whether it is cancelled.
-    guess
-        The first guess; None: any.
     max_failed_starts
         Number of guesses without any solution after which the search ends.
     """
@@ -247,7 +245,6 @@ class SearchProblem:
     options: OptimalOptions
     clock: SearchClock
     cancellation: Cancellation = NEVER
-    guess: Trajectory | None = None
     max_failed_starts: int = sys.maxsize
 
     @property
@@ -453,8 +450,6 @@ class _Search:
                 yield source.from_ticks(motion.remaining, velocity, self._period)
             for guess in source.generate(boundary, limits):
                 yield source.with_initial_velocity(guess, velocity, limits)
-        if problem.guess is not None:
-            yield source.resample(problem.guess)
         if len(self._wheels) and len(self._model.axes):
             robot = self._model.robot
             yield from source.generate_with_wheels(self._wheels, boundary, limits, robot)
