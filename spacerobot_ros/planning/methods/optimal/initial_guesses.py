@@ -41,9 +41,6 @@ _MIN_LOOP_SIZE = 0.1
 
 _MAX_RANGE_SHARE = 0.85
 
-_MAX_COASTING_SHARE = 0.6
-"""Largest fraction of a guess during which the joints rest first while the base drifts."""
-
 _LEAST_TURN_TIME, _TURN_STRETCHES = 0.5, tuple(1.15**k for k in range(16))
 """Shortest guess with reaction wheels, s, and the factors by which other guesses are longer."""
 
@@ -101,8 +98,6 @@ class InitialGuesses:
                 for _ in range(_CANDIDATES_PER_GUESS)
             ]
             shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
-            if self._angular_momentum is not None and around % 3 == 1:
-                shapes = self._loops_after_coasting(shapes, rng)
             candidates = self._build_trajectories(shapes, limits)
             # The cosine of half the remaining angle.
             near = np.abs([each.quaternions[-1] @ turn for each in candidates])
@@ -214,17 +209,6 @@ class InitialGuesses:
         late = s**3 * (10 - 15 * s + 6 * s**2)
         added = late * (between + 2 * math.pi * turns * axes)
         return np.asarray(quaternion_multiply(forwards, quaternions_from_rotvecs(added)))
-
-    def _loops_after_coasting(self, shapes: Array, rng: np.random.Generator) -> Array:
-        """Return paths (K, N + 1, n) that begin later: meanwhile the base drifts on."""
-        s = self._instants
-        shares = rng.uniform(0.0, _MAX_COASTING_SHARE, len(shapes))
-        return np.array(
-            [
-                _interpolate(np.clip((s - share) / (1 - share), 0.0, 1.0), s, path)
-                for share, path in zip(shares, shapes, strict=True)
-            ]
-        )
 
     def _direct_path(self, start: Array, final: Array) -> Array:
         s = self._instants
