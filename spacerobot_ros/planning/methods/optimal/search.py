@@ -391,10 +391,6 @@ def _initial_velocity(motion: InitialMotion, limits: MotionLimits, period: float
     return np.clip(between, -limits.velocity, limits.velocity)
 
 
-def _touch(near: Sequence[Approach]) -> bool:
-    return any(each.distance < 0 for each in near)
-
-
 class _Search:
     """One search.
 
@@ -703,7 +699,7 @@ class _Search:
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a faster path near to a clear one, and its held commands; else that one itself."""
         self._begin(SearchPhase.SHORTENING)
-        reach, limits, begin = 1.0, self._problem.limits, path
+        reach, limits = 1.0, self._problem.limits
         for number in range(_MAX_SHORTENING_ROUNDS):
             self._report("clear path", path.duration)
             is_over = number >= _MIN_SHORTENING_ROUNDS and self._is_over(found=True)
@@ -711,17 +707,13 @@ class _Search:
                 break
             try:
                 around = Neighbourhood.within(limits, reach)
-                faster = self._solve_apart(kept, grid, begin, None, around)
+                faster = self._solve_apart(kept, grid, path, None, around)
                 near, found = self._approaches(kept, grid, faster)
             except UnusableCandidateError:
-                reach, begin = reach / _REACH_DIVISOR, path
+                reach /= _REACH_DIVISOR
                 continue
             if near:
-                # Planes between links that do not touch lead to a clear path nearby.
-                begin = path if _touch(near) else faster
-                # A pair that is new has no planes yet.
-                if all(each.pair in kept.pairs for each in near):
-                    reach /= _REACH_DIVISOR
+                reach /= _REACH_DIVISOR
                 kept.add(near)
                 if made is None and grid == self._full:
                     # It is no path that is clear by its held commands, either.
@@ -732,7 +724,6 @@ class _Search:
                 path, made = faster, found
             if gain < _MIN_GAIN * reach:
                 break
-            begin = path
             reach = min(_REACH_FACTOR * reach, 1.0)
         return path, made
 
