@@ -11,7 +11,6 @@ from spacerobot_ros.batch.flights import (
     SensorErrors,
 )
 from spacerobot_ros.batch.lanes import fly_lanes
-from spacerobot_ros.batch.scalar import fly_one_by_one
 from spacerobot_ros.batch.stepping import SteppedFlights
 from spacerobot_ros.control.goal_monitor import Decision
 
@@ -27,5 +26,4 @@ __all__ = [
     "SensorErrors",
     "SteppedFlights",
     "fly_lanes",
-    "fly_one_by_one",
 ]

@@ -10,7 +10,7 @@ import numpy as np
 
 from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.control.controller import CoordinatedController, build_controller
-from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
+from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.goals import require_controlled_axes
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.reference import (
@@ -101,30 +101,6 @@ class BatchController:
     def time_of_tick(self, tick: int) -> float:
         """Return a tick's time as computed by controllers, s."""
         return tick * self._period_ns / SECOND
-
-    def command(self, tick: int, state: ControlState) -> list[Array]:
-        """Return the efforts and wrench for a state of the last started flight."""
-        time = self.time_of_tick(tick)
-        realised = self.controller.command(time, state, state.q, state.qdot).realised
-        return [realised.tau, realised.wrench_B]
-
-    def decide(self, monitor: GoalMonitor, tick: int, qdot: Array, bounds: Array) -> Decision:
-        """Return the goal decision after the last command.
-
-        ``qdot`` (n,) are measured joint rates, ``bounds`` (m,) as in :meth:`begin_flight`.
-        """
-        controller, time = self.controller, self.time_of_tick(tick)
-        assert controller.reference_ends is not None
-        found = monitor.decide(
-            time,
-            controller.reference_at_rest(time),
-            controller.reference_ends,
-            controller.errors(),
-            controller.joint_rate_limits.largest_rate_share(qdot),
-            self.law.largest_error_share(bounds),
-            self._config,
-        )
-        return Decision(int(found))
 
     # -- lanes --------------------------------------------------------------------------------
 

@@ -390,6 +390,29 @@ def state_parts(states: Array, n: int) -> dict[str, Array]:
     return dict(zip(names, np.split(states, ends, axis=-1), strict=False))
 
 
+def plant_of(flights: Flights, row: int) -> Plant:
+    """Return the plant of one flight in its start state.
+
+    Raises
+    ------
+    SpaceRobotError
+        The plant rejects the start state.
+    """
+    kind = PLANTS[flights.actuation]
+    return kind.plant(
+        flights.robot_of(row),
+        flights.control_period,
+        flights.initial_states.initial_state(row),
+        flights.integration_step or kind.integration_step,
+    )
+
+
+def split_command(flights: Flights, command: Array) -> list[Array]:
+    """Return a command as arguments of a plant's step."""
+    n = flights.robot.n
+    return [command] if flights.actuation == "velocity" else [command[:n], command[n:]]
+
+
 def state_of(plant: Plant) -> Array:
     """Return the state (2 n + 20,) of a plant."""
     return np.concatenate([plant.q, plant.qdot, plant.pose, plant.twist, plant.momentum])

@@ -22,15 +22,14 @@ from spacerobot_ros.batch.flights import (
     FollowedSchedule,
     HeldCommands,
     SensorErrors,
+    plant_of,
 )
 from spacerobot_ros.batch.native import CompiledTick, Job, Program
-from spacerobot_ros.batch.scalar import fly_one_by_one
 from spacerobot_ros.batch.targets import Target, vector_unit
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.compilation import NoLibraryError
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import ModelFunctions
@@ -55,23 +54,26 @@ def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
     """Fly many flights at once, one per SIMD lane or device thread.
 
     Every flight equals the plant's flight with the same values up to rounding (1e-12 in the
-    benchmark flights). Without a C++ compiler, the plant flies the flights one by one;
-    :attr:`BatchResult.engine` names the engine used.
+    benchmark flights).
+
+    Raises
+    ------
+    SpaceRobotError
+        There is no C++ compiler, or lanes do not support the controller.
     """
-    try:
-        return _fly_all_in_lanes(flights, target or vector_unit())
-    except NoLibraryError as reason:
-        warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
-        return fly_one_by_one(flights)
-
-
-def _fly_all_in_lanes(flights: Flights, target: Target) -> BatchResult:
-    """Fly on a target; NoLibraryError if the tick cannot be compiled for it here."""
+    target = target or vector_unit()
     model, p = symbolic_model_of(flights)
-    tick = CompiledTick.of(flights, model, target)
+    try:
+        tick = CompiledTick.of(flights, model, target)
+    except NoLibraryError as reason:
+        raise SpaceRobotError(f"Lanes need a C++ compiler: {reason}.") from reason
     fit = starts_accepted_by_plant(flights)
-    # The scalar plant gives the message about each irregular start.
-    result = replace(fly_one_by_one(flights, np.flatnonzero(~fit)), engine=target.engine)
+    result = replace(BatchResult.empty(flights), engine=target.engine)
+    for row in np.flatnonzero(~fit).tolist():
+        try:
+            plant_of(flights, row)
+        except SpaceRobotError as error:
+            result.failures[row] = str(error)
     rows = np.flatnonzero(fit)
     size = _block_size(flights, tick)
     for first in range(0, len(rows), size):
@@ -95,7 +97,7 @@ def starts_accepted_by_plant(flights: Flights) -> Flags:
     fit &= ((starts.q >= robot.lower) & (starts.q <= robot.upper)).all(axis=1)
     with np.errstate(invalid="ignore"):
         size = np.linalg.norm(starts.quaternion, axis=1)
-        return np.asarray(fit & np.isfinite(size) & (size > 1e-3) & (size < 1e3))
+        return np.asarray(fit & np.isfinite(size) & (size > 1e-6))
 
 
 def _block_size(flights: Flights, tick: CompiledTick) -> int:

@@ -21,13 +21,14 @@ from spacerobot_ros.batch.flights import (
     HeldCommands,
     InitialStates,
     assign_rows,
+    plant_of,
+    split_command,
     state_of,
     state_parts,
     state_size,
 )
 from spacerobot_ros.batch.lanes import LaneBlock, starts_accepted_by_plant, symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick, Program
-from spacerobot_ros.batch.scalar import plant_of, split_command
 from spacerobot_ros.batch.targets import Target, vector_unit
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.files import warn_once

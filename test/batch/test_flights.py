@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.plant_flights import fly_one_by_one
 from support.targets import needs_compiler, on_targets, target_named
 
 from spacerobot_ros.batch import (
@@ -19,7 +20,6 @@ from spacerobot_ros.batch import (
     InitialStates,
     SensorErrors,
     SteppedFlights,
-    fly_one_by_one,
 )
 from spacerobot_ros.batch.flights import NOISES
 from spacerobot_ros.batch.targets import Target

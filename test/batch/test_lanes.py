@@ -1,4 +1,4 @@
-"""Flights in lanes are those of the plant, and where there are no lanes the plant flies them."""
+"""Flights in lanes are those of the plant."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.plant_flights import command_of, decide, fly_one_by_one
 from support.slow import some_fast
 from support.targets import needs_compiler, on_targets, target_named
 
@@ -24,7 +25,6 @@ from spacerobot_ros.batch import (
     SensorErrors,
     SteppedFlights,
     fly_lanes,
-    fly_one_by_one,
     targets,
 )
 from spacerobot_ros.batch.controlling import BatchController
@@ -34,7 +34,7 @@ from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.state import ControlState
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import (
     InertialParameters,
     SpaceRobot,
@@ -188,15 +188,13 @@ def test_a_flight_that_fails_says_why_and_leaves_its_neighbours_alone(
     np.testing.assert_array_equal(here.pose[others], alone.pose[others])
 
 
-def test_without_a_compiler_the_plant_flies_them(
+def test_without_a_compiler_lanes_say_so(
     robots: dict[str, SpaceRobot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flights = velocity_flights(robots["sliding_masses"], 2, each=False, deadband=0.0)
-    there = fly_one_by_one(flights)
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    here = fly_lanes(flights)
-    assert here.engine == "scalar"
-    np.testing.assert_array_equal(here.pose, there.pose)
+    with pytest.raises(SpaceRobotError, match=r"^Lanes need a C\+\+ compiler: .*\.$"):
+        fly_lanes(flights)
 
 
 def test_the_widest_registers_that_there_are_are_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -450,13 +448,13 @@ def test_the_function_of_lanes_is_the_controller_and_its_monitor(
         wanted = np.zeros(17)
         measured.stack(wanted)
         np.testing.assert_allclose(seen, wanted, rtol=1e-12, atol=1e-15)
-        expected = np.concatenate(control.command(tick, measured))
+        expected = np.concatenate(command_of(control, tick, measured))
         if not exact[0]:
             np.testing.assert_allclose(command, expected, rtol=1e-9, atol=1e-9)
         assert bool(exact[0]) <= (size > 1.0)
         saturated = control.exact_command(1, profile, tick, measured)
         np.testing.assert_allclose(saturated, expected)
-        decision = control.decide(monitor, tick, measured.qdot, bounds)
+        decision = decide(control, monitor, tick, measured.qdot, bounds)
         decisions.append(decision)
         assert verdict[0] == decision
         memory = after

@@ -1,9 +1,9 @@
-"""Flights flown one by one in the package's plant: the reference for SIMD lanes."""
+"""Flights of a batch flown one by one in the plant: the reference for SIMD lanes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple, replace
+from collections.abc import Callable, Sequence
+from dataclasses import astuple
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from spacerobot_ros.batch.flights import (
     Flights,
     FollowedSchedule,
     HeldCommands,
+    plant_of,
+    split_command,
     state_of,
 )
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
@@ -24,7 +26,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower
-from spacerobot_ros.simulation.actuators import PLANTS, PlantWithFaults
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
@@ -34,14 +36,11 @@ _Commands = Callable[[int, Plant | Sensors], Sequence[Array]]
 """Function from a tick and a measured state to a flight's commands."""
 
 
-def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> BatchResult:
-    """Fly the flights in some rows (by default all) in the plant, tick by tick.
-
-    The other rows are NaN or zero.
-    """
-    result = replace(BatchResult.empty(flights), engine="scalar")
+def fly_one_by_one(flights: Flights) -> BatchResult:
+    """Fly the flights in the plant, tick by tick."""
+    result = BatchResult.empty(flights)
     controller: BatchController | None = None
-    for row in range(len(flights)) if rows is None else map(int, rows):
+    for row in range(len(flights)):
         try:
             if controller is None and isinstance(flights.program, ControlledGoals):
                 controller = BatchController.of(flights)
@@ -49,23 +48,6 @@ def fly_one_by_one(flights: Flights, rows: Iterable[int] | None = None) -> Batch
         except SpaceRobotError as error:
             result.failures[row] = str(error)
     return result
-
-
-def plant_of(flights: Flights, row: int) -> Plant:
-    """Return the plant of one flight in its start state."""
-    kind = PLANTS[flights.actuation]
-    return kind.plant(
-        flights.robot_of(row),
-        flights.control_period,
-        flights.initial_states.initial_state(row),
-        flights.integration_step or kind.integration_step,
-    )
-
-
-def split_command(flights: Flights, command: Array) -> list[Array]:
-    """Return a command as arguments of a plant's step."""
-    n = flights.robot.n
-    return [command] if flights.actuation == "velocity" else [command[:n], command[n:]]
 
 
 def _fly_row(
@@ -152,8 +134,8 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
         if tick == 0:
             profile, bounds = controller.begin_flight(row, state)
             goal = profile.goal
-        commands = controller.command(tick, state)
-        decision = controller.decide(monitor, tick, state.qdot, bounds)
+        commands = command_of(controller, tick, state)
+        decision = decide(controller, monitor, tick, state.qdot, bounds)
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
             result.decision[row], result.decision_tick[row] = decision, tick
             result.decision_distance[row] = astuple(
@@ -162,6 +144,31 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
         return commands
 
     return command
+
+
+def command_of(control: BatchController, tick: int, state: ControlState) -> list[Array]:
+    """Return the efforts and wrench for a state of the last started flight."""
+    time = control.time_of_tick(tick)
+    realised = control.controller.command(time, state, state.q, state.qdot).realised
+    return [realised.tau, realised.wrench_B]
+
+
+def decide(
+    control: BatchController, monitor: GoalMonitor, tick: int, qdot: Array, bounds: Array
+) -> Decision:
+    """Return the goal decision after the last command, for measured joint rates (n,)."""
+    controller, time = control.controller, control.time_of_tick(tick)
+    assert controller.reference_ends is not None
+    found = monitor.decide(
+        time,
+        controller.reference_at_rest(time),
+        controller.reference_ends,
+        controller.errors(),
+        controller.joint_rate_limits.largest_rate_share(qdot),
+        control.law.largest_error_share(bounds),
+        control.program.config.for_robot(control.law.robot.description),
+    )
+    return Decision(int(found))
 
 
 def _update_peaks(
