@@ -1,4 +1,4 @@
-"""Campaign workers: local processes connected by pipes, or a dask.distributed cluster.
+"""Campaign workers: local processes, or a dask.distributed cluster.
 
 :meth:`TaskDistributor.rows` distributes the draws in tasks of about :data:`TARGET_TASK_TIME`, and
 yields the rows as tasks finish.
@@ -13,15 +13,21 @@ import os
 import pickle
 import signal
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import CancelledError
-from contextlib import contextmanager, suppress
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -42,9 +48,6 @@ TARGET_TASK_TIME = 2.0
 _MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
 """Smallest number of flights in the first tasks, and largest number in any task."""
 
-_MAX_WORKER_DEATHS = 2
-"""Number of worker deaths after which a flight is reported as killed and not repeated."""
-
 _PACKAGE_NAME = "spacerobot_ros"
 
 _POLL_PERIOD = 0.2
@@ -54,6 +57,8 @@ _NO_WORKER_WARNING_DELAY = 5.0
 """Wall time without workers after which a warning is printed, s."""
 
 _THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+_Task = Future[list[Row | Fallback]]
 
 KILLED = "killed"
 """Outcome of a flight during which a worker died twice."""
@@ -133,43 +138,9 @@ class WorkerDeath(Exception):  # noqa: N818
     """A worker died during a task."""
 
 
-class _LocalWorker:
-    """A process that flies one task at a time, and takes its arguments from a pipe."""
-
-    def __init__(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, other = context.Pipe()
-        self.process = context.Process(target=_run_worker, args=(other,), daemon=True)
-        self.busy = False
-        # Compilers and linear algebra of several workers would compete for the cores.
-        before = {name: os.environ.get(name) for name in _THREAD_COUNT_VARIABLES}
-        os.environ.update(dict.fromkeys(_THREAD_COUNT_VARIABLES, "1"))
-        # A worker never takes the Ctrl-C of a terminal: this process ends it. The resource tracker
-        # would unblock the signal when it starts.
-        resource_tracker.ensure_running()
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            self.process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-            for name, value in before.items():
-                os.environ.pop(name)
-                if value is not None:
-                    os.environ[name] = value
-            other.close()
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.join()
-        self.connection.close()
-
-
 class LocalWorkers:
-    """Processes on this machine, each connected by an anonymous pipe that no other process can
+    """Processes on this machine, each connected by anonymous pipes that no other process can
     access.
-
-    Each worker has one task at a time, so a worker's death has one cause; a busy worker represents
-    its task.
 
     Parameters
     ----------
@@ -180,61 +151,68 @@ class LocalWorkers:
     tasks_per_worker = 1
 
     def __init__(self, count: int) -> None:
-        self._workers = [_LocalWorker() for _ in range(count)]
+        self._count = count
+        self._others = set(multiprocessing.active_children())
+        self._pool = self._make_pool()
+
+    def _make_pool(self) -> ProcessPoolExecutor:
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(self._count, context, _end_with_campaign)
 
     def count(self) -> int:
         """Return the number of workers."""
-        return len(self._workers)
+        return self._count
 
-    def submit(self, *arguments: Any) -> _LocalWorker:
-        """Start a task in an idle worker; the arguments are those of :func:`fly_task`."""
-        place = next(place for place, worker in enumerate(self._workers) if not worker.busy)
-        if not self._workers[place].process.is_alive():
-            self._workers[place].close()
-            self._workers[place] = _LocalWorker()
-        worker = self._workers[place]
-        worker.busy = True
-        with suppress(OSError):  # It has died since: the end of its pipe says so.
-            worker.connection.send(arguments)
-        return worker
+    def submit(self, *arguments: Any) -> _Task:
+        """Queue a task; the arguments are those of :func:`fly_task`."""
+        with _settings_of_workers():
+            try:
+                return self._pool.submit(fly_task, *arguments)
+            except BrokenProcessPool:
+                self._pool = self._make_pool()
+                return self._pool.submit(fly_task, *arguments)
 
-    def ended(self, tasks: list[_LocalWorker]) -> list[_LocalWorker]:
+    def ended(self, tasks: list[_Task]) -> list[_Task]:
         """Return the finished tasks, or an empty list if none finishes for a while."""
-        ready = wait([worker.connection for worker in tasks], timeout=_POLL_PERIOD)
-        return [worker for worker in tasks if worker.connection in ready]
+        return list(wait(tasks, _POLL_PERIOD, FIRST_COMPLETED).done)
 
-    def result(self, task: _LocalWorker) -> list[Row | Fallback]:
+    def result(self, task: _Task) -> list[Row | Fallback]:
         """Return the result of a finished task, or raise its exception."""
-        task.busy = False
         try:
-            answer: list[Row | Fallback] | Exception = task.connection.recv()
-        except (EOFError, OSError):
-            task.process.join()
-            raise WorkerDeath from None
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+            return task.result()
+        except BrokenProcessPool as error:
+            raise WorkerDeath from error
 
-    def cancel(self, tasks: list[_LocalWorker]) -> None:
+    def cancel(self, tasks: list[_Task]) -> None:
         """Stop tasks; :meth:`close` terminates the processes."""
 
     def close(self) -> None:
         """End the processes."""
-        for worker in self._workers:
-            worker.close()
+        for process in set(multiprocessing.active_children()) - self._others:
+            process.kill()
+        self._pool.shutdown(cancel_futures=True)
 
 
-def _run_worker(connection: Connection) -> None:
-    """Fly the tasks that come through a pipe until it is closed."""
+@contextmanager
+def _settings_of_workers() -> Iterator[None]:
+    """Let processes that start now have one thread, and no Ctrl-C, after which they are ended."""
+    before = os.environ.copy()
+    os.environ.update(dict.fromkeys(_THREAD_COUNT_VARIABLES, "1"))
+    # The resource tracker would unblock the signal when it starts.
+    resource_tracker.ensure_running()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        for name in _THREAD_COUNT_VARIABLES:
+            os.environ.pop(name)
+            if name in before:
+                os.environ[name] = before[name]
+
+
+def _end_with_campaign() -> None:
     Thread(target=end_with_parent, daemon=True).start()
-    with suppress(EOFError, OSError):
-        while True:
-            arguments = connection.recv()
-            try:
-                answer: list[Row | Fallback] | Exception = fly_task(*arguments)
-            except Exception as error:  # The parent process raises it again.
-                answer = error
-            connection.send(answer)
 
 
 class DaskWorkers:
@@ -412,9 +390,8 @@ class TaskDistributor:
 
     An engine's fallbacks are redistributed to engine ``flights``, in tasks with fewer flights.
 
-    If a worker dies, each flight in its task is repeated in a separate task, one such task at a
-    time. If a worker dies again, the flight has killed two workers and is reported. (A dask
-    scheduler reports all tasks of a dead worker, not only the running one.)
+    If a worker dies, each flight in the tasks that it takes along is repeated alone, with nothing
+    beside it. If a worker dies again, that flight has killed it and is reported.
 
     Parameters
     ----------
@@ -447,7 +424,6 @@ class TaskDistributor:
         self._running: dict[Any, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
         """Draws in tasks whose worker has died."""
-        self._deaths: Counter[int] = Counter()
 
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
         """Yield the rows of draws as their tasks finish, and empty lists in between."""
@@ -467,10 +443,10 @@ class TaskDistributor:
     def _submit_tasks(self, waiting: deque[int]) -> None:
         workers = self._workers.count()
         most = workers * self._workers.tasks_per_worker
-        alone = any(task.runs_alone for task in self._running.values())
-        if self._retry_alone and not alone and len(self._running) < most:
+        if self._retry_alone and not self._running:
             self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
-        while (self._fallbacks or waiting) and len(self._running) < most:
+        alone = self._retry_alone or any(task.runs_alone for task in self._running.values())
+        while not alone and (self._fallbacks or waiting) and len(self._running) < most:
             queue, engine = (
                 (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
             )
@@ -509,14 +485,9 @@ class TaskDistributor:
         ]
 
     def _on_worker_death(self, task: _SubmittedTask) -> list[Row]:
-        """Have the flights of a task flown again alone; return rows of those that died twice."""
-        given_up = []
-        for number in task.numbers:
-            if task.runs_alone or not self._deaths[number]:
-                self._deaths[number] += 1
-            if self._deaths[number] >= _MAX_WORKER_DEATHS:
-                reason = f"Its process died {_MAX_WORKER_DEATHS} times."
-                given_up.append(Row(self._draws[number], KILLED, reason, engine=self._engine))
-            else:
-                self._retry_alone.append(number)
-        return given_up
+        """Have the flights of a task flown again alone; return the row of one that was alone."""
+        if not task.runs_alone:
+            self._retry_alone += task.numbers
+            return []
+        draw = self._draws[task.numbers[0]]
+        return [Row(draw, KILLED, "Its process died 2 times.", engine=self._engine)]
