@@ -43,7 +43,6 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.files import irregular_kind
 
 RecordT = TypeVar("RecordT", bound=McapRecord)
 
@@ -82,12 +81,6 @@ DAMAGE_ERRORS = (
 # -- files ------------------------------------------------------------------------------------
 
 
-def require_regular(mode: int, path: Path, action: str = "read") -> None:
-    """Raise RecordingError unless a file is regular: pipes block, and devices may be damaged."""
-    if kind := irregular_kind(mode):
-        raise RecordingError(f"Cannot {action} the bag {path}: it is {kind}.")
-
-
 @contextmanager
 def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
     """Open a bag for reading, or the temporary file with its unpacked content.
@@ -95,13 +88,11 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
     Raises
     ------
     RecordingError
-        There is no such file, or it is not regular or cannot be read, or a damaged record is found
-        within the context.
+        There is no such file, or it cannot be read, or a damaged record is found within the
+        context.
     """
-    content = content or path
     try:
-        require_regular(os.stat(content).st_mode, path)
-        with content.open("rb") as file:
+        with (content or path).open("rb") as file:
             yield file
     except FileNotFoundError as error:
         raise RecordingError(f"There is no bag at {path}.") from error

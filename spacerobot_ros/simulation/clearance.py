@@ -5,7 +5,6 @@ An exact plant has no contact forces: it moves through contacts and reports them
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -21,13 +20,10 @@ from spacerobot_ros.events import (
     KeyValueFormat,
     number_format,
 )
-from spacerobot_ros.files import warn_first_time
-from spacerobot_ros.model.compilation import cache_directory
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import relative_pose
 from spacerobot_ros.simulation.capture import CapturePlant
-
-_LOG = logging.getLogger(__name__)
 
 _OK, _ERROR = 0, 2
 
@@ -142,12 +138,7 @@ class ClearanceMonitor:
         if not len(geometry.pairs):
             return None
         if not geometry.exact:
-            warn_first_time(
-                _LOG,
-                cache_directory(),
-                "warned_of_clearance",
-                "The plant cannot measure clearance without the package coal.",
-            )
+            warn_once("The plant cannot measure clearance without the package coal.")
             return None
         monitor = cls(geometry, links, has_contact_forces=has_contact_forces)
         if before is not None:
