@@ -19,19 +19,12 @@ from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.model import SpaceRobot
-    from spacerobot_ros.model.description import RobotDescription
     from spacerobot_ros.planning.analysis import Analysis
     from spacerobot_ros.planning.core.controllability import Controllability
 
 _MAX_LISTED_JOINTS = 12
 """Maximum number of listed joints; further joints are only counted."""
 
-
-_MAX_PLAUSIBLE_RADIANS = 20.0
-"""Joint limit beyond which it is probably in degrees."""
-
-_MAX_PLAUSIBLE_SPEED = 25.0
-"""Joint speed, rad/s, beyond which it is probably in degrees; fast legs reach 21."""
 
 _MAX_LISTED_DISTANCES = 3
 
@@ -72,7 +65,7 @@ def analyze_command(
 
     model = SpaceRobot.from_file(robot_file(robot))
     found = analyze(model, None if shape is None else _parse_shape(shape), end_effector)
-    for line in (*analysis_lines(found), "", *workspace_lines(found)):
+    for line in (*analysis_lines(found), *_notes(model), "", *workspace_lines(found)):
         click.echo(line)
     if json_file is not None:
         write_json(json_file, analysis_json(found))
@@ -110,14 +103,19 @@ def analysis_lines(found: Analysis) -> list[str]:
     base = robot.description.bodies[0].inertia.mass
     n, name = robot.n, robot.description.name
     lines = [f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which the base {base:.6g} kg"]
-    lines += [*_joint_rows(robot), *_degree_warnings(robot.description)]
-    lines += ["", *_rotation_lines(found)]
+    lines += [*_joint_rows(robot), "", *_rotation_lines(found)]
     lines += [f"{'position':<13}{_position_text(found)}", ""]
     for method, objection in found.objections.items():
         suits = "yes" if METHODS[method].plans_for_base else "yes, for end-effectors"
         lines.append(f"{method:<15}{'no: ' + objection if objection else suits}")
     lines.append(f"{'auto':<15}{found.chosen or 'no method suits this robot'}")
     return [*lines, "", *_distance_lines(found)]
+
+
+def _notes(robot: SpaceRobot) -> list[str]:
+    from spacerobot_ros.session.own_robot import urdf_remarks
+
+    return [f"{'note':<13}{remark}" for remark in urdf_remarks(robot.description)]
 
 
 def workspace_lines(found: Analysis) -> list[str]:
@@ -245,44 +243,6 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
     return rows
 
 
-def _degree_warnings(robot: RobotDescription) -> list[str]:
-    turning = [each for each in robot.movable_joints if each.unit == "rad"]
-    wide = [
-        joint.name
-        for joint in turning
-        if _is_beyond(_MAX_PLAUSIBLE_RADIANS, joint.limits.lower, joint.limits.upper)
-    ]
-    fast = [
-        joint.name
-        for joint in turning
-        if joint.name not in robot.wheel_names
-        and _is_beyond(_MAX_PLAUSIBLE_SPEED, joint.limits.velocity)
-    ]
-    warnings = []
-    if wide:
-        warnings.append(
-            f"warning: the limits of {_listed(wide)} are beyond {_MAX_PLAUSIBLE_RADIANS:g} rad, "
-            "several revolutions. URDF limits are in radians: if these are degrees, divide them by "
-            "57.2958."
-        )
-    if fast:
-        warnings.append(
-            f"warning: the speed of {_listed(fast)} is beyond {_MAX_PLAUSIBLE_SPEED:g} rad/s, "
-            "about four revolutions per second. URDF speeds are in rad/s: if it is in deg/s, "
-            "divide it by "
-            "57.2958."
-        )
-    return warnings
-
-
-def _is_beyond(most: float, *limits: float) -> bool:
-    return any(math.isfinite(limit) and abs(limit) > most for limit in limits)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names[:_MAX_LISTED_JOINTS])
-
-
 def _rotation_lines(found: Analysis) -> list[str]:
     lines = [f"{'rotation':<13}{found.anywhere.message}"]
     if found.planar.controllable:
@@ -378,7 +338,6 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
         first_problem,
         scenario_text,
         thruster_scenario_text,
-        urdf_remarks,
     )
 
     file = robot_file(robot)
@@ -395,10 +354,8 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     model = SpaceRobot.from_file(file)
     with display(name):
         known = analyze(model)
-    for line in analysis_lines(known):
+    for line in (*analysis_lines(known), *_notes(model)):
         click.echo(line)
-    for remark in urdf_remarks(model.description):
-        click.echo(f"{'note':<13}{remark}")
     click.echo()
     # A robot file beside its scenario is found from any working folder.
     from_there = os.path.relpath(file.resolve(), target.resolve().parent)

@@ -67,7 +67,7 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
         )
     found: dict[int, list[str]] = {}
     for joint in robot.movable_joints:
-        for kind, remark in _joint_remarks(joint):
+        for kind, remark in _joint_remarks(joint, is_wheel=joint.name in robot.wheel_names):
             found.setdefault(kind, []).append(remark)
     for _, remarks in sorted(found.items()):
         yield remarks[0] + _other_joints_clause(len(remarks) - 1)
@@ -85,7 +85,7 @@ def _other_joints_clause(count: int) -> str:
     return f" The same holds for {count} other joint{'s' if count > 1 else ''}."
 
 
-def _joint_remarks(joint: Joint) -> Iterator[tuple[int, str]]:
+def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]:
     """Yield notes on the limits of a joint, each with a number for its kind."""
     limits, unit, speed = joint.limits, joint.unit, joint.limits.velocity
     if speed == 0:
@@ -101,7 +101,7 @@ def _joint_remarks(joint: Joint) -> Iterator[tuple[int, str]]:
             f'<limit velocity="..." effort="..."/> in {unit}/s and '
             f"{'N' if unit == 'm' else 'N m'}.",
         )
-    elif not _LEAST_USUAL_SPEED <= speed <= _LARGEST_USUAL_SPEED:
+    elif not (is_wheel or _LEAST_USUAL_SPEED <= speed <= _LARGEST_USUAL_SPEED):
         yield (
             2,
             f"The joint '{joint.name}' moves at up to {speed:.4g} {unit}/s: check the unit of "

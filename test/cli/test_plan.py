@@ -17,7 +17,6 @@ from spacerobot_ros import fly, load_scenario
 from spacerobot_ros import plan as python_plan
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.robots import (
-    _degree_warnings,
     _joint_rows,
     analysis_json,
     analysis_lines,
@@ -270,27 +269,6 @@ def test_limits_of_turning_joints_are_also_in_degrees() -> None:
     assert "-1.5 .. 0.25 rad" in turns
     assert turns.endswith(" kg  -85.94 .. 14.32 deg  28.6 deg/s")
     assert slides.endswith(" 2 kg")
-    assert _degree_warnings(robot.description) == []
-
-
-def test_limits_that_look_like_degrees_are_pointed_out() -> None:
-    robot = jointed(
-        'lower="-1" upper="90" velocity="0.5" effort="3"',
-        'lower="-19" upper="19.9" velocity="0.5" effort="3"',
-        'lower="-20.1" upper="1" velocity="0.5" effort="3"',
-    )
-    assert _degree_warnings(robot.description) == [
-        "warning: the limits of 'joint_0', 'joint_2' are beyond 20 rad, several revolutions. URDF "
-        "limits are in radians: if these are degrees, divide them by 57.2958."
-    ]
-    fast = jointed(
-        'lower="-1" upper="1" velocity="30" effort="3"',
-        'lower="-1" upper="1" velocity="24" effort="3"',
-    )
-    (warning,) = _degree_warnings(fast.description)
-    assert warning.startswith("warning: the speed of 'joint_0' is beyond 25 rad/s, about four rev")
-    # Reaction wheels turn faster.
-    assert _degree_warnings(SpaceRobot.from_file(robot_file("tender")).description) == []
 
 
 def test_masses_and_limits_are_those_of_the_urdf() -> None:
