@@ -2,7 +2,7 @@
 
 from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic
-from spacerobot_ros.bag.reader import Bag, RecordedRobot, iterate_raw, read_bag
+from spacerobot_ros.bag.reader import Bag, RecordedRobot, read_bag
 from spacerobot_ros.bag.recording import Recording, RecordingState
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.bag.writer import BagWriter, free_name
@@ -23,7 +23,6 @@ __all__ = [
     "ReplayTopic",
     "TopicSeries",
     "free_name",
-    "iterate_raw",
     "message_definition",
     "read_bag",
     "type_hash",

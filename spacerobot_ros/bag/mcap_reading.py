@@ -378,9 +378,8 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
 
 # -- messages ---------------------------------------------------------------------------------
 
-MessageBlock = tuple[NDArray[np.intp], NDArray[np.uint64], NDArray[np.uint64], list[bytes]]
-"""N recorded messages: topic indices (N,), log times (N,) and publish times (N,) in ns,
-and serialised bytes."""
+MessageBlock = tuple[NDArray[np.intp], NDArray[np.uint64], list[bytes]]
+"""N recorded messages: topic indices (N,), log times (N,) in ns, and serialised bytes."""
 
 _MESSAGE_HEADS = np.dtype(
     [
@@ -406,8 +405,8 @@ class _Wanted:
         self,
         file: BagFile,
         topics: Sequence[str],
-        start_ns: int = 0,
-        end_ns: int = _LATEST_TIME_NS,
+        start_ns: int,
+        end_ns: int,
     ) -> None:
         places = {topic: number for number, topic in enumerate(topics)}
         self.numbers = np.full(_MOST_CHANNELS, _NOT_WANTED, np.intp)
@@ -424,15 +423,6 @@ class _Wanted:
             and index.message_end_time >= self.start_ns
             and (not channels or bool((self.numbers[channels] >= 0).any()))
         )
-
-
-def blocks_in_file_order(file: BagFile, topics: Sequence[str]) -> Iterator[MessageBlock]:
-    """Iterate over the messages in a file in write order, chunk by chunk.
-
-    ``topics``: the topics to read. Errors: see :meth:`BagFile.open`.
-    """
-    with file.open() as opened:
-        yield from _blocks_of_records(opened, _Wanted(file, topics))
 
 
 def _blocks_of_records(opened: BinaryIO, wanted: _Wanted) -> Iterator[MessageBlock]:
@@ -465,7 +455,7 @@ def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
     ends = begins + _RECORD_HEAD.size + heads["length"].astype(np.int64)
     spans = zip((begins + size).tolist(), ends.tolist(), strict=True)
     messages = [data[a:b] for a, b in spans]
-    return numbers[rows], heads["log_time"], heads["publish_time"], messages
+    return numbers[rows], heads["log_time"], messages
 
 
 class _Section(NamedTuple):
@@ -535,13 +525,12 @@ def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
 
 def _in_time_order(blocks: Iterable[MessageBlock]) -> MessageBlock:
     """Merge blocks into one by log time; messages of one time keep their order."""
-    empty = np.zeros(0, np.uint64)
-    parts = list(zip((empty.astype(np.intp), empty, empty, []), *blocks, strict=True))
-    numbers, log_times, publish_times = map(np.concatenate, parts[:3])
-    order = np.argsort(log_times, kind="stable")
-    messages = [message for part in parts[3] for message in part]
-    data = [messages[k] for k in order.tolist()]
-    return numbers[order], log_times[order], publish_times[order], data
+    nothing: MessageBlock = np.zeros(0, np.intp), np.zeros(0, np.uint64), []
+    numbers, log_times, data = zip(nothing, *blocks, strict=True)
+    times = np.concatenate(log_times)
+    order = np.argsort(times, kind="stable")
+    messages = [message for part in data for message in part]
+    return np.concatenate(numbers)[order], times[order], [messages[k] for k in order.tolist()]
 
 
 def _messages_of_chunk(file: BinaryIO, index: ChunkIndex, wanted: _Wanted) -> MessageBlock:

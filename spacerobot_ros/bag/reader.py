@@ -19,7 +19,6 @@ from spacerobot_ros.bag.mcap_reading import (
     BagFile,
     RecordedChannel,
     RecordT,
-    blocks_in_file_order,
     blocks_in_time_order,
     read_record,
 )
@@ -61,29 +60,6 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
     """
     given, files = Path(path), bag_files(Path(path))
     return Bag(given if given.is_dir() and len(files) > 1 else files[0], files)
-
-
-def iterate_raw(path: str | os.PathLike[str]) -> Iterator[tuple[str, str, int, int, bytes]]:
-    """Iterate over all messages of a bag, still serialised, in write order.
-
-    Yields
-    ------
-    Topic, type, log time and publish time in nanoseconds, serialised message.
-
-    Raises
-    ------
-    RecordingError
-        See :func:`read_bag`; raised when the first or a damaged message is requested.
-    """
-    for file in map(BagFile, bag_files(Path(path))):
-        types = {channel.topic: channel.type_name for channel in file.channels}
-        topics = list(types)
-        for numbers, *times, messages in blocks_in_file_order(file, topics):
-            log_times, publish_times = (each.tolist() for each in times)
-            rows = zip(numbers.tolist(), log_times, publish_times, messages, strict=True)
-            for number, log_time_ns, publish_time_ns, data in rows:
-                topic = topics[number]
-                yield topic, types[topic], log_time_ns, publish_time_ns, data
 
 
 def salvaged_copy(path: Path) -> Path:
@@ -303,7 +279,7 @@ class Bag(Mapping[str, TopicSeries]):
         Topic, log time in nanoseconds, serialised message.
         """
         blocks = blocks_in_time_order(self._files, topics, start_ns, end_ns)
-        for numbers, log_times, _, messages in blocks:
+        for numbers, log_times, messages in blocks:
             for number, time_ns, data in zip(
                 numbers.tolist(), log_times.tolist(), messages, strict=True
             ):
@@ -483,7 +459,7 @@ class Bag(Mapping[str, TopicSeries]):
         topics = list(types)
         times: list[list[NDArray[np.uint64]]] = [[np.zeros(0, np.uint64)] for _ in topics]
         data: list[list[bytes]] = [[] for _ in topics]
-        for numbers, log_times, _, messages in blocks_in_time_order(self._files, topics):
+        for numbers, log_times, messages in blocks_in_time_order(self._files, topics):
             for number in range(len(topics)):
                 rows = np.flatnonzero(numbers == number)
                 times[number].append(log_times[rows])

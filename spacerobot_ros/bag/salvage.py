@@ -28,7 +28,7 @@ from spacerobot_ros.bag.mcap_reading import (
     DAMAGE_ERRORS,
     BagFile,
     ChunkUnpacker,
-    blocks_in_file_order,
+    blocks_in_time_order,
     file_size,
     open_file,
     parse_record,
@@ -134,7 +134,7 @@ def is_complete(path: Path) -> bool:
 
 def _holds_what_it_counts(file: BagFile) -> bool:
     topics = [channel.topic for channel in file.channels]
-    count = sum(len(messages) for *_, messages in blocks_in_file_order(file, topics))
+    count = sum(len(messages) for *_, messages in blocks_in_time_order([file], topics))
     return file.statistics.message_count == count
 
 

@@ -19,8 +19,8 @@ from spacerobot_ros.bag import (
     Recording,
     RecordingError,
     free_name,
-    iterate_raw,
     mcap_file,
+    read_bag,
 )
 from spacerobot_ros.bag.mcap_file import McapFile
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
@@ -29,7 +29,7 @@ STRING = "std_msgs/msg/String"
 
 
 def numbers(path: Path) -> list[int]:
-    return [int(data[8:14]) for *_, data in iterate_raw(path)]
+    return [int(data[8:14]) for *_, data in read_bag(path).raw_messages(["/a"])]
 
 
 def make_bag(path: Path, count: int = 3) -> bytes:

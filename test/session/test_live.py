@@ -26,10 +26,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 from support.nodes_apart import NodeProcess
+from support.raw_messages import iterate_raw
 from support.ros_harness import Harness
 from support.warm_python import WarmProcess, WarmPython
 
-from spacerobot_ros.bag import iterate_raw, read_bag
+from spacerobot_ros.bag import read_bag
 from spacerobot_ros.cli.options import write_json
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.flight.verification import verify_bag

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from support.made_bags import array, joint_states, made_bag, odometry, pose
+from support.raw_messages import iterate_raw
 
-from spacerobot_ros.bag import BagWriter, iterate_raw
+from spacerobot_ros.bag import BagWriter
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.flight.reading import (
     open_flight_bag,

@@ -32,7 +32,7 @@ MEMORY_LIMIT_MB = 500.0
 
 
 def read(path: Path) -> None:
-    from spacerobot_ros.bag import iterate_raw, read_bag
+    from spacerobot_ros.bag import read_bag
 
     whole = read_bag(path)
     for topic in list(whole.topics)[:50]:
@@ -40,8 +40,6 @@ def read(path: Path) -> None:
         series = whole[topic]
         assert len(series.time) == sum(1 for _ in series.messages())
     _ = (whole.metadata, whole.attachments, whole.start_time, whole.end_time)
-    for _item in iterate_raw(path):
-        pass
 
 
 def resume(path: Path) -> None:

@@ -16,9 +16,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from support.altered_bags import altered
 from support.made_bags import array, made_bag, odometry, stamped
+from support.raw_messages import iterate_raw
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.bag import BagWriter, iterate_raw, read_bag
+from spacerobot_ros.bag import BagWriter, read_bag
 from spacerobot_ros.errors import RecordingError, SpaceRobotError
 from spacerobot_ros.flight import verification
 from spacerobot_ros.flight.verification import Difference, Verification, verify_bag

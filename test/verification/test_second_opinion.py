@@ -20,11 +20,12 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from support.altered_bags import altered
 from support.command_line import CliRunner
+from support.raw_messages import iterate_raw
 from support.sentences import assert_one_sentence
 from support.slow import some_fast
 
 from spacerobot_ros import fly
-from spacerobot_ros.bag import Bag, iterate_raw, read_bag
+from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
