@@ -1,4 +1,4 @@
-"""Campaign report: one self-contained HTML file."""
+"""Reports on one campaign, and on two with the same draws: self-contained HTML files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import shlex
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,14 @@ from spacerobot_ros.campaign.rows import ERROR
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,
+    PairedDifference,
     Share,
+    paired_difference,
+    paired_success,
     percentiles,
     share,
 )
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.report.figures import (
@@ -36,15 +41,15 @@ from spacerobot_ros.report.figures import (
     picture_of,
 )
 from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
+from spacerobot_ros.scenario import different_parameters
 from spacerobot_ros.version import __version__
 
-FOOTER_TEXT = f"Made by spacerobot_ros {__version__}."
-"""Footer of campaign pages."""
+_FOOTER = f"Made by spacerobot_ros {__version__}."
 
 _MAX_HISTOGRAMS, _MAX_SCATTER_PLOTS = 9, 6
 """Largest number of metric histograms and of scatter plots."""
 
-NO_INFLUENCES_TEXT = "no correlation is significant (p < 0.05, corrected for multiple tests)."
+_NO_INFLUENCES = "no correlation is significant (p < 0.05, corrected for multiple tests)."
 
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 _MAX_CURVE_STEPS = 2000
@@ -64,7 +69,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     """
     results = Results.of(folder)
     title = f"Campaign {results.campaign.name}"
-    write_output(path, html_page(title, _page_body(results), FOOTER_TEXT))
+    write_output(path, html_page(title, _page_body(results), _FOOTER))
     lines = [f"success     {results.success_share}"]
     lines += [f"{name:<11} {each}" for name, each in results.sampler_shares.items()]
     lines += (
@@ -80,7 +85,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     drivers = [each for each in found if each.is_significant]
     lines += [f"driver      {each}" for each in _sort_passing_first(drivers)[:3]]
     if found and not drivers:
-        lines.append(f"driver      none: {NO_INFLUENCES_TEXT}")
+        lines.append(f"driver      none: {_NO_INFLUENCES}")
     return lines
 
 
@@ -88,12 +93,12 @@ def _sort_passing_first(found: Sequence[Influence]) -> list[Influence]:
     return sorted(found, key=lambda each: each.metric != PASSING)
 
 
-def picture_part(drawn: Figure, name: str, caption: str) -> str:
+def _picture_part(drawn: Figure, name: str, caption: str) -> str:
     """Return a figure for the page."""
     return figure(name, picture_of(drawn, PictureFormat.SVG), caption, escape(caption))
 
 
-def figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
+def _figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
     """Return a figure and its axes, ``across`` per row."""
     rows = -(-count // across)
     figure = Figure(figsize=(9.6, height * rows + 0.2), layout="constrained", facecolor="white")
@@ -229,7 +234,7 @@ def _histograms_section(results: Results) -> str:
     names = results.distributed_metrics[:_MAX_HISTOGRAMS]
     if not names:
         return ""
-    figure, axes = figure_with_axes(len(names), 2)
+    figure, axes = _figure_with_axes(len(names), 2)
     bounds = {criterion.metric: criterion for criterion in results.campaign.criteria}
     for panel, name in zip(axes, names, strict=True):
         values = results.columns[name]
@@ -257,7 +262,7 @@ def _histograms_section(results: Results) -> str:
         "Distributions of the metrics; dotted: percentiles 5, 50 and 95; orange: requirements; "
         "black: cumulative share of flights."
     )
-    return picture_part(figure, "distributions", caption)
+    return _picture_part(figure, "distributions", caption)
 
 
 def _sensitivity_section(found: Sequence[Influence]) -> str:
@@ -280,7 +285,7 @@ def _sensitivity_section(found: Sequence[Influence]) -> str:
     if not sobol:
         note += " Sampler 'saltelli' adds Sobol indices."
     if not any(each.is_significant for each in found):
-        note += f" Here {NO_INFLUENCES_TEXT}"
+        note += f" Here {_NO_INFLUENCES}"
     return f'<p class="facts">{escape(note)}</p>' + table("drivers", head, rows)
 
 
@@ -288,7 +293,7 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
     chosen = [each for each in found if each.metric != PASSING][:_MAX_SCATTER_PLOTS]
     if not chosen:
         return ""
-    figure, axes = figure_with_axes(len(chosen), 3, 2.4)
+    figure, axes = _figure_with_axes(len(chosen), 3, 2.4)
     passed = results.passed
     # At most 2000 points, drawn at random, are plotted.
     few = np.random.default_rng(0).permutation(len(results))[:2000]
@@ -301,14 +306,14 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
         panel.set_ylabel(metric_label(each.metric))
         panel.locator_params(axis="x", nbins=5)
     caption = "The strongest correlations; orange: flights that did not pass."
-    return picture_part(figure, "scatter", caption)
+    return _picture_part(figure, "scatter", caption)
 
 
 def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> str:
     drawn = results.drawn_by_influence(found)[:_MAX_SCATTER_PLOTS]
     if not drawn or results.passed.all() or not results.passed.any():
         return ""
-    figure, axes = figure_with_axes(len(drawn), 3, 2.4)
+    figure, axes = _figure_with_axes(len(drawn), 3, 2.4)
     for panel, name in zip(axes, drawn, strict=True):
         bins = results.success_by_bins(name)
         shares = np.array([each.passed.value for each in bins])
@@ -326,7 +331,7 @@ def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> st
         panel.set_ylabel("success")
         panel.tick_params(axis="x", labelsize=7)
     caption = "Success over drawn values, in bins with about equal flight counts; 95 % intervals."
-    return picture_part(figure, "success", caption)
+    return _picture_part(figure, "success", caption)
 
 
 def _worst_flights_section(results: Results) -> str:
@@ -349,7 +354,7 @@ def _convergence_section(results: Results) -> list[str]:
         return []
     passed = np.cumsum(results.passed)
     shares = [share(int(passed[k - 1]), int(k)) for k in at]
-    figure, axes = figure_with_axes(2, 2, 2.4)
+    figure, axes = _figure_with_axes(2, 2, 2.4)
     axes[0].fill_between(
         at,
         [s.interval_low for s in shares],
@@ -375,7 +380,7 @@ def _convergence_section(results: Results) -> list[str]:
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         panel.xaxis.set_minor_formatter(NullFormatter())
     caption = "Convergence of the results with the number of flights."
-    return ["<h2>Convergence</h2>", picture_part(figure, "convergence", caption)]
+    return ["<h2>Convergence</h2>", _picture_part(figure, "convergence", caption)]
 
 
 def _dispersions_section(campaign: Campaign) -> str:
@@ -396,3 +401,162 @@ def _dispersions_section(campaign: Campaign) -> str:
         *(f"{100 * share:g} %" for share in _QUANTILES_SHOWN),
     ]
     return table("dispersed", head, rows)
+
+
+# -- two campaigns ----------------------------------------------------------------------------
+
+
+def require_same_draws(first: Campaign, second: Campaign) -> None:
+    """Check that two campaigns have the same draws.
+
+    Raises
+    ------
+    ParameterError
+        The seeds, samplers, numbers of flights or dispersions differ.
+    """
+    sentence = f"The campaigns '{first.name}' and '{second.name}' do not have the same draws: "
+    for key in ("seed", "sampler", "flights"):
+        ours, theirs = getattr(first, key), getattr(second, key)
+        if ours != theirs:
+            raise ParameterError(f"{sentence}'{key}' is {ours} and {theirs}.")
+    # The order counts, because numbers are assigned to dispersions in order.
+    for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
+        a, b = (
+            "nothing" if each is None else f"{each.name}: {each}" for each in (ours_is, theirs_is)
+        )
+        same = a == b and all(
+            getattr(ours_is, key) == getattr(theirs_is, key) for key in ("distribution", "weights")
+        )
+        if not same:
+            raise ParameterError(f"{sentence}'disperse' has {a} and {b} at the same place.")
+
+
+def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
+    """Write a comparison report of two datasets with the same draws; return the terminal output
+    lines.
+
+    Raises
+    ------
+    ParameterError
+        A folder contains no flights, or the draws differ.
+    SpaceRobotError
+        The file cannot be written.
+    """
+    first, second = (Results.of(folder) for folder in folders)
+    require_same_draws(first.campaign, second.campaign)
+    common = np.intersect1d(first.flight_numbers, second.flight_numbers)
+    rows_a = np.searchsorted(first.flight_numbers, common)
+    rows_b = np.searchsorted(second.flight_numbers, common)
+    if not common.size:
+        raise ParameterError(
+            f"'{first.campaign.name}' and '{second.campaign.name}' share no flown draws: fly more "
+            "flights of one of them."
+        )
+    # Metrics required by one campaign only are compared too, if both have them.
+    names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
+    names = [name for name in names if name in first.columns and name in second.columns]
+    # A flight whose goal was refused has not moved: its numbers are those of the start.
+    flew = ~(first.refused[rows_a] | second.refused[rows_b])
+    flown_a, flown_b = rows_a[flew], rows_b[flew]
+    pairs = (
+        paired_difference(name, first.columns[name][flown_a], second.columns[name][flown_b])
+        for name in names
+    )
+    found = [difference for difference in pairs if difference is not None]
+    compared = [each.metric for each in found]
+    passed_a, passed_b = first.passed[rows_a], second.passed[rows_b]
+    only_a, only_b, p = paired_success(passed_a, passed_b)
+    a, b = first.campaign.name, second.campaign.name
+    sentence = (
+        f"{a} passes {int(passed_a.sum())} and {b} {int(passed_b.sum())} of {len(common)} draws; "
+        f"{only_a} only {a}, {only_b} only {b} (McNemar's exact test: p = {p:.2g})."
+    )
+    notes = [*_notes_on_failures(first, second), *_notes_on_control(first, second)]
+    with drawing():
+        body = [
+            f"<header><h1>{escape(a)} and {escape(b)}</h1>",
+            facts([f"{len(common)} common draws"]),
+            f'<p class="outcome">{escape(sentence)}</p></header>',
+            *(f'<p class="missing">{escape(note)}</p>' for note in notes),
+            *_parameters_part(first.campaign, second.campaign),
+            "<h2>Paired differences</h2>",
+            _difference_table(found, first, second),
+            _difference_figure(first, second, flown_a, flown_b, compared[:6]),
+        ]
+    write_output(path, html_page(f"{a} and {b}", body, _FOOTER))
+    return [sentence, *(_difference_line(each, b, a) for each in found), *notes]
+
+
+def _parameters_part(first: Campaign, second: Campaign) -> list[str]:
+    rows = [list(row) for row in different_parameters([first.scenario, second.scenario])]
+    if not rows:
+        return ["<h2>Parameters that differ</h2>", '<p class="missing">None differ.</p>']
+    head = ["parameter", first.name, second.name]
+    return ["<h2>Parameters that differ</h2>", table("parameters", head, rows)]
+
+
+def _difference_line(each: PairedDifference, second: str, first: str) -> str:
+    return (
+        f"{metric_label(each.metric)}: {first} {each.first:.4g}, {second} {each.second:.4g}; "
+        f"{second} minus {first} is {each.difference:.4g} "
+        f"(95 % interval {each.interval_low:.4g} to {each.interval_high:.4g})"
+    )
+
+
+def _notes_on_failures(first: Results, second: Results) -> list[str]:
+    notes = []
+    for each in (first, second):
+        missed = [found for found in messages_of(each) if found[0] != "reached"]
+        for outcome, count, message in sorted(missed, key=lambda found: -found[1])[:1]:
+            share = f"{count} of {len(each)} flights"
+            notes.append(f"Of {each.campaign.name}, {share} have the outcome {outcome}: {message}")
+    if first.refused.any() or second.refused.any():
+        notes.append("Differences exclude draws whose goal was refused in one of the campaigns.")
+    return notes
+
+
+def _notes_on_control(first: Results, second: Results) -> list[str]:
+    return [
+        f"{each.campaign.name} does not control the {' and '.join(parts)}: the error is ignored "
+        "unless a criterion names it."
+        for each in (first, second)
+        if (parts := each.not_controlled)
+    ]
+
+
+def _difference_table(found: list[PairedDifference], first: Results, second: Results) -> str:
+    free = [part for part in first.not_controlled if part in second.not_controlled]
+    rows = [
+        [
+            metric_label(each.metric, free),
+            str(each.count),
+            f"{each.first:.5g}",
+            f"{each.second:.5g}",
+            f"{each.difference:+.4g}",
+            f"{each.interval_low:+.4g} to {each.interval_high:+.4g}",
+            "yes" if each.is_significant else "no",
+        ]
+        for each in found
+    ]
+    names = [f"mean of {each.campaign.name}" for each in (first, second)]
+    head = ["metric", "pairs", *names, "difference"]
+    return table("paired", [*head, "95 % interval", "interval excludes 0"], rows)
+
+
+def _difference_figure(
+    first: Results, second: Results, rows_a: np.ndarray, rows_b: np.ndarray, names: list[str]
+) -> str:
+    if not names:
+        return ""
+    figure, axes = _figure_with_axes(len(names), 3, 2.6)
+    for panel, name in zip(axes, names, strict=True):
+        x, y = first.columns[name][rows_a], second.columns[name][rows_b]
+        panel.plot(x, y, ".", ms=3, alpha=0.5, color=PALETTE[0], rasterized=True)
+        both = np.concatenate([x[np.isfinite(x)], y[np.isfinite(y)]])
+        if both.size:
+            ends = [both.min(), both.max()]
+            panel.plot(ends, ends, color=TEXT_COLOUR, linewidth=0.8, linestyle=":")
+        panel.locator_params(nbins=5)
+        panel.set_xlabel(f"{first.campaign.name}: {name}")
+        panel.set_ylabel(second.campaign.name)
+    return _picture_part(figure, "pairs", "Each draw in both campaigns; dotted: no difference.")

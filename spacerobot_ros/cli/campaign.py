@@ -213,8 +213,8 @@ def _compare(
     out: Path | None,
     report: Path | None,
 ) -> None:
-    from spacerobot_ros.campaign.comparing import require_same_draws, write_comparison
     from spacerobot_ros.campaign.config import load_campaign
+    from spacerobot_ros.campaign.report import require_same_draws, write_comparison
 
     require_same_draws(*(load_campaign(file, flights) for file in files))
     names = [file.stem for file in files]

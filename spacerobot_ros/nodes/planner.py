@@ -3,35 +3,40 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from threading import Thread
 from typing import Any, ClassVar
 
 import numpy as np
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Path
+from rclpy.action import ActionClient
 from rclpy.publisher import Publisher
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.commanding.trajectory_output import Outcome, TrajectoryEnd, TrajectoryOutput
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.messages.builders import path_message, trajectory_message
 from spacerobot_ros.messages.markers import goal_markers
 from spacerobot_ros.messages.readers import joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.commander import CommanderNode
+from spacerobot_ros.nodes.common.fly_to import action_class
 from spacerobot_ros.nodes.common.messages import (
     path_poses,
     shape_of,
 )
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
-from spacerobot_ros.nodes.common.trajectory_clients import TrajectoryClients
 from spacerobot_ros.planning.core.cancellation import MAX_THREAD_END_TIME
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
-from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
@@ -61,7 +66,7 @@ class PlannerNode(CommanderNode):
     default_name: ClassVar = "planner"
     config: PlannerConfig
     commander: PlannerCommander
-    _trajectories: Any = None
+    _trajectories: TrajectoryClients | None = None
     """FollowJointTrajectory clients, for ``output: trajectory``."""
     _announcement: Thread | None = None
     """Publishes the latest schedule."""
@@ -212,6 +217,110 @@ class PlannerNode(CommanderNode):
         self._schedule_topic.publish(trajectory_message(schedule, stamp, robot.base_link))
         self._path_topic.publish(path_message(schedule.path, stamp, frame))
         self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, robot, frame))
+
+
+_OUTCOMES = {
+    GoalStatus.STATUS_SUCCEEDED: Outcome.SUCCEEDED,
+    GoalStatus.STATUS_ABORTED: Outcome.ABORTED,
+    GoalStatus.STATUS_CANCELED: Outcome.CANCELED,
+}
+
+
+class TrajectoryClients:
+    """A planner node's FollowJointTrajectory clients; they exist as long as the node.
+
+    If a node cleanup destroyed them, an executor might still hold a response for one of them.
+
+    Raises
+    ------
+    ParameterError
+        The action package is not installed.
+    """
+
+    def __init__(self, node: Any) -> None:
+        kind = action_class("control_msgs", "FollowJointTrajectory")
+        if kind is None:
+            raise ParameterError(
+                "Parameter 'output' is 'trajectory', which needs the package control_msgs: install "
+                "it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
+            )
+        self._kind, self._node = kind, node
+        self._clients: dict[str, ActionClient] = {}
+
+    def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
+        """Return an output to an action server; it calls `on_end` when a schedule ends."""
+        if name not in self._clients:
+            self._clients[name] = ActionClient(self._node, self._kind, name)
+        connection = _Connection(self._kind, self._clients[name])
+        output = TrajectoryOutput(connection, self._node.resolve_topic_name(name), on_end)
+        connection.output = output
+        return output
+
+    def destroy(self) -> None:
+        """Destroy the clients when the node is destroyed."""
+        for client in self._clients.values():
+            client.destroy()
+        self._clients.clear()
+
+
+class _Connection:
+    """Connects one :class:`TrajectoryOutput` with a client."""
+
+    output: TrajectoryOutput
+
+    def __init__(self, kind: Any, client: Any) -> None:
+        self._kind, self._client = kind, client
+        self._handles: dict[int, Any] = {}
+        """Accepted schedules without a result, by number."""
+        self._cancelled: set[int] = set()
+        """Schedules that are cancelled as soon as they are accepted."""
+
+    def is_available(self) -> bool:
+        return bool(self._client.server_is_ready())
+
+    def send(self, number: int, start: ScheduleStart) -> None:
+        goal = self._kind.Goal(trajectory=joint_trajectory(start.schedule))
+        answer = self._client.send_goal_async(goal)
+        answer.add_done_callback(lambda future: self._on_answer(number, future.result()))
+
+    def cancel(self, number: int) -> None:
+        handle = self._handles.get(number)
+        if handle is None:
+            self._cancelled.add(number)
+        else:
+            handle.cancel_goal_async()
+
+    def _on_answer(self, number: int, handle: Any) -> None:
+        if not handle.accepted:
+            self._cancelled.discard(number)
+            self.output.rejected(number)
+            return
+        self._handles[number] = handle
+        if number in self._cancelled:
+            self._cancelled.discard(number)
+            handle.cancel_goal_async()
+        self.output.accepted(number)
+        handle.get_result_async().add_done_callback(
+            lambda future: self._on_result(number, future.result())
+        )
+
+    def _on_result(self, number: int, response: Any) -> None:
+        self._handles.pop(number, None)
+        outcome = _OUTCOMES.get(response.status, Outcome.ABORTED)
+        result = response.result
+        self.output.ended(number, outcome, result.error_code, result.error_string)
+
+
+def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
+    """Return a schedule as a trajectory that begins when it arrives.
+
+    Its points have only positions, so that controllers interpolate linearly. This reproduces the
+    schedule, whose velocities are constant over a tick.
+    """
+    message = deserialize_message(trajectory_message(schedule, 0, ""), JointTrajectory)
+    for point in message.points:
+        point.velocities = []
+    return message
 
 
 def main() -> None:

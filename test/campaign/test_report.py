@@ -18,11 +18,14 @@ from scipy import stats
 from support.campaigns import campaign
 from support.chromium import browser, chromium
 
-from spacerobot_ros.campaign.comparing import require_same_draws, write_comparison
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.report import write_campaign_report
+from spacerobot_ros.campaign.report import (
+    require_same_draws,
+    write_campaign_report,
+    write_comparison,
+)
 from spacerobot_ros.campaign.results import PASSING, Columns, Results
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from support.campaigns import section
 from support.figure_prints import prints_of, words_of
 
-from spacerobot_ros.campaign import comparing, report
+from spacerobot_ros.campaign import report
 from spacerobot_ros.campaign.config import Campaign, parse_campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
@@ -83,7 +83,7 @@ def _pictures() -> Iterator[dict[str, Any]]:
         found[name] = {"caption": caption, **prints_of(drawn)}
         return f"<figure>{name}</figure>"
 
-    with patch.object(report, "picture_part", part), patch.object(comparing, "picture_part", part):
+    with patch.object(report, "_picture_part", part):
         yield found
 
 
@@ -108,7 +108,7 @@ def comparison_prints() -> dict[str, Any]:
         for folder, better in zip(folders, (0.0, 0.002), strict=True):
             write_flights(folder, made_up("lighter" if better else "sliders"), better)
         page = Path(name, "report.html")
-        lines = comparing.write_comparison(folders, page)
+        lines = report.write_comparison(folders, page)
         found = {"page": words_of(page.read_text("utf-8")), "terminal": lines, **pictures}
     return dict(json.loads(json.dumps(found)))
 
