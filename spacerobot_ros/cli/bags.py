@@ -11,7 +11,6 @@ import click
 
 from spacerobot_ros.cli.options import (
     PATH,
-    NumberRange,
     bag_argument,
     beside,
     format_option,
@@ -146,7 +145,7 @@ def figures_command(
     is_flag=False,
     flag_value=100.0,
     default=0.0,
-    type=NumberRange(min=0.0),
+    type=click.FloatRange(min=0.0),
     metavar="[HZ]",
     help="Publish bag time on /clock HZ times per second (100 without a number) [as recorded].",
 )
@@ -156,7 +155,7 @@ def figures_command(
     "--wait",
     default=3.0,
     show_default=True,
-    type=NumberRange(min=0.0),
+    type=click.FloatRange(min=0.0),
     help="Maximum wait for subscribers (s).",
 )
 def replay_command(
@@ -237,7 +236,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     "--tolerance",
     default=1e-9,
     show_default=True,
-    type=NumberRange(min=0.0),
+    type=click.FloatRange(min=0.0),
     help="Largest deviation considered equal (SI units; relative above 1).",
 )
 @click.option(

@@ -194,9 +194,9 @@ def fault_timeline(lines: Iterable[str], targets: FaultTargets) -> Timeline[Faul
     Raises
     ------
     ParameterError
-        A line is not a valid fault for this plant, or there are too many lines.
+        A line is not a valid fault for this plant.
     """
-    return Timeline(lines, lambda line, now: parse_fault(line, targets, now), "fault")
+    return Timeline(lines, lambda line, now: parse_fault(line, targets, now))
 
 
 # -- disturbances ---------------------------------------------------------------------------------
@@ -283,18 +283,15 @@ def disturbance_timeline(lines: Iterable[str], links: Sequence[str]) -> Timeline
     Raises
     ------
     ParameterError
-        A line is not a valid disturbance for this robot, or there are too many lines.
+        A line is not a valid disturbance for this robot.
     """
-    return Timeline(lines, lambda line, now: parse_disturbance(line, links, now), "disturbance")
+    return Timeline(lines, lambda line, now: parse_disturbance(line, links, now))
 
 
 # -- lines and times ------------------------------------------------------------------------------
 
 MAX_TIME = 1e9
 """Largest time in a line, s."""
-
-_MAX_ENTRIES = 1000
-"""Largest number of entries in a timeline; searching more would exceed a tick."""
 
 Refusal = Callable[[str], ParameterError]
 """Function that returns the error for an invalid line, given the reason as a clause."""
@@ -376,15 +373,10 @@ class Timeline(Generic[Entry]):
     parse
         Function that parses an entry line; the second argument is the start time if the line
         specifies none, s.
-    noun
-        Noun for an entry, for messages.
     """
 
-    def __init__(
-        self, lines: Iterable[str], parse: Callable[[str, float], Entry], noun: str
-    ) -> None:
+    def __init__(self, lines: Iterable[str], parse: Callable[[str, float], Entry]) -> None:
         self._parse: Callable[[str, float], Entry] = parse
-        self._noun = noun
         self.entries: list[Entry] = []
         self.active: tuple[Entry, ...] = ()
         """Active entries; a new tuple object after every change."""
@@ -398,15 +390,9 @@ class Timeline(Generic[Entry]):
         Raises
         ------
         ParameterError
-            A line is invalid, or there are too many; none is added.
+            A line is invalid; none is added.
         """
-        added = [self._parse(line, now) for line in lines if line.strip()]
-        if len(self.entries) + len(added) > _MAX_ENTRIES:
-            raise ParameterError(
-                f"{len(added)} more {self._noun}(s) are refused: there are already "
-                f"{len(self.entries)} of at most {_MAX_ENTRIES}; inject 'clear' first."
-            )
-        self.entries += added
+        self.entries += [self._parse(line, now) for line in lines if line.strip()]
         self.next_change = -math.inf
 
     def inject(self, text: str, now: float) -> None:

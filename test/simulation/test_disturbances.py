@@ -31,7 +31,6 @@ from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (
     Disturbance,
-    disturbance_timeline,
     parse_disturbance,
 )
 from spacerobot_ros.simulation.loads import PlantLoads
@@ -114,18 +113,6 @@ def test_a_bad_line_is_refused_with_a_sentence(line: str, reason: str) -> None:
     with pytest.raises(ParameterError) as refused:
         parse_disturbance(line, LINKS)
     assert str(refused.value) == f"The disturbance '{line}' is refused: {reason}."
-
-
-def test_too_many_disturbances_are_refused_together() -> None:
-    timeline = disturbance_timeline(["hand force 1 0 0"] * 999, LINKS)
-    with pytest.raises(ParameterError) as refused:
-        timeline.read(["base force 0 1 0", " ", "base force 0 2 0"])
-    assert str(refused.value) == (
-        "2 more disturbance(s) are refused: there are already 999 of at most 1000; inject "
-        "'clear' first."
-    )
-    timeline.read(["base force 0 1 0"], now=2.5)
-    assert (len(timeline.entries), timeline.entries[-1].start) == (1000, 2.5)
 
 
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])

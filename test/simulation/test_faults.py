@@ -141,16 +141,6 @@ def test_times_of_a_long_flight_are_written_as_they_are() -> None:
     assert parse_fault(str(fault), TARGETS) == fault
 
 
-def test_so_many_faults_that_none_could_look_through_them_are_refused() -> None:
-    timeline = fault_timeline(["joint_stuck elbow_pitch"] * 999, TARGETS)
-    with pytest.raises(ParameterError, match="at most 1000"):
-        timeline.read(["joint_stuck elbow_pitch"] * 2)
-    assert len(timeline.entries) == 999
-    timeline.read(["joint_stuck elbow_pitch"])
-    timeline.inject("clear", 0.0)
-    timeline.read(["joint_stuck elbow_pitch"])
-
-
 @pytest.mark.parametrize("kind", FAULT_KINDS)
 @pytest.mark.parametrize("actuation", ["velocity", "effort"])
 def test_the_largest_faults_leave_numbers_finite_or_stop_the_plant_with_a_sentence(
