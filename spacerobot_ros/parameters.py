@@ -254,7 +254,6 @@ def _registered_options(config: Any) -> tuple[tuple[str, type[Any]], ...]:
 def _declared_in_class(
     config: type[Any], registered_options: tuple[tuple[str, type[Any]], ...]
 ) -> tuple[Parameter, ...]:
-    """Return the parameters of a class; the registry contents are part of the cache key."""
     return declared(config())
 
 
@@ -316,7 +315,6 @@ def _configured(defaults: Any, values: Mapping[str, Any], prefix: str) -> Any:
 
 
 def _parameters_with_values(config: Any) -> Iterator[tuple[str, Parameter, Value]]:
-    """Yield full name, declaration and value of every parameter of a configuration."""
     for each in fields(config):
         value = getattr(config, each.name)
         if _PARAMETER in each.metadata:

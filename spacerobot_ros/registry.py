@@ -142,7 +142,6 @@ class Registry(dict[str, type[T]]):
 
 
 def _origin(entry: type[Any]) -> str:
-    """Return the file of the module that defines a class; the module's name without one."""
     file = getattr(sys.modules.get(entry.__module__), "__file__", None)
     return f"'{file or entry.__module__}'"
 

@@ -206,7 +206,6 @@ class Scenario:
             return DEFAULT_POSITION_TOLERANCE  # The robot is refused where it is built.
 
     def _parameters_as_written(self, node: str) -> dict[str, Any]:
-        """Return the parameters of a node in the file and the overrides, before type conversion."""
         return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
 
     @property
@@ -284,7 +283,6 @@ class Scenario:
         return tuple(link or DEFAULT_END_EFFECTOR for link in self.end_effectors)
 
     def _goal_poses(self) -> dict[str, list[float]]:
-        """Return positions (3,) and quaternions (4,) of the goals by their keys in a file."""
         goals = zip(_GOAL_KEYS, (self.goal, self.end_effector_goal), strict=True)
         poses = {name: goal for name, goal in goals if goal is not None and goal.base}
         return {
@@ -802,7 +800,6 @@ def _value_text(value: Any) -> str:
 
 
 def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters by node of a file, with the paths of files that they name."""
     in_file = {
         node: _with_files_beside(path, parameters)
         for node, parameters in _parameters_by_node(content, path).items()

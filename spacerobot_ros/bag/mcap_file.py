@@ -152,7 +152,6 @@ class RecordedTopic:
 def _rosbag2_metadata(
     file_name: str, topics: Sequence[RecordedTopic], start_ns: int | None, end_ns: int | None
 ) -> dict[str, str]:
-    """Return the values of rosbag2's metadata record."""
     start, duration = INFINITE_NS, 0
     if start_ns is not None and end_ns is not None:
         start, duration = start_ns, end_ns - start_ns

@@ -199,7 +199,6 @@ class Bag(Mapping[str, TopicSeries]):
         return f"Bag {self.path}: {self.message_count()} messages on {len(self)} topics{span}"
 
     def _topic_rows(self) -> list[tuple[str, int, str]]:
-        """Name, number of messages and type of every topic, by name."""
         return [
             (
                 printable(topic),

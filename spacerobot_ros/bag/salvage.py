@@ -139,8 +139,6 @@ def _holds_what_it_counts(file: BagFile) -> bool:
 
 
 class _Copy:
-    """The readable records of a bag in a new file."""
-
     def __init__(self, file: McapFile) -> None:
         self.empty = True
         self.lost_chunks = self.lost_bytes = 0
@@ -180,7 +178,6 @@ class _Copy:
                 self._add(data[begin:end])
 
     def _add(self, record: bytes) -> None:
-        """Add a record; one that cannot be read, or is of an unknown channel, is omitted."""
         found = None
         with suppress(*DAMAGE_ERRORS):
             found = parse_record(record)

@@ -167,7 +167,6 @@ class LaneBlock:
         self._memory[tuple(at)] = arrays.asarray(values)
 
     def _read_rows(self, name: str) -> Array:
-        """Return rows (flights, size) of a name."""
         part = np.swapaxes(self._target.to_numpy(self._memory[:, self._rows[name]]), 1, 2)
         return part.reshape(len(self._rows_of_lanes), -1)[: len(self._flown)]
 
@@ -300,7 +299,6 @@ class LaneBlock:
         self._write_rows("bounds", most)
 
     def _note_failures(self) -> None:
-        """Give the flights that the driver has ended their messages."""
         if not self._memory[:, self._rows["failure"]].any():
             return
         reasons, ticks = self._read_rows("failure")[:, 0], self._read_rows("failed_at")[:, 0]
@@ -309,7 +307,6 @@ class LaneBlock:
         self._memory[:, self._rows["failure"]] = 0.0
 
     def _command_outside_lanes(self) -> None:
-        """Compute the commands that lanes wait for."""
         controller, each = self._tick.controller, 1 if self._target.threads else self._lanes
         assert controller is not None
         of_loops = np.arange(len(self._flown)) // each

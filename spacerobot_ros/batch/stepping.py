@@ -298,8 +298,6 @@ class _SteppedLanes(LaneBlock):
 
 
 class _SteppedPlants:
-    """Flights of which each has a plant, stepped one after the other."""
-
     name = "scalar"
 
     def __init__(self, flights: Flights, link: str, configs: Sequence[PlantConfig]) -> None:
@@ -315,7 +313,6 @@ class _SteppedPlants:
         return np.array([self._report(self._plants[row]) for row in rows.tolist()])
 
     def _start_plant(self, row: int) -> None:
-        """Return the plant of a flight to a start; other masses need another plant."""
         flights = self._flights
         assert flights.inertial is not None
         start, masses = flights.initial_states.initial_state(row), flights.inertial[row].vector

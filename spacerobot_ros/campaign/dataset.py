@@ -175,7 +175,6 @@ class Dataset:
         os.replace(new, path)
 
     def _lock(self) -> None:
-        """Lock the folder; ParameterError if another process has locked it."""
         descriptor = os.open(self.folder / _FLIGHTS_FOLDER, os.O_RDONLY | os.O_CLOEXEC)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -217,7 +216,6 @@ class Dataset:
             raise ParameterError(f"The campaign in {self.folder} is refused: {error}") from error
 
     def _read_identity(self) -> dict[str, str]:
-        """Return name, scenario and fingerprint of the campaign in the folder."""
         path = self.folder / _ABOUT_FILE
         try:
             facts = json.loads(path.read_text(encoding="utf-8"))
@@ -345,7 +343,6 @@ def _row_schema(campaign: Campaign) -> Any:
 
 
 def _columns_of_rows(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the values of rows in columns of these names; None where a row has none."""
     columns: dict[str, list[Any]] = {
         "flight": [row.draw.number for row in rows],
         "seed": [row.draw.seed for row in rows],

@@ -81,7 +81,6 @@ class Draws:
         return self._made[place]
 
     def _draw_block(self, first: int) -> list[Draw]:
-        """Return the draws of a block, whose values are computed together."""
         campaign = self._campaign
         numbers = range(first, first + _BLOCK_SIZE)
         seeds = [np.random.SeedSequence(campaign.seed, spawn_key=(number,)) for number in numbers]

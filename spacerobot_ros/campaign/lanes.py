@@ -370,8 +370,6 @@ class _ScheduledLanes:
 
 
 class _ControlledLanes:
-    """Flights of coordinated control, to the decisions about their goals."""
-
     max_batch_flights = 128
 
     def refusal(self, campaign: Campaign) -> str:
@@ -548,7 +546,6 @@ def _batch_of_flights(
 def _end_effector_error(
     robot: SpaceRobot, flight: DrawnFlight, q: Array, pose: Array
 ) -> PoseError | None:
-    """Return the error of the end-effector to its goal; None without one of them."""
     goal = flight.scenario.end_effector_goal
     link = robot.description.end_effector(flight.scenario.plant.end_effector_frame)
     if goal is None or not link:

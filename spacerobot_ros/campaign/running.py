@@ -148,7 +148,6 @@ def _fly_rows(
     workers: Workers | None,
     stopped: Callable[[], bool],
 ) -> Iterator[list[Row]]:
-    """Yield the rows of draws as they are flown, and empty lists while workers fly."""
     if not numbers:
         return
     if workers is None:

@@ -400,7 +400,6 @@ def _start_positions(scenario: Scenario) -> list[float]:
 
 
 def _find_bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
-    """Return the bodies of a name, all for ``*``, each with its index."""
     names = [body.name for body in description_of(scenario).bodies]
     if name == "*":
         return list(enumerate(names))

@@ -147,7 +147,6 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 def _fly_campaign(
     file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None, name: str = ""
 ) -> tuple[Path, Progress]:
-    """Fly a campaign, print its progress, and return its folder and its end."""
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
     from spacerobot_ros.termination import graceful_shutdown
@@ -168,7 +167,6 @@ def _fly_campaign(
 
 
 def _require_flights(*each: Progress) -> None:
-    """Exit with 1 if no draw of a campaign could be flown."""
     for progress in each:
         if progress.unflown and progress.unflown == progress.flown:
             fail(

@@ -151,7 +151,6 @@ def within_option(default: tuple[float, float], help_prefix: str) -> Any:
 
 
 def _attitude_options(*prefixes: str) -> Callable[..., Any]:
-    """Return a decorator: an attitude as the arguments ``rotvec`` and ``rpy_deg``."""
     rotvec = click.option(
         *(f"--{prefix}rotvec" for prefix in prefixes),
         "rotvec",

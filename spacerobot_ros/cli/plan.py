@@ -228,7 +228,6 @@ def comparison_lines(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> I
 def _plan_random_goals(
     problem: PlanningProblem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
-    """Plan and print random goals; exit code 0: all that were simulated were reached."""
     from spacerobot_ros.flight.trials import PlanEvaluation, random_goals, try_goals
 
     goals = random_goals(problem, count, within[0], math.radians(within[1]))

@@ -275,7 +275,6 @@ class Episodes:
             self._observe()
 
     def _apply(self, config: EpisodeConfig) -> None:
-        """Set the attributes that may change from episode to episode."""
         self._weights = self.task.weights.of(config.reward)
         self._config, self.reward, self.time_limit = config, vars(self._weights), config.time_limit
         self.spread = config.spread or self.task.spread
@@ -384,7 +383,6 @@ class Episodes:
         self._observe(chosen)
 
     def _checked_starts(self, start: Any) -> list[dict[str, Array]]:
-        """Return the given changes of the starts of all rows."""
         count, n = len(self.goals), self.robot.n
         each = list(start) if isinstance(start, list | tuple) else [start] * count
         if len(each) != count or not all(isinstance(one, Mapping) for one in each):
@@ -400,7 +398,6 @@ class Episodes:
         ]
 
     def _checked_goals(self, goal: Any) -> Array:
-        """Return the given goals (N, goal_size) of all rows."""
         values, (count, size) = as_numbers(goal, "The goal"), self.goals.shape
         if values.shape not in ((size,), (count, size)) or not np.isfinite(values).all():
             raise ParameterError(
@@ -475,7 +472,6 @@ class Episodes:
 
 
 def _checked_start(name: str, given: Any, size: int) -> Array:
-    """Return a given value of a start."""
     values = as_numbers(given, f"The start's {name}")
     if values.shape != (size,) or not np.isfinite(values).all():
         raise ParameterError(f"The start's {name} is {given!r}; it must be {size} finite numbers.")

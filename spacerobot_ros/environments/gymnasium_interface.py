@@ -26,7 +26,6 @@ from gymnasium.vector.utils import batch_space  # noqa: E402
 def _prepare(
     environment: Any, count: int, arguments: Mapping[str, Any], render_mode: str | None, lanes: bool
 ) -> tuple[Any, Any]:
-    """Give an environment its episodes; return the spaces of an observation and an action."""
     if render_mode not in (None, "rgb_array"):
         # Libraries make environments without one after this type of error.
         raise TypeError(f"There is no render_mode '{render_mode}': use 'rgb_array', or omit it.")
@@ -40,7 +39,6 @@ def _prepare(
 
 
 def _begin_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the goal and start of the options of a reset; refuse others."""
     if not isinstance(options, Mapping | None):
         raise ParameterError(f"The reset options are {options!r}: pass a dictionary.")
     require_names("A reset has no option", options or {}, ("goal", "start", "reset_mask"))

@@ -264,8 +264,6 @@ class TrajectoryClients:
 
 
 class _Connection:
-    """Connects one :class:`TrajectoryOutput` with a client."""
-
     output: TrajectoryOutput
 
     def __init__(self, kind: Any, client: Any) -> None:

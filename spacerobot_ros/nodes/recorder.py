@@ -349,7 +349,6 @@ class RecorderNode(FlightNode):
         self._publish_state()
 
     def _check_file(self) -> None:
-        """Check the file; a failure is published again for late subscribers."""
         recording = self.recording
         if recording is None or recording.state is RecordingState.CLOSED:
             return
@@ -549,7 +548,6 @@ def _recorded_qos(offered: QoSProfile) -> QosProfile:
 
 
 def _subscribed_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """Return the best quality of service that all publishers of a topic offer."""
     reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
     latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
     return QoSProfile(

@@ -106,7 +106,6 @@ class MissionClient:
         )
 
     def _make_publisher(self, link: str, *, path: bool) -> Publisher:
-        """Return the publisher of goals of a link: of paths, or of poses."""
         name = link or DEFAULT_END_EFFECTOR
         if path:
             return self.node.create_publisher(Path, path_topic(name), STREAM)

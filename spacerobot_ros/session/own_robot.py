@@ -79,14 +79,12 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
 
 
 def _other_joints_clause(count: int) -> str:
-    """Return a sentence that extends a remark about one joint to others."""
     if not count:
         return ""
     return f" The same holds for {count} other joint{'s' if count > 1 else ''}."
 
 
 def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]:
-    """Yield notes on the limits of a joint, each with a number for its kind."""
     limits, unit, speed = joint.limits, joint.unit, joint.limits.velocity
     if speed == 0:
         yield (

@@ -356,7 +356,6 @@ class MultiProcessStack:
         self.require_alive()
 
     def _restart_commanders(self) -> None:
-        """Start planner and controller again that have died, as long as the limit allows it."""
         for name in self.scenario.commanders:
             if self.processes[name].poll() is None or name in self._timeline.away:
                 continue
@@ -471,7 +470,6 @@ class MultiProcessStack:
 
 
 def _require_flyable(scenario: Scenario) -> None:
-    """Raise ParameterError if the scenario kills nodes in lockstep, or its goals cannot be sent."""
     if scenario.kills and scenario.lockstep:
         raise ParameterError(
             f"The scenario '{scenario.name}' kills nodes in flight: fly it with --nodes and "

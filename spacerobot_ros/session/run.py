@@ -96,7 +96,6 @@ def _fly_and_write(
     look: Callable[[float, float], bool],
     longest: float,
 ) -> dict[str, Any]:
-    """Fly, write the flight, also one that ends by an error, and return the summary."""
     with writer:
         began = time.perf_counter()
         try:

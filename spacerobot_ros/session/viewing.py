@@ -164,7 +164,6 @@ def _read_log_lines(log: Path) -> list[str]:
 
 
 def _read_announcement(process: subprocess.Popen[bytes], log: Path) -> str:
-    """Return the line that the viewer prints once its page is served."""
     assert process.stdout is not None
     text, deadline = b"", time.monotonic() + _LONGEST_START
     while not text.endswith(b"\n"):

@@ -534,7 +534,6 @@ class CapturePlant(WrappedPlant):
         return report
 
     def _continue(self, robot: SpaceRobot, motion: RobotMotion, momenta: Array) -> None:
-        """Integrate another robot from this motion on."""
         start = InitialState(
             position=motion.pose[:3],
             quaternion=motion.pose[3:],

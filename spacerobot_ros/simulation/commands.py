@@ -393,7 +393,6 @@ class CommandValidator:
         return None
 
     def _refuse(self, source: CommandSource, refusal: Refusal, now_ns: int) -> Refusal:
-        """Count a refused command, and latch a fault if its reason does."""
         self.counts[refusal.reason] += 1
         if refusal.reason not in self._latching or self.fault:
             return refusal

@@ -365,7 +365,6 @@ class EffortPlant:
         return self._apply_limits()
 
     def _apply_limits(self) -> bool:
-        """Count clipped joints, and repeat the tick if a joint touched a stop or is locked."""
         n = self.robot.n
         clipped, touched = self._limited[1 : 1 + n] != 0.0, self._limited[1 + n] != 0.0
         stopped = np.zeros(n, dtype=np.bool_)

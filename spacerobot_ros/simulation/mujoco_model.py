@@ -161,7 +161,6 @@ def _add_contacts(
     robot: RobotDescription,
     target: tuple[RobotDescription, str] | None,
 ) -> list[str]:
-    """Add shapes and the target; return the names of the target's shapes."""
     geometry = CollisionGeometry(robot)
     names = [
         _add_shape(mujoco, spec, solid, f"{_OBSTACLE if solid.is_obstacle else ''}{index}")
@@ -235,7 +234,6 @@ def _add_target(spec: Any, target: RobotDescription) -> None:
 
 
 def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = "") -> str:
-    """Add a solid to its body, without mass, and return the name of its geometry."""
     body = spec.worldbody if solid.is_obstacle else spec.body(body_name(f"{prefix}{solid.link}"))
     kinds, size = mujoco.mjtGeom, solid.shape.size
     # Pairs that push are named one by one.

@@ -470,7 +470,6 @@ class PlantNode(FlightNode):
             self._publish_report()
 
     def _ticks_for_viewers(self, seconds: float, longest_wall: float) -> int:
-        """Return the ticks of a period, which real time shortens for viewers."""
         if self._real_time is not None and seconds:
             seconds = min(seconds, longest_wall * self.config.real_time_factor)
         return self.config.ticks_of(seconds)
@@ -545,7 +544,6 @@ class PlantNode(FlightNode):
             self._step()
 
     def _on_injection(self, inject: Callable[[str], None], message: String) -> None:
-        """Inject the faults or disturbances in a message, one a line, or remove all ("clear")."""
         try:
             inject(message.data)
         except ParameterError as error:

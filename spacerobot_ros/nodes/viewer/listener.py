@@ -464,8 +464,6 @@ class Listener:
 
 @dataclass(frozen=True)
 class _Heartbeat:
-    """The last heartbeat of a node: time of arrival, wall s, pulse and role."""
-
     at: float
     pulse: HeartbeatState
     role: str
