@@ -17,7 +17,7 @@ import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.targets import DrawnFlight
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array
 
@@ -176,11 +176,15 @@ def drawn_flights(
             # Other values are refused below.
             flights = dispersion.target.apply(flights, np.where(np.isfinite(drawn), drawn, 1.0))
         seeds = [draw.seed if has_own_seed else None for draw in block]
-        each = zip(block, flights.separate(seeds), flights.surely_physical().tolist(), strict=True)
-        for draw, flight, is_physical in each:
+        try:
+            flights.require_physical()
+            suspicious = False
+        except RobotDescriptionError:
+            suspicious = True
+        for draw, flight in zip(block, flights.separate(seeds), strict=True):
             try:
                 made = _with_values(campaign, draw, flight)
-                if not is_physical:
+                if suspicious:
                     made.require_physical()
             except Exception as error:
                 yield draw, error

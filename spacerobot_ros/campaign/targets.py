@@ -40,8 +40,6 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("plant.robot", "plant.robot_description", "plant.time_mode", "plant.resume_bag"),
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
-_MIN_FACTOR = 1e-6
-"""If mass and inertia factors are between this value and its inverse, bodies need no check."""
 
 _FACTORS = ("mass", "inertia", "com")
 """Attributes of :class:`DrawnFlight` with one value per flight."""
@@ -116,9 +114,8 @@ class DrawnFlight:
         factor.
     com
         (..., B, 3) centre of mass offsets, m.
-    parameters, is_physical
-        Masses, centres of mass and inertias of the nominal robot, and whether they are physical
-        without rounding tolerance.
+    parameters
+        Masses, centres of mass and inertias of the nominal robot.
     has_target_masses
         Whether the target's mass properties are drawn.
     seed
@@ -131,7 +128,6 @@ class DrawnFlight:
     inertia: Array
     com: Array
     parameters: InertialParameters
-    is_physical: bool
     has_target_masses: bool = False
     seed: int | None = None
 
@@ -142,15 +138,13 @@ class DrawnFlight:
             scenario.config(node)  # Known to all flights that are made of this one.
         robot = description_of(scenario)
         count = len(robot.bodies)
-        parameters = InertialParameters.of(robot)
         return cls(
             scenario,
             robot,
             mass=np.ones(count),
             inertia=np.ones(count),
             com=np.zeros((count, 3)),
-            parameters=parameters,
-            is_physical=_are_exactly_physical(parameters),
+            parameters=InertialParameters.of(robot),
         )
 
     def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
@@ -203,25 +197,15 @@ class DrawnFlight:
             flights.append(flight)
         return flights
 
-    def surely_physical(self) -> npt.NDArray[np.bool_]:
-        """Return whether :meth:`require_physical` can skip the body check for flights (...).
-
-        Positive factors preserve the ratios of principal moments.
-        """
-        factors = np.concatenate([self.mass, self.inertia], axis=-1)
-        mild = (factors > _MIN_FACTOR) & (factors < 1.0 / _MIN_FACTOR)
-        finite = np.isfinite(self.com).all(axis=(-2, -1))
-        return np.asarray(self.is_physical & mild.all(axis=-1) & finite)
-
     def require_physical(self) -> None:
-        """Check that drawn masses and inertias are physical.
+        """Check that all drawn masses and inertias are physical.
 
         Raises
         ------
         RobotDescriptionError
             They are not.
         """
-        if self.inertial is not None and not self.surely_physical().all():
+        if self.inertial is not None:
             self.inertial.require_physical([body.name for body in self.nominal.bodies])
 
     def with_draws_in_scenario(self) -> DrawnFlight:
@@ -258,13 +242,6 @@ def description_of(scenario: Scenario) -> RobotDescription:
             f"the scenario '{scenario.name}' specifies no robot for its plant: set plant.robot."
         )
     return _load_description(plant.robot, plant.robot_description, plant.world)
-
-
-def _are_exactly_physical(parameters: InertialParameters) -> bool:
-    """Whether all bodies have positive masses, and moments that need no slack for rounding."""
-    low, middle, high = np.linalg.eigvalsh(parameters.inertias).T
-    moments = np.all(low >= 0.0) and np.all(high <= low + middle)
-    return bool(np.all(parameters.masses > 0.0) and moments)
 
 
 @cache
