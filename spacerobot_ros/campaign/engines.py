@@ -29,20 +29,14 @@ def select_engine(campaign: Campaign, engine_name: str) -> Engine:
     SpaceRobotError
         The engine cannot fly the campaign, or no engine can; the message states the reason.
     """
-    if engine_name != "auto":
-        engine = ENGINE_FACTORIES[engine_name]()
-        reason = engine.refusal(campaign)
-        if reason:
-            raise SpaceRobotError(f"The engine '{engine_name}' cannot fly this campaign: {reason}")
-        return engine
     reasons = []
-    for name, make in ENGINE_FACTORIES.items():
-        engine = make()
+    for name in ENGINE_FACTORIES if engine_name == "auto" else (engine_name,):
+        engine = engine_by_name(name)
         reason = engine.refusal(campaign)
         if not reason:
             return engine
-        reasons.append(f"{name}: {reason}")
-    raise SpaceRobotError(f"No engine can fly this campaign. {' '.join(reasons)}")
+        reasons.append(f"The engine '{name}' cannot fly this campaign: {reason}")
+    raise SpaceRobotError(" ".join(reasons))
 
 
 @cache

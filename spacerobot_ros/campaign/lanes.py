@@ -230,8 +230,6 @@ class _ScheduledLanes:
     max_batch_flights = 512
 
     def __init__(self) -> None:
-        self._extremes: tuple[GaitSchedule, Array, Array] | None = None
-        """The last schedule, and its lowest and highest joint positions (n,), m or rad."""
         self._planned_values: _PlannedValues | None = None
         """The values that determine plans for the last scenario, common to many draws."""
         self._last_plan: tuple[Any, _Plan | None] | None = None
@@ -281,13 +279,6 @@ class _ScheduledLanes:
             self._last_plan = key, _first_plan(flight)
         return self._last_plan[1]
 
-    def _extremes_of(self, schedule: GaitSchedule) -> tuple[Array, Array]:
-        """Return the lowest and highest positions of the joints; draws often share a schedule."""
-        if self._extremes is None or self._extremes[0] is not schedule:
-            positions = schedule.positions
-            self._extremes = schedule, positions.min(axis=0), positions.max(axis=0)
-        return self._extremes[1:]
-
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
         planner = batch[0].flight.scenario.planner
         first, ticks = batch[0].schedule, [each.schedule.ticks for each in batch]
@@ -328,6 +319,8 @@ class _ScheduledLanes:
         own = {each: np.isin(flights.report_ticks, _evaluated_ticks(each)) for each in set(ticks)}
         evaluated = np.array([own[each] for each in ticks])
         drifts = momentum_drift(np.where(evaluated[..., np.newaxis], result.momentum, np.nan))
+        shared = {id(each.schedule): each.schedule.positions for each in batch}
+        extremes = {key: (each.min(axis=0), each.max(axis=0)) for key, each in shared.items()}
         for row, ready in enumerate(batch):
             if row in result.failures:
                 yield "was refused by the plant"
@@ -349,7 +342,7 @@ class _ScheduledLanes:
                 continue
             assert ready.plan is not None
             hand = _end_effector_error(flights.robot, ready.flight, q[row], pose)
-            lowest, highest = self._extremes_of(schedule)
+            lowest, highest = extremes[id(schedule)]
             yield Measures(
                 *decided,
                 duration=duration,
