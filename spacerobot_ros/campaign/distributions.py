@@ -266,23 +266,17 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
                     f"'{name}': uniform is from {least:g} to {most:g}; the first must be smaller."
                 )
             arguments = [least, most - least]
-        if len(arguments) > len(words):
-            raise ParameterError(
-                f"'{name}': {kind} takes {', '.join(words)}, not {len(arguments)} numbers."
-            )
-        arguments = dict(zip(words, arguments, strict=False))
-    if not isinstance(arguments, dict):
-        raise ParameterError(f"'{name}': {kind} must have arguments: {', '.join(words)}.")
-    for word in arguments:
-        if word not in words:
-            raise ParameterError(
-                f"'{name}': {kind} has no argument '{word}'; it takes {', '.join(words)}"
-                f"{': ' + _ARGUMENT_HELP[kind] if kind in _ARGUMENT_HELP else ''}."
-                f"{suggestion(str(word), words)}"
-            )
-    missing = [word for word in filter(None, shapes) if word not in arguments]
-    if missing:
-        raise ParameterError(f"'{name}': {kind} requires the argument '{missing[0]}'.")
+        if len(arguments) <= len(words):
+            arguments = dict(zip(words, arguments, strict=False))
+    required = set(filter(None, shapes))
+    if not isinstance(arguments, dict) or not required <= arguments.keys() <= set(words):
+        named = arguments if isinstance(arguments, dict) else {}
+        unknown = [str(word) for word in named if word not in words]
+        raise ParameterError(
+            f"'{name}': {kind} takes {', '.join(words)}, not {arguments!r}"
+            f"{': ' + _ARGUMENT_HELP[kind] if kind in _ARGUMENT_HELP else ''}."
+            f"{suggestion(unknown[0], words) if unknown else ''}"
+        )
     values = {word: read_real_number(f"{name}: {word}", value) for word, value in arguments.items()}
     with np.errstate(all="ignore"):
         middle = float(distribution.ppf(0.5, **values))

@@ -46,11 +46,15 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mas": NORM}}, "'mas' cannot be dispersed.*Did you mean 'mass'"),
     ({"disperse": {"mass.mass_7": NORM}}, "no body 'mass_7'.*Did you mean 'mass_"),
     ({"disperse": {"mass": {"nrom": {}}}}, "no distribution 'nrom'.*Did you mean 'norm'"),
-    ({"disperse": {"mass": {"norm": {"scal": 1}}}}, "no argument 'scal'.*Did you mean 'scale'"),
+    (
+        {"disperse": {"mass": {"norm": {"scal": 1}}}},
+        "not {'scal': 1}.*Did you mean 'scale'",
+    ),
+    ({"disperse": {"mass": {"norm": 3}}}, "norm takes loc, scale, not 3"),
     ({"disperse": {"mass": {"norm": {"scale": -1}}}}, "norm is not defined for these"),
     ({"disperse": {"mass": {"norm": {"loc": "one"}}}}, "'mass: loc' is 'one'"),
-    ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta requires the argument 'b'"),
-    ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, "norm takes loc, scale, not 3 numbers"),
+    ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta takes a, b, loc, scale, not {'a': 1}"),
+    ({"disperse": {"mass": {"norm": [1, 2, 3]}}}, r"norm takes loc, scale, not \[1, 2, 3\]"),
     ({"disperse": {"mass": {"uniform": [1]}}}, r"uniform takes two numbers, \[smallest, largest\]"),
     (
         {"disperse": {"mass": {"uniform": [2, 1]}}},
