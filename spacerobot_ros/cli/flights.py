@@ -14,12 +14,12 @@ import click
 from spacerobot_ros.cli.options import (
     LAWS,
     METHODS,
-    EndEffectorOptions,
     GoalCommand,
     GoalOptions,
     attitude_options,
     bag_option,
     complete_scenario,
+    end_effector_goals,
     end_effector_options,
     goal_options,
     json_option,
@@ -388,7 +388,7 @@ def goal_command(
     goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C ended the command; the stack still
     pursues the goal.
     """
-    hands = EndEffectorOptions(poses, positions, links, paths).goals()
+    hands = end_effector_goals(poses, positions, links, paths)
     turned = rotvec is not None or rpy_deg is not None
     if len(pose) not in ((0, 3, 7) if hands or turned else (3, 7)):
         raise click.UsageError("A goal is X Y Z, or X Y Z QX QY QZ QW.")

@@ -7,7 +7,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, wraps
 from importlib import import_module
 from itertools import takewhile
@@ -222,69 +222,57 @@ class GoalOptions:
         (7,) position (m) and quaternion, or (3,) position, if given.
     rotvec, rpy_deg
         (3,) attitude in radians or in degrees, if given.
+    end_effectors
+        Goals of end-effectors.
     """
 
     pose: tuple[float, ...] | None
     rotvec: tuple[float, ...] | None
     rpy_deg: tuple[float, ...] | None
-    end_effectors: EndEffectorOptions = field(default_factory=lambda: EndEffectorOptions())
+    end_effectors: Sequence[EndEffectorGoal] = ()
 
     def apply_to(self, scenario: Scenario) -> Scenario:
         """Return a scenario with this goal; warn about a rotation that looks like degrees."""
         if self.rotvec is not None:
             warn_of_large_angles(self.rotvec, "--goal-rpy-deg")
         scenario = scenario.with_goal(self.pose, self.rotvec, self.rpy_deg)
-        hands = self.end_effectors.goals()
-        if not hands:
+        if not self.end_effectors:
             return scenario
         attitude = self.rotvec is not None or self.rpy_deg is not None
         asked: set[Controlled] = {"attitude"} if attitude else set()
         if self.pose is not None:
             asked |= {"position"} if len(self.pose) == 3 else {"position", "attitude"}
-        return scenario.with_end_effectors(hands, frozenset(asked))
+        return scenario.with_end_effectors(self.end_effectors, frozenset(asked))
 
 
-@dataclass(frozen=True)
-class EndEffectorOptions:
-    """End-effector goals from the command line.
+def end_effector_goals(
+    poses: Sequence[tuple[float, ...]] = (),
+    positions: Sequence[tuple[float, ...]] = (),
+    links: Sequence[str] = (),
+    paths: Sequence[Path] = (),
+) -> list[EndEffectorGoal]:
+    """Return the goals of the :func:`end_effector_options`, whose links are in the order of the
+    poses, positions and paths; without a link, one goal is for the default end-effector.
 
-    Attributes
-    ----------
-    poses, positions
-        Poses (7,) and positions (3,), m.
-    links
-        Link names, in the order of the poses, positions and paths; empty: the default link.
-    paths
-        Path files: each line is a position or a pose.
+    Raises
+    ------
+    click.UsageError
+        The numbers of names and goals differ.
+    GoalError
+        A goal is not a position, pose or path, or a link has two goals.
     """
+    from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 
-    poses: Sequence[tuple[float, ...]] = ()
-    positions: Sequence[tuple[float, ...]] = ()
-    links: Sequence[str] = ()
-    paths: Sequence[Path] = ()
-
-    def goals(self) -> list[EndEffectorGoal]:
-        """Return the goals, an empty list if none are given.
-
-        Raises
-        ------
-        click.UsageError
-            The numbers of names and goals differ.
-        GoalError
-            A goal is not a position, pose or path, or a link has two goals.
-        """
-        from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
-
-        values: list[Any] = [*self.poses, *self.positions, *map(_read_path, self.paths)]
-        links = self.links or [""] * min(len(values), 1)
-        if len(links) != len(values):
-            raise click.UsageError(
-                f"{len(values)} end-effector goal(s) and {len(self.links)} name(s): give one "
-                "--end-effector for each --end-effector-goal, then for each "
-                "--end-effector-position, then for each --end-effector-path."
-            )
-        goals = [EndEffectorGoal.of_numbers(*each) for each in zip(links, values, strict=True)]
-        return list(Goal.of_end_effectors(goals).end_effectors) if goals else goals
+    values: list[Any] = [*poses, *positions, *map(_read_path, paths)]
+    named = links or [""] * min(len(values), 1)
+    if len(named) != len(values):
+        raise click.UsageError(
+            f"{len(values)} end-effector goal(s) and {len(links)} name(s): give one "
+            "--end-effector for each --end-effector-goal, then for each "
+            "--end-effector-position, then for each --end-effector-path."
+        )
+    goals = [EndEffectorGoal.of_numbers(*each) for each in zip(named, values, strict=True)]
+    return list(Goal.of_end_effectors(goals).end_effectors) if goals else goals
 
 
 def _read_path(file: Path) -> list[list[float]]:
@@ -324,7 +312,7 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     ) -> None:
         if goal is not None and position is not None:
             raise click.UsageError("The goal is given twice, as a pose and as a position.")
-        hands = EndEffectorOptions(poses, positions, links, paths)
+        hands = end_effector_goals(poses, positions, links, paths)
         command(*words, goal=GoalOptions(goal or position, rotvec, rpy_deg, hands), **options)
 
     with_poses = _position_option(_pose_option(_attitude_options("goal-")(with_goal)))

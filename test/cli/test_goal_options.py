@@ -28,10 +28,10 @@ import spacerobot_ros.session.live as session
 from spacerobot_ros.cli import terminal
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.cli.options import (
-    EndEffectorOptions,
     GoalCommand,
     GoalOptions,
     beside,
+    end_effector_goals,
     goal_options,
     warn_of_large_angles,
 )
@@ -76,7 +76,7 @@ def test_beside_goals_of_end_effectors_the_base_has_what_is_asked(
     pose: Any, rotvec: Any, rpy_deg: Any, base: list[str]
 ) -> None:
     asked: Any = RequestedPart()
-    hands = EndEffectorOptions((), (HAND,), ("left",))
+    hands = end_effector_goals((), (HAND,), ("left",))
     GoalOptions(pose, rotvec, rpy_deg, hands).apply_to(asked)
     assert asked.goals == [(pose, rotvec, rpy_deg), (["left"], base)]
     alone: Any = RequestedPart()
@@ -85,15 +85,15 @@ def test_beside_goals_of_end_effectors_the_base_has_what_is_asked(
 
 
 def test_end_effectors_have_names_in_the_order_of_poses_then_positions() -> None:
-    found = EndEffectorOptions((POSE,), (HAND,), ("left", "right")).goals()
+    found = end_effector_goals((POSE,), (HAND,), ("left", "right"))
     assert [(each.link, tuple(each.position)) for each in found] == [
         ("left", POSE[:3]),
         ("right", HAND),
     ]
     assert [each.quaternion is None for each in found] == [False, True]
-    (found_one,) = EndEffectorOptions((), (HAND,)).goals()
+    (found_one,) = end_effector_goals((), (HAND,))
     assert found_one.link == ""
-    assert EndEffectorOptions().goals() == []
+    assert end_effector_goals() == []
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_end_effectors_with_more_or_fewer_names_are_refused(
     poses: Any, positions: Any, links: Any, counts: str
 ) -> None:
     with pytest.raises(click.UsageError) as refused:
-        EndEffectorOptions(poses, positions, links).goals()
+        end_effector_goals(poses, positions, links)
     assert refused.value.message == (
         f"{counts}: give one --end-effector for each --end-effector-goal, then for each "
         "--end-effector-position, then for each --end-effector-path."
@@ -221,8 +221,8 @@ def test_paths_of_end_effectors_are_read_from_files(tmp_path: Path) -> None:
     places, poses = tmp_path / "places.txt", tmp_path / "poses.csv"
     places.write_text("# x y z\n1.5 0.7 1.3\n\n1.3, -0.9 0.8  # the goal\n", encoding="utf-8")
     poses.write_text("0.1,0.2,0.3,0,0,0,2\n0.4,0.5,0.6,0,0.6,0,0.8\n", encoding="utf-8")
-    options = EndEffectorOptions((), (HAND,), ("tip", "left", "right"), (places, poses))
-    found = {each.link: each for each in options.goals()}
+    goals = end_effector_goals((), (HAND,), ("tip", "left", "right"), (places, poses))
+    found = {each.link: each for each in goals}
     assert found["tip"].waypoints is None
     assert found["left"].path_values.tolist() == [[1.5, 0.7, 1.3], [1.3, -0.9, 0.8]]
     assert found["right"].values == (0.4, 0.5, 0.6, 0.0, 0.6, 0.0, 0.8)
@@ -244,7 +244,7 @@ def test_files_that_are_no_paths_are_refused(tmp_path: Path, text: str | None, w
     if text is not None:
         file.write_text(text, encoding="utf-8")
     with pytest.raises(click.BadParameter) as refused:
-        EndEffectorOptions((), (), (), (file,)).goals()
+        end_effector_goals((), (), (), (file,))
     assert f"The path {file}" in refused.value.message
     assert words in refused.value.message
     assert "a position and a quaternion" in refused.value.message
