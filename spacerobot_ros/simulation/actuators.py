@@ -28,8 +28,9 @@ from spacerobot_ros.simulation.faults import (
     Disturbance,
     Fault,
     FaultTargets,
-    disturbance_timeline,
-    fault_timeline,
+    Timeline,
+    parse_disturbance,
+    parse_fault,
 )
 from spacerobot_ros.simulation.loads import PlantLoads, Surroundings
 from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
@@ -196,9 +197,8 @@ class PlantWithFaults(WrappedPlant):
         self.capturing = inner if isinstance(inner, CapturePlant) else None
         """The plant that captures the target; None: there is no target."""
         nozzles = self.thrusters.table.names if self.thrusters is not None else ()
-        self.timeline = fault_timeline(
-            faults, FaultTargets(plant.robot.joint_names, wrench, nozzles)
-        )
+        targets = FaultTargets(plant.robot.joint_names, wrench, nozzles)
+        self.timeline = Timeline(faults, lambda line, now: parse_fault(line, targets, now))
         self.takes_wrench = wrench
         """Whether a step accepts a base wrench in addition to the joint commands."""
         self.tick = 0
@@ -220,7 +220,9 @@ class PlantWithFaults(WrappedPlant):
         """Active faults and disturbances; a new tuple object after every change."""
         self.loads: PlantLoads | None = None
         """External loads; None: there have been none so far."""
-        self._disturbances = disturbance_timeline(disturbances, self.robot.link_names)
+        self._disturbances = Timeline(
+            disturbances, lambda line, now: parse_disturbance(line, plant.robot.link_names, now)
+        )
         self._surroundings = surroundings or Surroundings()
         self.apply_active_faults()
         self._apply_active_disturbances()

@@ -188,17 +188,6 @@ def edited_fault(line: str, part: str, text: str) -> str:
     return " ".join([kind, target, *value, *times])
 
 
-def fault_timeline(lines: Iterable[str], targets: FaultTargets) -> Timeline[Fault]:
-    """Return the fault timeline of one plant.
-
-    Raises
-    ------
-    ParameterError
-        A line is not a valid fault for this plant.
-    """
-    return Timeline(lines, lambda line, now: parse_fault(line, targets, now))
-
-
 # -- disturbances ---------------------------------------------------------------------------------
 
 _MAX_COMPONENT = 1e6  # N or N m
@@ -275,17 +264,6 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
     if start < 0.0:
         raise refusal(f"it begins at {start:g} s, before the simulation begins")
     return Disturbance(link, vectors["force"], vectors["torque"], in_link, start, end)
-
-
-def disturbance_timeline(lines: Iterable[str], links: Sequence[str]) -> Timeline[Disturbance]:
-    """Return the disturbance timeline of one plant.
-
-    Raises
-    ------
-    ParameterError
-        A line is not a valid disturbance for this robot.
-    """
-    return Timeline(lines, lambda line, now: parse_disturbance(line, links, now))
 
 
 # -- lines and times ------------------------------------------------------------------------------

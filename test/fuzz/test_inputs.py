@@ -50,7 +50,7 @@ from spacerobot_ros.simulation.faults import (
     SENSOR_GROUPS,
     WRENCH_AXES,
     FaultTargets,
-    fault_timeline,
+    Timeline,
     parse_fault,
 )
 
@@ -103,7 +103,10 @@ def test_a_line_is_refused_or_says_the_same_when_written_again(line: str, wrench
     "fault timeline", st.lists(LINES, max_size=4), st.lists(NUMBERS, max_size=4), fast=20, long=400
 )
 def test_a_timeline_of_lines(lines: list[str], times: list[float]) -> None:
-    timeline = attempt("fault timeline", fault_timeline, lines, FaultTargets(JOINTS, True))
+    targets = FaultTargets(JOINTS, True)
+    timeline = attempt(
+        "fault timeline", Timeline, lines, lambda line, now: parse_fault(line, targets, now)
+    )
     if timeline is not None:
         for time in sorted(t for t in times if math.isfinite(t)):
             assert all(f.start <= time < f.end for f in timeline.at(time))

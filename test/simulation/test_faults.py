@@ -29,7 +29,7 @@ from spacerobot_ros.simulation.faults import (
     FAULT_KINDS,
     Fault,
     FaultTargets,
-    fault_timeline,
+    Timeline,
     parse_fault,
 )
 from spacerobot_ros.simulation.plant import Plant
@@ -181,7 +181,7 @@ def test_faults_are_active_from_their_start_until_before_their_end() -> None:
         "",
         "sensor_delay odom 1",
     ]
-    timeline = fault_timeline(lines, TARGETS)
+    timeline = Timeline(lines, lambda line, now: parse_fault(line, TARGETS, now))
     active = {t: [f.kind for f in timeline.at(t)] for t in (0.0, 0.999, 1.0, 2.0, 2.999, 3.0, 9.0)}
     assert active == {
         0.0: ["sensor_delay"],
