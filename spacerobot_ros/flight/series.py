@@ -48,10 +48,6 @@ class Signal:
         """Return the norms (N, 1) of selected columns."""
         return Signal(self.time, np.linalg.norm(self.values[:, columns], axis=1, keepdims=True))
 
-    def relative_to_first(self) -> Signal:
-        """Return the changes since the first sample."""
-        return Signal(self.time, self.values - self.values[:1])
-
 
 @dataclass(frozen=True)
 class Commands:

@@ -29,7 +29,7 @@ from matplotlib.ticker import MaxNLocator
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.report.signals import envelope, simplified
+from spacerobot_ros.report.signals import thinned
 
 TEXT_COLOUR, SECONDARY_COLOUR, LINE_COLOUR = "#1f2328", "#667085", "#c3c8d0"
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -49,12 +49,6 @@ _NARROW_WIDTH = 6.0
 
 TRACE_TIME_SLICES = 960
 """Number of time slices across a figure that summarise a dense trace."""
-
-LARGEST_VALUE_SLICES = 240
-"""Number of time slices for a trace drawn as the largest value in each slice."""
-
-_INVISIBLE_ERROR = 5e-4
-"""Largest error of a simplified line, as a share of the panel height."""
 
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
@@ -401,59 +395,19 @@ def flight_dashes(number: int) -> tuple[float, ...]:
 
 
 def draw_traces(
-    axes: Axes,
-    signal: Signal,
-    colours: Sequence[str],
-    share: float = 1.0,
-    factor: float = 1.0,
-    dashes: tuple[float, ...] = (),
-) -> bool:
-    """Draw every column of a signal; return whether any is drawn as a band.
-
-    A line omits samples that make no visible difference. If more samples remain than the panel,
-    which has ``share`` of the figure width, can show, a band spans the smallest and largest value
-    in each time slice.
-    """
-    if not len(signal):
-        # A close-up without samples.
-        return False
-    style: Any = (0, dashes) if dashes else "-"
-    columns = max(int(TRACE_TIME_SLICES * share), 20)
-    low, high = axes.get_ylim()
-    dense = False
-    for index, tint in enumerate(colours):
-        values = factor * signal.values[:, index]
-        in_sight = Signal(signal.time, values[:, np.newaxis] / (_INVISIBLE_ERROR * (high - low)))
-        crowded = len(signal) > 2 * columns
-        kept, off = simplified(in_sight, columns)
-        if off > 1.0 and crowded:
-            dense = True
-            time, least, most = envelope(signal, index, columns)
-            axes.fill_between(
-                time,
-                factor * least,
-                factor * most,
-                facecolor=(*mpl.colors.to_rgb(tint), 0.3),
-                edgecolor=tint,
-                linewidth=0.9,
-                linestyle=style,
-                zorder=2.5,
-            )
-            continue
-        if off > 1.0:
-            kept = np.arange(len(signal))
-        marker = "o" if len(signal) < 3 else ""
-        axes.plot(signal.time[kept], values[kept], color=tint, ls=style, marker=marker, ms=4)
-    return dense
-
-
-def largest_over_time(signal: Signal, column: int) -> tuple[Array, Array]:
-    """Return the times and values of a column; if it is dense, only the largest value in each time
-    slice."""
-    if len(signal) <= 2 * LARGEST_VALUE_SLICES:
-        return signal.time, signal.values[:, column]
-    time, _, high = envelope(signal, column, LARGEST_VALUE_SLICES)
-    return time, high
+    axes: Axes, signal: Signal, colours: Sequence[str], dashes: tuple[float, ...] = ()
+) -> None:
+    """Draw every column of a signal; of dense ones the extremes in each time slice."""
+    for index, tint in enumerate(colours if len(signal) else ()):
+        part = thinned(Signal(signal.time, signal.values[:, [index]]), TRACE_TIME_SLICES)
+        axes.plot(
+            part.time,
+            part.values[:, 0],
+            color=tint,
+            ls=(0, dashes) if dashes else "-",
+            marker="o" if len(signal) < 3 else "",
+            ms=4,
+        )
 
 
 def set_range(
@@ -500,9 +454,9 @@ def set_time(axes: Axes, start: float, end: float) -> None:
 def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
     """Write the labels (value, text, colour) to the right of the axes at their values, without
     overlaps."""
-    low, high = axes.get_ylim()
     ordered = sorted(labels)
-    wanted = np.clip([(value - low) / (high - low) for value, _, _ in ordered], 0.0, 1.0)
+    to_axes = axes.transData - axes.transAxes
+    wanted = np.clip([to_axes.transform((0.0, value))[1] for value, _, _ in ordered], 0.0, 1.0)
     height = axes.get_window_extent().height / axes.figure.dpi
     gap = min(inches(0.155) / height, 1.0 / max(len(ordered) - 1, 1))
     for at, (_, text, tint) in zip(_separate_labels(wanted, gap), ordered, strict=True):
@@ -565,13 +519,6 @@ def fit_legend(legend: Legend, room: float) -> None:
         text.set_fontsize(share * float(text.get_fontsize()))
 
 
-def scaled(unit: str, largest: float) -> tuple[float, str]:
-    """Return the factor and unit suited to values of at most ``largest``."""
-    if unit not in ("m", "rad") or largest == 0.0 or largest >= 0.05:
-        return 1.0, unit
-    return (1e3, f"m{unit}") if largest >= 5e-5 else (1e6, f"µ{unit}")
-
-
 LIMIT = "limit (URDF)"
 """Name of a joint limit in legends."""
 
@@ -621,6 +568,13 @@ class TraceGroup:
         return [each for each in (self.signal, *self.beside) if len(each)]
 
     @property
+    def height(self) -> float:
+        """Height of the panel, inches."""
+        if self.rows:
+            return 0.4 + 0.14 * len(self.names)
+        return 1.7 if self.decades else 2.3
+
+    @property
     def values(self) -> Array:
         """All values from all flights."""
         return np.concatenate([np.empty(0), *(each.values.ravel() for each in self.signals)])
@@ -654,8 +608,6 @@ class ReportFigure:
         The picture.
     groups
         The traces of its panels over the whole flight; none if the figure is not over time.
-    picture_section
-        The part of the caption that applies to the picture but not to its charts.
     """
 
     name: str
@@ -663,7 +615,6 @@ class ReportFigure:
     caption: str
     figure: Figure
     groups: Sequence[TraceGroup] = ()
-    picture_section: str = ""
 
     @cached_property
     def svg(self) -> bytes:

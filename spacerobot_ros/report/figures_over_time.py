@@ -1,8 +1,8 @@
 """Figures over flight time: motion, efforts, thrusters, momentum, errors.
 
-Traces with the same unit share a panel; events are shown below the time axes; gaits with equal
-cycles get close-ups. A function named after a figure returns the figure, a sentence explaining why
-the bag has no such figure, or None if it does not apply to the flight.
+Traces with the same unit share a panel; events are shown below the time axes. A function named
+after a figure returns the figure, a sentence explaining why the bag has no such figure, or None if
+it does not apply to the flight.
 """
 
 from __future__ import annotations
@@ -39,22 +39,16 @@ from spacerobot_ros.report.figures import (
     draw_traces,
     end_labels,
     flight_dashes,
-    largest_over_time,
     legend_above,
     legend_entry,
     log_range,
-    narrow,
     room_for,
-    scaled,
     set_range,
     set_time,
     sheet,
 )
 from spacerobot_ros.report.flight import FlightReport, GoalSpan, joint_unit, pose_errors
-from spacerobot_ros.report.signals import Cycles, Indices, envelope
-
-SHOWN_CYCLES = 3
-"""Cycles in a close-up."""
+from spacerobot_ros.report.signals import Indices, thinned
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
@@ -67,32 +61,63 @@ _LABEL_HEIGHT = 0.17
 _DUTY_ROW_HEIGHT = 0.8
 """Height of a duty cycle of 1 relative to its row."""
 
-BAND_CAPTION = (
-    "If a trace has more samples than the picture has columns, the band spans the smallest and "
-    "largest value in each time slice."
-)
-
-EVENTS_CAPTION = (
-    "Events below the time axis: goals and plans in the upper row, robot and faults below."
+_EVENTS_CAPTION = (
+    " Events below the time axis: goals and plans in the upper row, robot and faults below."
 )
 
 
-def draw_group(
-    axes: Axes, group: TraceGroup, end: float, share: float = 1.0, later: Sequence[float] = ()
-) -> bool:
+def draw_group(axes: Axes, group: TraceGroup, end: float, later: Sequence[float] = ()) -> None:
     """Draw traces from zero to an end time, s, and marks at the start times of ``later`` schedules,
     s.
-
-    Return whether any trace is drawn as a band.
     """
     set_time(axes, 0.0, max([end, *(float(each.time[-1]) for each in group.signals)]))
     if group.rows:
-        return _draw_rows(axes, group, share)
+        _draw_rows(axes, group)
+        return
+    _set_value_axis(axes, group)
+    low, high = axes.get_ylim()
+    keys = []
+    shown = [(k, bound) for k, bound in group.limits if low < bound < high]
+    for bound in {bound for _, bound in shown}:
+        owners = [k for k, other in shown if other == bound]
+        shared = len(owners) == len(group.names) > 1
+        tint = SECONDARY_COLOUR if shared else group.colours[owners[0]]
+        axes.axhline(bound, color=tint, lw=1.0, ls=(0, DOTS), zorder=1.8)
+    if shown:
+        keys.append(legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS))
+    for number, signal in enumerate((group.signal, *group.beside)):
+        drawn = Signal(signal.time, np.maximum(signal.values, low)) if group.decades else signal
+        draw_traces(axes, drawn, group.colours, flight_dashes(number))
+    for start, stop, index, value in group.goals:
+        axes.hlines(
+            value, start, stop, color=group.colours[index], ls=(0, DASHES), lw=1.2, zorder=3
+        )
+    if group.goals:
+        keys.append(legend_entry(SECONDARY_COLOUR, "goal", DASHES))
+    if len(later) > _MAX_MARKED_SCHEDULES or group.beside or group.decades:
+        later = ()
+    for time in later:
+        axes.axvline(time, color=LINE_COLOUR, lw=1.0, zorder=1.5)
+    if later:
+        keys.append(legend_entry(LINE_COLOUR, "new schedule"))
+    legend_above(axes, keys)
+    axes.set_ylabel(f"{group.label} ({group.unit})")
+    if len(group.signal):
+        ends = np.maximum(group.signal.values[-1], low).tolist()
+        end_labels(axes, list(zip(ends, group.names, group.colours, strict=True)))
+
+
+def _set_value_axis(axes: Axes, group: TraceGroup) -> None:
+    """Set the y axis to the values of a group; on a logarithmic one, smaller values are at the
+    lower edge.
+    """
     if group.decades:
-        _draw_decades(axes, group)
-        return False
-    colours = group.colours
-    values = np.concatenate([group.values, [g[3] for g in group.goals]])
+        axes.set_yscale("log")
+        axes.set_ylim(log_range(group.values, group.decades))
+        axes.minorticks_off()
+        axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
+        return
+    values = np.concatenate([group.values, [goal[3] for goal in group.goals]])
     if group.window is not None:
         text = f"peaks of {np.abs(values).max():.3g} {group.unit} exceed the axis"
         axes.text(
@@ -101,65 +126,6 @@ def draw_group(
         )  # fmt: skip
         values = np.array(group.window)
     set_range(axes, values, [bound for _, bound in group.limits])
-    low, high = axes.get_ylim()
-    keys = []
-    shown = [(k, bound) for k, bound in group.limits if low < bound < high]
-    for bound in {bound for _, bound in shown}:
-        owners = [k for k, other in shown if other == bound]
-        tint = SECONDARY_COLOUR if len(owners) == len(group.names) else colours[owners[0]]
-        axes.axhline(bound, color=tint, lw=1.0, ls=(0, DOTS), zorder=1.8)
-    if shown:
-        keys.append(legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS))
-    dense = draw_traces(axes, group.signal, colours, share)
-    for number, other in enumerate(group.beside, 1):
-        dense |= draw_traces(axes, other, colours, share, dashes=flight_dashes(number))
-    for start, end, index, value in group.goals:
-        axes.hlines(value, start, end, color=colours[index], ls=(0, DASHES), lw=1.2, zorder=3)
-    if group.goals:
-        keys.append(legend_entry(SECONDARY_COLOUR, "goal", DASHES))
-    if len(later) > _MAX_MARKED_SCHEDULES or group.beside:
-        later = ()
-    for time in later:
-        axes.axvline(time, color=LINE_COLOUR, lw=1.0, zorder=1.5)
-    if later:
-        keys.append(legend_entry(LINE_COLOUR, "new schedule"))
-    legend_above(axes, keys)
-    axes.set_ylabel(f"{group.label} ({group.unit})")
-    _label_trace_ends(axes, group.signal, group)
-    return dense
-
-
-def _draw_decades(axes: Axes, group: TraceGroup) -> None:
-    """Draw positive traces on a logarithmic axis; smaller values lie on its lower edge."""
-    floor, top = log_range(group.values, group.decades)
-    axes.set_yscale("log")
-    axes.set_ylim(floor, top)
-    several = len(group.names) > 1
-    for number, signal in enumerate((group.signal, *group.beside)):
-        shown = Signal(signal.time, np.maximum(signal.values, floor))
-        for index, tint in enumerate(group.colours if len(signal) else ()):
-            axes.plot(
-                *largest_over_time(shown, index),
-                color=tint,
-                ls=(0, flight_dashes(number)) if number else "-",
-                # Traces that lie on each other are both seen.
-                lw=2.6 - 1.3 * index if several else None,
-                marker="o" if len(signal) < 3 else "",
-                ms=4,
-                clip_on=False,
-            )
-    for index, bound in group.limits:
-        if floor < bound < top:
-            axes.axhline(bound, color=group.colours[index], lw=1.0, ls=(0, DOTS), zorder=1.8)
-    keys = [legend_entry(SECONDARY_COLOUR, group.limit_name, DOTS)] if group.limits else []
-    named = zip(group.colours, group.names, strict=True)
-    keys += [legend_entry(*each) for each in named] if several else []
-    legend_above(axes, keys)
-    axes.minorticks_off()
-    axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
-    if several:
-        axes.set_title("" if narrow() else group.label)
-    axes.set_ylabel(group.unit if several else f"{group.label} ({group.unit})")
 
 
 ONE_STATE_TEXT = "The bag contains only one state: there are no figures over time."
@@ -174,8 +140,7 @@ def time_figure(
     *,
     flights: Sequence[str] = (),
 ) -> ReportFigure | str:
-    """Return a figure with one panel per group, and close-ups if a gait has equal cycles; a
-    sentence if nothing was recorded over time.
+    """Return a figure with one panel per group; a sentence if nothing was recorded over time.
 
     ``caption`` is its beginning. ``flights``: labels of the flights whose traces the groups
     contain.
@@ -183,47 +148,32 @@ def time_figure(
     if all(len(signal) < 2 for group in groups for signal in group.signals):
         return ONE_STATE_TEXT
     groups = [group.in_unit_of_angles() for group in groups]
-    whole_only = flights or any(group.decades or group.rows for group in groups)
-    cycles = None if whole_only else flight.cycles
-    lane = EVENT_STRIP_HEIGHT if flight.timed_events else 0.0
-    top = 0.3 + _LABEL_HEIGHT * len(flights)
-    right = room_for([name for group in groups for name in group.names])
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
-    rows, heights = _layout(groups, with_cycles=cycles is not None)
-    sizes = {"left": left, "right": right, "lane": lane, "top": top}
-    figure, panels = sheet(rows * len(groups), heights, **sizes)
+    figure, panels = sheet(
+        [[1.0]] * len(groups),
+        [group.height for group in groups],
+        left=left,
+        right=room_for([name for group in groups for name in group.names]),
+        lane=EVENT_STRIP_HEIGHT if flight.timed_events else 0.0,
+        top=0.3 + _LABEL_HEIGHT * len(flights),
+    )
     if flights:
         named = enumerate(flights)
         keys = [legend_entry(SECONDARY_COLOUR, text, flight_dashes(k)) for k, text in named]
         figure.legend(handles=keys, loc="upper center", borderaxespad=0.1, handlelength=3.0)
-    share, later = min(1.0, 4 / len(groups)), [time for time, _ in flight.executing[1:]]
-    dense = []
-    for number, group in enumerate(groups):
-        whole, *below_it = panels[number * len(rows) : (number + 1) * len(rows)]
-        dense.append(draw_group(whole[0], group, flight.end, share, later))
-        if cycles is not None:
-            whole[0].set_title("whole flight")
-            first, last = (axes for row in below_it for axes in row)
-            dense.append(_draw_before_cycles(first, group, cycles))
-            _draw_last_cycles(last, group, cycles)
+    for group, (axes,) in zip(groups, panels, strict=True):
+        draw_group(axes, group, flight.end, [time for time, _ in flight.executing[1:]])
     if flight.timed_events:
-        for axes in (each for row in panels for each in row):
+        for (axes,) in panels:
             draw_events(axes, flight.timed_events)
     if any(group.goals for group in groups):
         caption += "; dashed: goal"
     if any(group.limits and group.limit_name == LIMIT for group in groups):
         caption += "; dotted: URDF limits, if in range"
     caption += "."
-    aside = ""
-    if cycles is not None:
-        aside += (
-            f" The flight ends with {cycles.count} equal cycles of {cycles.period:.4g} s; below: "
-            f"the part before them, and the change during the last {SHOWN_CYCLES} cycles."
-        )
-    aside += f" {BAND_CAPTION}" if any(dense) else ""
-    aside += f" {EVENTS_CAPTION}" if flight.timed_events else ""
-    caption += aside
-    return ReportFigure(name, heading, caption, figure, groups, aside)
+    if flight.timed_events:
+        caption += _EVENTS_CAPTION
+    return ReportFigure(name, heading, caption, figure, groups)
 
 
 def figure_of_flights(
@@ -271,75 +221,22 @@ def figure_of_flights(
     return time_figure(only, first.name, first.heading, first.heading, merged, flights=labels)
 
 
-def _layout(
-    groups: Sequence[TraceGroup], *, with_cycles: bool
-) -> tuple[list[list[float]], list[float]]:
-    """Return the widths of the rows of panels that each group has, and the heights of all rows."""
-    if any(group.decades for group in groups):
-        return [[1.0]], [1.3] * len(groups)
-    if any(group.rows for group in groups):
-        return [[1.0]], [0.4 + 0.14 * len(each.names) if each.rows else 1.6 for each in groups]
-    if not with_cycles:
-        return [[1.0]], [2.3] * len(groups)
-    if narrow():
-        return [[1.0]] * 3, [2.0, 1.35, 1.35] * len(groups)
-    return [[1.0], [1.0, 1.0]], [2.0, 1.35] * len(groups)
-
-
-def _draw_rows(axes: Axes, group: TraceGroup, share: float) -> bool:
+def _draw_rows(axes: Axes, group: TraceGroup) -> None:
     """Draw each trace as a band in a row of its own, the first on top."""
-    columns = max(int(TRACE_TIME_SLICES * share), 20)
-    count, signal = len(group.names), group.signal
-    dense = len(signal) > 2 * columns
+    count = len(group.names)
+    signal = thinned(group.signal, TRACE_TIME_SLICES)
     for index, tint in enumerate(group.colours):
-        time, high = signal.time, signal.values[:, index]
-        if dense:
-            time, _, high = envelope(signal, index, columns)
-        foot = count - 1 - index
+        values, foot = signal.values[:, index], count - 1 - index
         # A value holds from the sample before.
-        on = high > 0
+        on = values > 0
         on[:-1] |= on[1:]
-        axes.fill_between(
-            time, foot, foot + _DUTY_ROW_HEIGHT * high, on, step="pre", color=tint, linewidth=0.3
-        )
+        top = foot + _DUTY_ROW_HEIGHT * values
+        axes.fill_between(signal.time, foot, top, on, step="pre", color=tint, linewidth=0.3)
     axes.set_ylim(-0.2, count)
     axes.set_yticks([count - 1 - k + _DUTY_ROW_HEIGHT / 2 for k in range(count)], group.names)
     axes.tick_params(axis="y", length=0, labelsize="small")
     axes.grid(axis="y", visible=False)
     axes.set_title(f"{group.label} ({group.unit})")
-    return dense
-
-
-def _draw_before_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> bool:
-    """Draw the part before the cycles; the first cycles if there is none."""
-    end = cycles.start if cycles.start > 0 else SHOWN_CYCLES * cycles.period
-    part = group.signal.between(0.0, end)
-    whole = group.signal.values
-    set_range(axes, part.values, least=0.05 * float(np.ptp(whole)))
-    dense = draw_traces(axes, part, group.colours, 0.5)
-    set_time(axes, 0.0, end)
-    axes.set_title(f"first {end:.4g} s")
-    axes.set_ylabel(group.unit)
-    _label_trace_ends(axes, part, group)
-    return dense
-
-
-def _label_trace_ends(axes: Axes, part: Signal, group: TraceGroup) -> None:
-    if not len(part):
-        return
-    ends = part.values[-1].tolist()
-    end_labels(axes, list(zip(ends, group.names, group.colours, strict=True)))
-
-
-def _draw_last_cycles(axes: Axes, group: TraceGroup, cycles: Cycles) -> None:
-    start, end = cycles.last(SHOWN_CYCLES)
-    part = group.signal.between(start, end).relative_to_first()
-    factor, unit = scaled(group.unit, float(np.abs(part.values).max(initial=0.0)))
-    set_range(axes, factor * part.values)
-    draw_traces(axes, part, group.colours, factor=factor)
-    set_time(axes, start, end)
-    axes.set_title(f"last {SHOWN_CYCLES} cycles, change")
-    axes.set_ylabel(unit)
 
 
 _JOINTS_PER_PANEL = 6
@@ -597,7 +494,7 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         TraceGroup(
             Signal(balance.time, changes),
             ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
-            "change in total momenta",
+            "change",
             "kg m/s, kg m²/s",
             PALETTE[:2],
             decades=_MOMENTUM_DECADES,

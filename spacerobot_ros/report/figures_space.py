@@ -38,7 +38,6 @@ from spacerobot_ros.report.figures_over_time import (
     NO_JOINTS_TEXT,
     NO_POSES_TEXT,
     ONE_STATE_TEXT,
-    SHOWN_CYCLES,
     power_of_ten,
 )
 from spacerobot_ros.report.flight import FlightReport, joint_unit
@@ -307,7 +306,7 @@ def _square_panels(
     return figure, places[:count]
 
 
-_LOOP_JOINTS = 3
+_LOOP_JOINTS, _SHOWN_CYCLES = 3, 3
 
 
 def loops_figure(flight: FlightReport) -> ReportFigure | str:
@@ -328,7 +327,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
     joint_units = [angle if unit == "rad" else unit for unit in joint_units]
     part = Signal(flight.shape.time, flight.shape.values[:, columns] * scale)
     if cycles is not None:
-        part = part.between(*cycles.last(SHOWN_CYCLES))
+        part = part.between(*cycles.last(_SHOWN_CYCLES))
     one = len(pairs) == 1
     across, high = (2, 3.4) if one else (_LOOP_JOINTS, 2.35)
     figure, places = _square_panels(len(pairs), across, 2.0, high)
@@ -353,7 +352,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
         caption = "Joint positions in pairs; a circle marks the first shape, a dot the last."
     else:
         caption = (
-            f"The last {SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
+            f"The last {_SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
             "ends at the circle and, to first order, displaces the base in proportion to the areas "
             "it encloses: the areas of one cycle are given, positive if counter-clockwise."
         )

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report.events import FlightEvent, event_style
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.flight import FlightReport
@@ -24,7 +23,7 @@ from spacerobot_ros.report.page_parts import (
     tiles,
     unbroken,
 )
-from spacerobot_ros.report.signals import simplified
+from spacerobot_ros.report.signals import thinned
 from spacerobot_ros.report.tables import (
     Table,
     different_goals,
@@ -44,12 +43,8 @@ _CHART_HELP = (
 _MAX_EVENT_ROWS, _MAX_UNFOLDED_ROWS = 200, 20
 """Largest number of events in the table, and in a table that is not collapsed."""
 
-_MAX_SAMPLES = 2000
-_MAX_SLICED_SAMPLES = 5000
-"""Largest number of samples in a chart if the omitted samples lie on lines, and if they do not."""
-
-_LINE_TOLERANCE = 5e-4
-"""Largest distance between an omitted sample and its line, as a fraction of the trace's extent."""
+_CHART_SLICES = 500
+"""Number of time slices in a chart of a dense trace."""
 
 _MAX_CHART_EVENTS = 500
 
@@ -179,19 +174,12 @@ def _figures_html(figures: Figures) -> list[str]:
         first_chart += len(each.groups)
         charts = f' data-charts="{numbers}"' if numbers else ""
         heading = escape(each.heading)
-        caption = f"<b>Figure {number}. {heading}.</b> {_caption_html(each)}"
+        caption = f"<b>Figure {number}. {heading}.</b> {escape(each.caption)}"
         shown = figure(each.name, each.svg, each.heading, caption, charts)
         if each.name in _FOLDED:
             shown = f"<details><summary>{heading}</summary>{shown}</details>"
         parts.append(shown)
     return parts
-
-
-def _caption_html(each: ReportFigure) -> str:
-    if not each.picture_section:
-        return escape(each.caption)
-    before, aside, after = each.caption.partition(each.picture_section)
-    return f'{escape(before)}<span class="still">{escape(aside)}</span>{escape(after)}'
 
 
 def _events_html(events: Sequence[FlightEvent]) -> list[str]:
@@ -273,7 +261,7 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
 
 
 def _chart_data(group: TraceGroup) -> dict[str, Any]:
-    signal = thin_out(group.signal)
+    signal = thinned(group.signal, _CHART_SLICES)
     values = signal.values
     if group.decades:
         # uPlot's own logarithmic axes go wrong with numbers as small as rounding errors.
@@ -307,29 +295,6 @@ def _limit_range(group: TraceGroup) -> tuple[float, float]:
     low, high = group.window or (float(np.min(numbers)), float(np.max(numbers)))
     span = max(high - low, 1e-6)
     return low - 0.2 * span, high + 0.2 * span
-
-
-def thin_out(signal: Signal) -> Signal:
-    """Return a signal with fewer samples that looks the same in a chart.
-
-    Samples that are not on lines between others are kept. If these are too many, the smallest and
-    largest value of every trace in each time slice are kept.
-    """
-    if len(signal) <= _MAX_SAMPLES:
-        return signal
-    extent = np.maximum(np.ptp(signal.values, axis=0), 1e-300)
-    kept, off = simplified(
-        Signal(signal.time, signal.values / (_LINE_TOLERANCE * extent)), _MAX_SAMPLES
-    )
-    if off > 1.0:
-        slices = max(1, _MAX_SLICED_SAMPLES // (2 * signal.width + 1))
-        edges = np.unique(np.linspace(0, len(signal), slices + 1).astype(int))
-        parts = [edges[:-1], np.array([len(signal) - 1])]
-        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-            part = signal.values[a:b]
-            parts += [a + part.argmin(axis=0), a + part.argmax(axis=0)]
-        kept = np.unique(np.concatenate(parts))
-    return Signal(signal.time[kept], signal.values[kept])
 
 
 def _encode_numbers(values: Any, kind: str) -> str:

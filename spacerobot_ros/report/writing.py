@@ -212,11 +212,8 @@ def _overview_figure(flight: FlightReport) -> Figure:
     beside = _ROBOT_PANEL_WIDTH if robot else 0.1
     rows = [[1.0]] * len(groups)
     figure, panels = sheet(rows, [1.25] * len(groups), right=right + beside, top=0.77, gap=0.42)
-    share = 1.0 - (right + beside) / WIDTH
     for number, (group, (axes,)) in enumerate(zip(groups, panels, strict=True)):
-        over_time.draw_group(
-            axes, group, flight.end, share, [time for time, _ in flight.executing[1:]]
-        )
+        over_time.draw_group(axes, group, flight.end, [t for t, _ in flight.executing[1:]])
         if number < len(groups) - 1:
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)

@@ -533,7 +533,6 @@ def test_a_part_of_a_signal_includes_its_ends() -> None:
     signal = Signal(np.array([0.0, 0.1, 0.2, 0.3]), np.arange(8.0).reshape(4, 2))
     part = signal.between(0.1, 0.2 + 1e-12)
     assert (len(part), part.width, part.time.tolist()) == (2, 2, [0.1, 0.2])
-    assert part.relative_to_first().values.tolist() == [[0.0, 0.0], [2.0, 2.0]]
     flight = made_flight(series={})
     sizes = {"pose": 7, "momentum": 7, "end_effector_pose": 7, "measured_pose": 7, "q": N}
     sizes |= {"twist": 6, "measured_twist": 6, "expected_momenta": 6, "effort": N}

@@ -351,7 +351,7 @@ UNITS = {
     "efforts": {"thruster force": "N", "thruster torque": "N m", "joint effort": "N m"},
     "clearance": {"smallest distance": "m"},
     "momentum_budget": {"angular momentum": "N m s"},
-    "momentum": {"change in total momenta": "kg m/s, kg m²/s", "kinetic energy": "J"},
+    "momentum": {"change": "kg m/s, kg m²/s", "kinetic energy": "J"},
     "thrusters": {
         "thrusters": "share of each tick during which they are on",
         "impulse given": "N s",

@@ -41,7 +41,7 @@ from spacerobot_ros.report.page import charts_of, page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.player import WORLD, View3D, view_of_flight
 from spacerobot_ros.report.scene import obstacles_of
-from spacerobot_ros.report.signals import Cycles, envelope, find_cycles, rotvecs
+from spacerobot_ros.report.signals import Cycles, find_cycles, rotvecs
 from spacerobot_ros.report.solids import Canvas, PlacedSolid, View, corner_points, placed_solids
 from spacerobot_ros.report.tables import headline, result_table
 
@@ -433,17 +433,6 @@ def test_rotation_vectors_are_continuous_beyond_half_turns() -> None:
     np.testing.assert_allclose(rotvecs(quaternions), expected, atol=1e-12)
 
 
-def test_envelopes_hold_every_sample() -> None:
-    rng = np.random.default_rng(1)
-    values = rng.normal(size=(997, 1))
-    time, low, high = envelope(Signal(np.arange(997.0), values), 0, 50)
-    assert (time[0], time[-1]) == (0.0, 996.0)
-    assert (low.min(), high.max()) == (values.min(), values.max())
-    for k, value in enumerate(values[:, 0]):
-        place = min(k * 50 // 996, 49)
-        assert low[place] <= value <= high[place] or low[place - 1] <= value <= high[place - 1]
-
-
 def ticks(values: Array) -> Signal:
     return Signal(np.linspace(0.0, TICK * (len(values) - 1), len(values)), values)
 
@@ -467,13 +456,6 @@ def test_whole_cycles_are_counted_and_the_last_are_at_the_end() -> None:
     for end, count in ((8.0, 3), (7.95, 3), (7.5, 2), (9.5, 3)):
         assert Cycles(2.0, end, 2.0).count == count
     assert Cycles(2.0, 20.0, 2.0).last(3) == (14.0, 20.0)
-
-
-def test_change_is_since_the_first_sample_of_a_window() -> None:
-    values = np.array([[1.0, -2.0], [4.0, 3.0], [7.0, 5.0]])
-    part = Signal(np.array([0.0, 1.0, 2.0]), values).between(1.0, 2.0).relative_to_first()
-    np.testing.assert_array_equal(part.values, [[0.0, 0.0], [3.0, 2.0]])
-    np.testing.assert_array_equal(part.time, [1.0, 2.0])
 
 
 def test_the_robot_is_drawn_at_six_instants_though_it_rests_at_the_end(strut: FlightReport) -> None:

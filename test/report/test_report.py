@@ -200,12 +200,11 @@ def test_the_same_bag_makes_the_same_report(folder: Path, flown: Page) -> None:
     assert (folder / "again.html").read_bytes() == (folder / "out/report.html").read_bytes()
 
 
-def test_dense_traces_become_bands_and_say_so(tmp_path: Path) -> None:
+def test_pictures_of_dense_traces_stay_small(tmp_path: Path) -> None:
     bag = tell(tmp_path / "flight.mcap", Story(cyclic_shapes(cycles=70)))
     with drawing():
         figure = shape_figure(read_report(bag))
     assert isinstance(figure, ReportFigure)
-    assert "the smallest and largest value in each time slice" in figure.caption
     assert len(figure.svg) < 250_000
 
 

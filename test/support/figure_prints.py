@@ -88,8 +88,8 @@ def _figure(flight: FlightReport, figure: str) -> dict[str, str] | None:
 
 def _page(flight: FlightReport) -> list[str]:
     """Return the page with a picture that stands in for its figures, which are parts themselves."""
-    missing, still = "It has no <errors>.", "in the picture"
-    stand_in = ReportFigure("pose", "Pose", f"Shown {still}, too.", Figure(), picture_section=still)
+    missing = "It has no <errors>."
+    stand_in = ReportFigure("pose", "Pose", "Shown too.", Figure())
     player = PagePart("<p>3D view</p>")
     with patch.object(ReportFigure, "svg", b"<svg/>"):
         return words_of(page(flight, player, [stand_in, missing, None, missing], [flight]))
