@@ -235,15 +235,15 @@ class FlightBag(RecordedRobot):
             except SpaceRobotError:
                 yield time_ns, message.message
 
-    def events(self) -> Iterator[tuple[int, str, Event]]:
-        """Yield the events with their log times (ns) and nodes."""
+    def events(self) -> Iterator[tuple[int, Event]]:
+        """Yield the events with their log times, ns."""
         for time_ns, recorded in self.messages("events"):
             message = read_status(recorded)
             try:
                 event = Event.from_values(message.values, message.message, message.level)
             except SpaceRobotError:
                 continue  # Of a later version.
-            yield time_ns, message.name, event
+            yield time_ns, replace(event, node=message.name.strip("/"))
 
     def goals(self, topic: str) -> tuple[SentGoal, ...]:
         """Return valid goal poses, and the last poses of paths, in the odometry frame."""
@@ -392,7 +392,12 @@ def read_flight(bag: FlightBag) -> Flight:
         series=bag.series(),
         commands=bag.commands(scenario),
         statuses=tuple(sorted((s for each in statuses.values() for s in each), key=lambda s: s[0])),
-        events=tuple(event for _, _, event in bag.events()),
+        events=tuple(
+            event
+            if bag.stamped and event.time_s is not None
+            else replace(event, time_s=time_ns / SECOND)
+            for time_ns, event in bag.events()
+        ),
         outcome=Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value),
         message=status.message if status is not None else "",
         goal=goal_at_end(reports, goals),

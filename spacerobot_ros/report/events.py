@@ -20,7 +20,6 @@ from spacerobot_ros.report.figures import (
     panel,
 )
 from spacerobot_ros.simulation.faults import with_seconds
-from spacerobot_ros.times import SECOND
 
 EVENT_STRIP_HEIGHT = 0.62
 """Height of an event strip with its legend below a time axis, inches."""
@@ -33,35 +32,6 @@ _STRIP_DISTANCE = 0.44
 
 _STRIP_HEIGHT = 0.24
 _GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
-
-
-@dataclass(frozen=True)
-class FlightEvent:
-    """An event in a recorded flight; ``time`` is in s since the first state."""
-
-    time: float
-    node: str
-    event: Event
-
-    @property
-    def text(self) -> str:
-        """The event in a few words, such as ``fault on: joint_stuck elbow at 5 s``."""
-        label, about = _MARKS[self.event.kind].label, self.event.about
-        details = [with_seconds(about[key]) for key in _DETAIL_KEYS if about.get(key)]
-        return f"{label}: {', '.join(details)}" if details else label
-
-
-_DETAIL_KEYS = (
-    "fault",
-    "disturbance",
-    "joints",
-    "reason",
-    "method",
-    "node",
-    "first",
-    "second",
-    "wheel",
-)
 
 
 @dataclass(frozen=True)
@@ -158,34 +128,38 @@ def event_style(kind: EventKind) -> dict[str, Any]:
     }
 
 
-def timed_events(
-    events: Iterable[tuple[int, str, Event]], began: float, *, stamped: bool
-) -> list[FlightEvent]:
-    """Return the events that are drawn.
-
-    Parameters
-    ----------
-    events
-        Events with log times (ns) and nodes.
-    began
-        Time of the first state, s.
-    stamped
-        Whether ``began`` is simulated time, like the time in the events; otherwise log times are
-        used.
-    """
-    found = []
-    for time_ns, node, event in events:
-        time = event.time_s if stamped and event.time_s is not None else time_ns / SECOND
-        # Not true of nan either.
-        if event.kind in _MARKS and abs(time - began) < 1e12:
-            found.append(FlightEvent(time - began, node, event))
-    return found
+_DETAIL_KEYS = (
+    "fault",
+    "disturbance",
+    "joints",
+    "reason",
+    "method",
+    "node",
+    "first",
+    "second",
+    "wheel",
+)
 
 
-def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
+def event_text(event: Event) -> str:
+    """Return an event in a few words, such as ``fault on: joint_stuck elbow at 5 s``."""
+    label, about = _MARKS[event.kind].label, event.about
+    details = [with_seconds(about[key]) for key in _DETAIL_KEYS if about.get(key)]
+    return f"{label}: {', '.join(details)}" if details else label
+
+
+def shown_events(events: Iterable[Event]) -> list[tuple[float, Event]]:
+    """Return the events that are drawn with their times, s, in the order of time."""
+    # The comparison is false for NaN.
+    timed = [(each.time_s, each) for each in events if each.kind in _MARKS]
+    found = [(time, each) for time, each in timed if time is not None and abs(time) < 1e12]
+    return sorted(found, key=lambda pair: pair[0])
+
+
+def draw_events(axes: Axes, events: Sequence[tuple[float, Event]]) -> None:
     """Draw a strip below a time axis with the events in its span, and a legend of their marks."""
     start, end = axes.get_xlim()
-    shown = [each for each in events if start <= each.time <= end][:_MAX_MARKS]
+    shown = [(time, each) for time, each in events if start <= time <= end][:_MAX_MARKS]
     figure = axes.figure
     assert isinstance(figure, Figure)
     across, up = figure.get_size_inches()
@@ -201,12 +175,12 @@ def draw_events(axes: Axes, events: Sequence[FlightEvent]) -> None:
     lane.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
     lane.set_label("events")
     for kind, mark in _MARKS.items():
-        times = [each.time for each in shown if each.event.kind is kind]
+        times = [time for time, each in shown if each.kind is kind]
         if times:
             # Without texts, faults need no row of their own.
             height = 0 if mark.row else 1
             lane.plot(times, [height] * len(times), clip_on=False, **_marker_style(mark))
-    kinds = {each.event.kind for each in shown}
+    kinds = {each.kind for _, each in shown}
     keys = [
         Line2D([], [], label=mark.label, **_marker_style(mark))
         for kind, mark in _MARKS.items()

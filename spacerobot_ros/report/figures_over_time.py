@@ -217,7 +217,7 @@ def figure_of_flights(
     if not merged:
         return "This figure shows a single flight: specify one bag."
     first, labels = figures[0], [each.label for each in flights]
-    only = replace(flights[0], timed_events=[])
+    only = replace(flights[0], events=())
     return time_figure(only, first.name, first.heading, first.heading, merged, flights=labels)
 
 

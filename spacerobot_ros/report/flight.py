@@ -14,6 +14,7 @@ from spacerobot_ros.collision.geometry import obstacle_visuals
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import MeshError
+from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import (
     WRENCH_COLUMNS,
@@ -38,7 +39,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.registry import METHODS
-from spacerobot_ros.report.events import FlightEvent, timed_events
+from spacerobot_ros.report.events import shown_events
 from spacerobot_ros.report.signals import (
     Cycles,
     continuous,
@@ -70,14 +71,11 @@ class FlightReport(Flight):
     ----------
     bag
         The bag that the flight was read from.
-    timed_events
-        The events that figures show; none in bags from earlier versions.
     meshes
         Triangles of the meshes in the bag, by URI.
     """
 
     bag: FlightBag
-    timed_events: list[FlightEvent] = field(default_factory=list)
     meshes: dict[str, TriangleMesh] = field(default_factory=dict)
 
     @classmethod
@@ -94,7 +92,6 @@ class FlightReport(Flight):
         return cls(
             **{each.name: getattr(flight, each.name) for each in fields(flight)},
             bag=bag,
-            timed_events=timed_events(bag.events(), bag.began, stamped=bag.stamped),
             meshes=meshes_from_attachments(flight.robot, attachments) if flight.robot else {},
         )
 
@@ -216,6 +213,11 @@ class FlightReport(Flight):
     def parameter(self, node: str, name: str) -> Any:
         """Return a node parameter; None if it is not in the bag."""
         return self.scenario.in_file.get(node, {}).get(name)
+
+    @property
+    def timed_events(self) -> list[tuple[float, Event]]:
+        """The events that are drawn, with their times, s."""
+        return shown_events(self.events)
 
     # -- reports and goals ------------------------------------------------------------------------
 

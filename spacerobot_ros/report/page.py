@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.events import EventKind
-from spacerobot_ros.report.events import FlightEvent, event_style
+from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.report.events import event_style, event_text
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import (
@@ -182,14 +182,11 @@ def _figures_html(figures: Figures) -> list[str]:
     return parts
 
 
-def _events_html(events: Sequence[FlightEvent]) -> list[str]:
+def _events_html(events: Sequence[tuple[float, Event]]) -> list[str]:
     """Return the table of events by time; of very many the first rows."""
     if not events:
         return []
-    rows = [
-        (f"{each.time:.6g}", each.text, each.event.message, each.node.strip("/"))
-        for each in sorted(events, key=lambda each: each.time)
-    ]
+    rows = [(f"{time:.6g}", event_text(event), event.message, event.node) for time, event in events]
     more = len(rows) - _MAX_EVENT_ROWS
     head = ("Time (s)", "Event", "Message", "Node")
     note = f'<p class="facts">{more} more are in the bag.</p>' if more > 0 else ""
@@ -251,12 +248,12 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
     """Return the events of a flight; the last of several of one kind and time counts them."""
     found = []
     together: dict[tuple[float, EventKind], list[str]] = {}
-    for each in sorted(flight.timed_events, key=lambda each: each.time)[:_MAX_CHART_EVENTS]:
-        sentences = together.setdefault((each.time, each.event.kind), [])
-        text = f"{each.text} (+{len(sentences)})" if sentences else each.text
-        sentences.append(each.event.message)
-        shown = {"time": each.time, "sentence": " ".join(sentences), "text": text}
-        found.append(shown | event_style(each.event.kind))
+    for time, event in flight.timed_events[:_MAX_CHART_EVENTS]:
+        sentences = together.setdefault((time, event.kind), [])
+        text = f"{event_text(event)} (+{len(sentences)})" if sentences else event_text(event)
+        sentences.append(event.message)
+        shown = {"time": time, "sentence": " ".join(sentences), "text": text}
+        found.append(shown | event_style(event.kind))
     return found
 
 

@@ -150,7 +150,7 @@ def write_figures(
         )
     flight, *others = (read_report(each, namespace) for each in (bag, *beside))
     if not events:
-        flight = replace(flight, timed_events=[])
+        flight = replace(flight, events=())
     made: dict[str, Path | str] = {}
     with drawing(width / 25.4, "paper", style, degrees=degrees, lettered=True):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:

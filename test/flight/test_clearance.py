@@ -23,6 +23,7 @@ from spacerobot_ros.measures import metrics_of_each
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.execution.config import PlannerConfig
+from spacerobot_ros.report.events import event_text
 from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import clearance_figure
 from spacerobot_ros.report.flight import read_report
@@ -125,7 +126,7 @@ def test_its_bag_and_its_report_show_the_contacts(through: Flight, tmp_path: Pat
     again = read_run(tmp_path / "through.mcap")
     assert again.measures.clearance == pytest.approx(through.measures.clearance, abs=1e-9)
     report = read_report(tmp_path / "through.mcap")
-    shown = [each.text for each in report.timed_events if each.event.kind is EventKind.CONTACT]
+    shown = [event_text(each) for each in report.events if each.kind is EventKind.CONTACT]
     assert shown == [
         f"contact: {pair}" for pair in ("mass_2, mass_3", "mass_1, mass_2", "mass_1, mass_3")
     ]

@@ -163,7 +163,7 @@ def test_reports_of_a_flight_are_those_of_its_last_goal(bag: FlightBag, flight: 
         "Of another package."
     ]
     assert [(event.message, event.time_s) for event in flight.events] == [("It runs.", 1.5)]
-    assert [(time, name) for time, name, _ in bag.events()] == [(1_750_000_000, "/a/plant")]
+    assert [(time, event.node) for time, event in bag.events()] == [(1_750_000_000, "a/plant")]
     assert bag.began == 1.0
     assert bag.message_count == 37
     assert (flight.scenario.name, flight.scenario.description) == ("made", "It is made.")

@@ -73,7 +73,7 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
     if error is not None:
         assert error.distance == pytest.approx(summary["position_error_m"], rel=1e-9, abs=1e-12)
         assert error.angle == pytest.approx(summary["attitude_error_rad"], rel=1e-9, abs=1e-12)
-    kinds = {each.event.kind for each in flight.timed_events}
+    kinds = {each.kind for _, each in flight.timed_events}
     for width in (1280, 390):
         window.complaints.clear()
         window.requests.clear()

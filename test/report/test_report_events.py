@@ -83,9 +83,9 @@ def lanes(figure: Figure) -> list[Any]:
 
 def test_events_have_the_time_that_their_node_gave(tmp_path: Path) -> None:
     flight = read_report(story(tmp_path))
-    found = {each.event.kind.value: each.time for each in flight.timed_events}
+    found = {each.kind.value: time for time, each in flight.timed_events}
     assert found == pytest.approx(TIMES)
-    assert {each.node for each in flight.timed_events} == {"/node"}
+    assert {each.node for _, each in flight.timed_events} == {"node"}
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.core.workspaces import Workspaces
 from spacerobot_ros.report import figures_space, planning_figures
-from spacerobot_ros.report.events import _MARKS, FlightEvent, draw_events, event_style
+from spacerobot_ros.report.events import _MARKS, draw_events, event_style, event_text
 from spacerobot_ros.report.figures import (
     WIDTH,
     PictureFormat,
@@ -254,11 +254,10 @@ def _events() -> dict[str, str]:
     kinds = list(_MARKS)
     about = {"fault": "joint_stuck elbow", "method": "some", "node": "/plant", "goal_id": "7.5"}
     events = [
-        FlightEvent(0.5 * number, "/node", Event(kind, "Something.", about=about))
-        for number, kind in enumerate(kinds)
+        (0.5 * number, Event(kind, "Something.", about=about)) for number, kind in enumerate(kinds)
     ]
     found = {kind.value: _command(event_style(kind)) for kind in kinds}
-    found |= {f"text of {each.event.kind.value}": each.text for each in events}
+    found |= {f"text of {each.kind.value}": event_text(each) for _, each in events}
     with drawing():
         figure = new_figure(3.0)
         axes = panel(figure, 0.75, 1.0, 6.0, 1.5)

@@ -29,7 +29,6 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-from spacerobot_ros.report.events import FlightEvent
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.scenario import Published, Scenario
 
@@ -56,7 +55,7 @@ def _report(
     statuses: Mapping[str, Statuses] = {},
     goals: Sequence[tuple[float, Goal]] = (),
     tool_goals: Sequence[tuple[float, Goal]] = (),
-    events: Sequence[FlightEvent] = (),
+    events: Sequence[Event] = (),
     topics: Mapping[str, Array] = {},
     in_file: Mapping[str, Any] = {},
     metadata: Mapping[str, Any] = {},
@@ -126,7 +125,7 @@ def _report(
         status=told[-1] if told else None,
         gait=next((each for each in told if isinstance(each, PlannerStatus) and each.method), None),
     )
-    report = replace(FlightReport.of(bag, flight), timed_events=list(events))
+    report = replace(FlightReport.of(bag, flight), events=tuple(events))
     position = report.position
     least = np.inf if clearance is None else float(clearance.min())
     vars(report)["clearance"] = (
@@ -142,8 +141,8 @@ def _report(
     return report
 
 
-def _event(time: float, kind: EventKind, **about: str) -> FlightEvent:
-    return FlightEvent(time, "/plant", Event(kind, f"It is {kind.value}.", about=about))
+def _event(time: float, kind: EventKind, **about: str) -> Event:
+    return Event(kind, f"It is {kind.value}.", time_s=time, about=about, node="plant")
 
 
 def _poses(end: Sequence[float], turn: Sequence[float], count: int) -> Array:
