@@ -111,9 +111,8 @@ def drawing(
     SpaceRobotError
         The style file cannot be read, or its font settings cannot be used.
     """
-    shipped = Path(str(files("spacerobot_ros.report").joinpath(f"{style}.mplstyle")))
     with mpl.rc_context():
-        _apply_style(shipped)
+        _apply_style(_shipped_style(style))
         if own is not None:
             _apply_style(own)
             _require_fonts(own)
@@ -126,7 +125,14 @@ def drawing(
             _look.reset(before)
 
 
+def _shipped_style(name: str) -> Path:
+    return Path(str(files("spacerobot_ros.report").joinpath(f"{name}.mplstyle")))
+
+
 def _apply_style(path: Path) -> None:
+    import matplotlib.style as styles  # This import reads all styles of matplotlib.
+
+    shipped = _shipped_style(str(path))
     warnings: list[str] = []
 
     def collect(record: logging.LogRecord) -> bool:
@@ -139,7 +145,7 @@ def _apply_style(path: Path) -> None:
     log = logging.getLogger("matplotlib")
     log.addFilter(collect)
     try:
-        settings = _read_style(path)
+        styles.use(str(shipped if shipped.is_file() and not path.exists() else path))
     except (OSError, ValueError, KeyError) as error:
         why = getattr(error, "strerror", None) or error
         raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
@@ -147,23 +153,6 @@ def _apply_style(path: Path) -> None:
         log.removeFilter(collect)
     if warnings:
         raise SpaceRobotError(f"The style file {path} is refused: {warnings[0]}.")
-    mpl.rcParams.update(settings)
-
-
-def _read_style(path: Path) -> mpl.RcParams:
-    shipped = files("spacerobot_ros.report").joinpath(f"{path}.mplstyle")
-    if not path.exists() and path.name == str(path) and shipped.is_file():
-        path = Path(str(shipped))
-    if not path.exists():
-        # The import reads all styles of matplotlib.
-        import matplotlib.style as styles
-
-        if str(path) in styles.library:
-            return styles.library[str(path)]
-        raise ValueError("there is no such file, and matplotlib has no style with that name")
-    if not path.is_file():
-        raise ValueError("it is no file")
-    return mpl.rc_params_from_file(path, use_default_template=False)
 
 
 def _require_fonts(path: Path) -> None:

@@ -142,7 +142,6 @@ def test_the_help_names_every_figure() -> None:
         (("--width", "wide"), "'wide'"),
         (("--width", "2mm"), "2 mm"),
         (("--style", "nowhere.mplstyle"), "nowhere.mplstyle"),
-        (("--style", "."), "it is no file"),
         (("--width", "nan"), "'nan'"),
         (("--only", "joint"), "Did you mean 'joints'?"),
         (("--out", "pose.pdf"), "'pose.pdf'"),
