@@ -115,7 +115,7 @@ def _set_value_axis(axes: Axes, group: TraceGroup) -> None:
         axes.set_yscale("log")
         axes.set_ylim(log_range(group.values, group.decades))
         axes.minorticks_off()
-        axes.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
+        axes.yaxis.set_major_formatter(lambda value, _: _power_of_ten(value))
         return
     values = np.concatenate([group.values, [goal[3] for goal in group.goals]])
     if group.window is not None:
@@ -572,7 +572,7 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
     return time_figure(flight, "clearance", "Clearance", caption, [group])
 
 
-def power_of_ten(value: float) -> str:
+def _power_of_ten(value: float) -> str:
     """Return a power of ten as a string with an exponent, for a logarithmic axis."""
     exponent = str(round(np.log10(value))).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"10{exponent}"
@@ -606,7 +606,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
             chosen = [i for i in flight.controls(part) if i // 3 == k]
             if len(errors) and chosen and half not in free:
                 signal = errors.norms(chosen)
-                groups.append(_error_group(flight, signal, half, of, colour(number)))
+                groups.append(error_group(flight, signal, half, of, colour(number)))
     if not groups:
         return None
     caption = (
@@ -618,7 +618,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     return time_figure(flight, "errors", "Errors", caption, groups)
 
 
-def _error_group(
+def error_group(
     flight: FlightReport,
     signal: Signal,
     part: Literal["position", "attitude"],
@@ -648,7 +648,7 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     for number, (link, errors) in enumerate(flight.link_errors.items()):
         for (part, *_), signal in zip(_ERROR_PARTS, errors, strict=True):
             if len(signal):
-                groups.append(_error_group(flight, signal, part, shortened(link), colour(number)))
+                groups.append(error_group(flight, signal, part, shortened(link), colour(number)))
     caption = (
         "Distance between each link and its goal position, and angle from its goal attitude if "
         "required, on logarithmic axes; smaller values are at the lower edge; dotted: tolerance"

@@ -24,12 +24,13 @@ from spacerobot_ros.report.figures import (
     SECONDARY_COLOUR,
     TRACE_TIME_SLICES,
     ReportFigure,
+    TraceGroup,
     angle_unit,
     colour,
-    end_labels,
     legend_above,
     legend_entry,
     narrow,
+    room_for,
     set_range,
     sheet,
 )
@@ -38,7 +39,8 @@ from spacerobot_ros.report.figures_over_time import (
     NO_JOINTS_TEXT,
     NO_POSES_TEXT,
     ONE_STATE_TEXT,
-    power_of_ten,
+    draw_group,
+    error_group,
 )
 from spacerobot_ros.report.flight import FlightReport, joint_unit
 from spacerobot_ros.report.scene import bodies_of, goal_of_base, is_flat, obstacles_of
@@ -383,7 +385,6 @@ _CLOSED_LOOP_DISTANCE = 0.02
 """Distance from the first shape at which a loop is considered closed, as a share of its size."""
 
 _MIN_LOOPS = 4
-_LOG_AXIS_RATIO = 10.0
 
 
 def cycles_figure(flight: FlightReport) -> ReportFigure | None:
@@ -400,44 +401,27 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     ends = loop_ends(flight.shape)
     if len(ends) < _MIN_LOOPS:
         return None
-    number = np.arange(len(ends))
-    factor, unit = angle_unit()
-    attitude = factor * flight.attitude.values[ends]
-    goal = flight.base_goal
-    figure, panels = sheet([[1.0], [1.0]] if goal else [[1.0]], [2.0, 1.3] if goal else [2.0])
-    above = panels[0][0]
-    dots = "." if len(ends) <= 60 else ""
-    wanted = factor * flight.goal_rotvec(goal) if goal is not None else np.empty(0)
-    set_range(above, np.concatenate([attitude.ravel(), wanted]))
-    for i in range(3):
-        above.plot(number, attitude[:, i], color=PALETTE[i], marker=dots)
-    for i, value in enumerate(wanted):
-        above.axhline(value, color=PALETTE[i], ls=(0, DASHES), lw=1.2, zorder=1.8)
-    if goal is not None:
-        legend_above(above, [legend_entry(SECONDARY_COLOUR, "goal", DASHES)])
-    above.set_ylabel(f"rotation vector ({unit})")
-    end_labels(above, list(zip(attitude[-1].tolist(), "xyz", PALETTE[:3], strict=True)))
+    number, goal = np.arange(float(len(ends))), flight.base_goal
+    rotvec = [] if goal is None else flight.goal_rotvec(goal).tolist()
+    goals = [(0.0, float(number[-1]), i, x) for i, x in enumerate(rotvec)]
+    attitude = Signal(number, flight.attitude.values[ends])
+    groups = [TraceGroup(attitude, list("xyz"), "rotation vector", "rad", PALETTE[:3], goals)]
     caption = (
         f"Base link attitude at the {len(ends)} instants at which the joints return to the start "
         "of a loop; number 0 is before the first loop"
     )
     if goal is not None:
-        below = panels[1][0]
         poses = zip(flight.position.values[ends], flight.quaternion[ends], strict=True)
-        left = factor * np.array([PoseError.between(r, q, goal).angle for r, q in poses])
-        below.plot(number, left, color=PALETTE[0], marker=dots)
-        below.set_ylabel(f"remaining angle ({unit})")
-        caption += "; dashed: goal. Below: remaining angle to the goal"
-        if left.min() > 0 and left.max() > _LOG_AXIS_RATIO * left.min():
-            below.set_yscale("log")
-            below.minorticks_off()
-            below.yaxis.set_major_formatter(lambda value, _: power_of_ten(value))
-            caption += ", on a logarithmic axis"
-        else:
-            set_range(below, np.append(left, 0.0))
-    for axes in (row[0] for row in panels):
-        axes.set_xlim(0, len(ends) - 1)
-    panels[-1][0].set_xlabel("number of the cycle")
+        left = Signal(number, np.array([[PoseError.between(r, q, goal).angle] for r, q in poses]))
+        groups.append(error_group(flight, left, "attitude", "base", PALETTE[0]))
+        caption += "; dashed: goal. Below: remaining angle to the goal, on a logarithmic axis"
+    groups = [group.in_unit_of_angles() for group in groups]
+    right = room_for([name for group in groups for name in group.names])
+    figure, panels = sheet([[1.0]] * len(groups), [each.height for each in groups], right=right)
+    for (axes,), group in zip(panels, groups, strict=True):
+        draw_group(axes, group, 0.0)
+        axes.locator_params(axis="x", integer=True)
+        axes.set_xlabel("number of the cycle")
     return ReportFigure("cycles", "Attitude cycle by cycle", f"{caption}.", figure)
 
 
