@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from html import escape
 from typing import Generic, TypeVar
 
-import numpy as np
-
 from spacerobot_ros.errors import ParameterError, numbers, quantity, shortened
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -596,6 +594,10 @@ class RecentItems(Generic[T]):
         """The items."""
         return self._items
 
+    def until(self, time_s: float) -> Sequence[T]:
+        """Return the items at or before a time."""
+        return self._items[: bisect_right(self._times, time_s)]
+
     @property
     def span(self) -> tuple[float, float] | None:
         """Times of the first and last items, s; None: there is none."""
@@ -604,38 +606,3 @@ class RecentItems(Generic[T]):
     def at(self, time_s: float) -> T:
         """Return the last item at or before a time, or else the first item."""
         return self._items[max(bisect_right(self._times, time_s) - 1, 0)]
-
-
-class Trail:
-    """The flown base path, as points at least one step apart.
-
-    Parameters
-    ----------
-    step
-        Smallest distance between neighbours, m.
-    most
-        Largest number of points; beyond it, every second point is dropped and the step is doubled.
-    """
-
-    def __init__(self, step: float, most: int = 1500) -> None:
-        self._step, self._most = step, most
-        self._points: list[Array] = []
-        self._times: list[float] = []
-
-    def add(self, time_s: float, point: Array) -> None:
-        """Add a point; existing points at this time or later are dropped first (time may jump
-        back)."""
-        while self._times and self._times[-1] >= time_s:
-            self._times.pop()
-            self._points.pop()
-        if self._points and float(np.linalg.norm(point - self._points[-1])) < self._step:
-            return
-        self._points.append(np.array(point, float))
-        self._times.append(time_s)
-        if len(self._points) > self._most:
-            self._points, self._times = self._points[::2], self._times[::2]
-            self._step *= 2
-
-    def points(self, until: float = math.inf) -> Array:
-        """Return the points (k, 3), m, up to a time, s."""
-        return np.array(self._points[: bisect_right(self._times, until)]).reshape(-1, 3)

@@ -25,7 +25,7 @@ from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets
 from spacerobot_ros.viewer import content, scene
-from spacerobot_ros.viewer.content import RecentItems, Trail
+from spacerobot_ros.viewer.content import RecentItems
 from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor, react
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import (
@@ -683,7 +683,8 @@ class Page:
         self._drawn_obstacles = []
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach = reach
-        self._trails: dict[Part, Trail] = {}
+        self._flown: dict[Part, RecentItems[Array]] = {}
+        """Positions over the whole flight."""
         self.editor.show_robot(robot, reach)
         self._plots.show_robot(robot)
         if robot is None:
@@ -820,8 +821,8 @@ class Page:
         assert self._kinematics is not None
         hands = content.end_effector_positions(state, self._kinematics)
         for part, point in {BASE_GOAL_KEY: measured.pose[:3], **hands}.items():
-            trail = self._trails.setdefault(part, Trail(0.003 * self._reach))
-            trail.add(measured.time_s, point)
+            path = self._flown.setdefault(part, RecentItems(span_s=math.inf))
+            path.add(measured.time_s, point)
         if state.replay is None:
             self._past.add(measured.time_s, state)
 
@@ -848,7 +849,8 @@ class Page:
             )
 
     def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
-        around.draw_paths("flown", {part: x.points(until) for part, x in self._trails.items()})
+        flown = {part: np.array(path.until(until)) for part, path in self._flown.items()}
+        around.draw_paths("flown", {part: x.reshape(-1, 3) for part, x in flown.items()})
         assert self._robot is not None
         assert self._kinematics is not None
         paths = content.planned_positions(state, self._robot, self._kinematics)

@@ -35,7 +35,7 @@ from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer import content
-from spacerobot_ros.viewer.content import RecentItems, Trail
+from spacerobot_ros.viewer.content import RecentItems
 from spacerobot_ros.viewer.goal_editor import move_along
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
 from spacerobot_ros.viewer.state import Measured, Notice, StackState
@@ -389,18 +389,18 @@ def test_history_keeps_the_last_minutes_and_forgets_a_time_that_comes_again() ->
     assert np.all(np.diff(recent.items[:-1]) > 0)
 
 
-def test_a_trail_is_as_long_as_the_flight_with_as_many_points_as_are_drawn() -> None:
-    trail = Trail(0.01, most=100)
+def test_a_path_is_as_long_as_the_flight_with_as_many_points_as_are_drawn() -> None:
+    path: RecentItems[float] = RecentItems(span_s=math.inf, most=100)
     for k in range(10_000):
-        trail.add(float(k), np.array([0.005 * k, 0.0, 0.0]))
-    assert 50 <= len(trail.points()) <= 100
-    assert trail.points()[0][0] == 0.0
-    assert trail.points()[-1][0] > 48.0
-    gaps = np.diff(trail.points()[:, 0])
+        path.add(float(k), 0.005 * k)
+    assert 50 <= len(path.items) <= 101
+    assert (path.items[0], path.items[-1]) == (0.0, 0.005 * 9999)
+    gaps = np.diff(path.items)[:-1]
     assert gaps.max() < 2.2 * gaps.min(), "thinned evenly"
-    trail.add(100.0, np.array([0.5, 1.0, 0.0]))
-    assert trail.points()[-1].tolist() == [0.5, 1.0, 0.0]
-    assert trail.points()[-2][0] < 0.5
+    assert max(path.until(100.0)) <= 0.5 < path.items[len(path.until(100.0))]
+    path.add(100.0, -1.0)
+    assert path.items[-1] == -1.0
+    assert path.items[-2] < 0.5
 
 
 def test_a_goal_that_is_carried_along_stays_where_it_is_beside_the_base() -> None:
