@@ -250,7 +250,8 @@ def position_group(flight: FlightReport) -> TraceGroup:
     """Return the base position and its goals."""
     targets = flight.targets if flight.position_counts else []
     goals = _goal_lines(targets, lambda goal: goal.position)
-    return TraceGroup(flight.position, ["x", "y", "z"], "base position", "m", PALETTE[:3], goals)
+    path = Signal(flight.time, flight.pose[:, :3])
+    return TraceGroup(path, ["x", "y", "z"], "base position", "m", PALETTE[:3], goals)
 
 
 def attitude_group(flight: FlightReport) -> TraceGroup:
@@ -276,10 +277,12 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
         return [joint.limits.lower, joint.limits.upper]
 
     units, columns = {"m": "m", "rad": "rad"}, flight.shape_columns
-    groups = joint_groups(flight, flight.shape, "joint position", units, bounds, columns)
-    if len(flight.rates):
+    groups = joint_groups(flight, flight.signal("q"), "joint position", units, bounds, columns)
+    if len(flight.qdot):
         units, columns = {"rad": "rad/s"}, flight.wheel_columns
-        groups += joint_groups(flight, flight.rates, "wheel rate", units, _rate_bounds, columns)
+        groups += joint_groups(
+            flight, flight.signal("qdot"), "wheel rate", units, _rate_bounds, columns
+        )
     return groups
 
 
@@ -331,7 +334,7 @@ def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceG
 
 def position_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position and goal."""
-    if not len(flight.position):
+    if not len(flight.time):
         return NO_POSES_TEXT
     caption = "Base link position in the world frame"
     return time_figure(flight, "position", "Base position", caption, [position_group(flight)])
@@ -339,7 +342,7 @@ def position_figure(flight: FlightReport) -> ReportFigure | str:
 
 def pose_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position above base attitude, and goals."""
-    if not len(flight.position):
+    if not len(flight.time):
         return NO_POSES_TEXT
     caption = "Base link position in the world frame, and base attitude as a rotation vector"
     groups = [position_group(flight), attitude_group(flight)]
@@ -361,7 +364,7 @@ def attitude_figure(flight: FlightReport) -> ReportFigure | str:
 
 def shape_figure(flight: FlightReport) -> ReportFigure | str:
     """Joint positions, with URDF limits that are in range."""
-    if not len(flight.shape) or not flight.joint_names:
+    if not len(flight.q) or not flight.joint_names:
         return _why_no_joints(flight)
     caption = "Joint positions" + (", and wheel rates" if flight.wheel_columns else "")
     return time_figure(flight, "shape", "Shape", caption, shape_groups(flight))
@@ -376,10 +379,10 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Joint velocities; None if all joints are wheels; their rates are in shape figures."""
     if not flight.joint_names:
         return _why_no_joints(flight)
-    if not len(flight.rates):
+    if not len(flight.qdot):
         return "The bag contains no joint velocities."
     units, columns = {"m": "m/s", "rad": "rad/s"}, flight.shape_columns
-    groups = joint_groups(flight, flight.rates, "velocity", units, _rate_bounds, columns)
+    groups = joint_groups(flight, flight.signal("qdot"), "velocity", units, _rate_bounds, columns)
     if not groups:
         return None
     return time_figure(flight, "velocities", "Joint velocities", "Velocity of each joint", groups)
@@ -595,7 +598,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Distance and angle between the base and its goal, and between a controller's end-effector and
     its goal, in the controlled components.
     """
-    base = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
+    base = flight.signal("pose")
     groups = []
     for number, (part, pose, targets) in enumerate(
         (("base", base, flight.targets), ("end_effector", flight.tool, flight.tool_targets))
@@ -667,15 +670,15 @@ def _error_decades(values: Array, tolerance: float | None) -> int:
 
 def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Measured minus true poses and joint positions; None if sensors have no errors."""
-    true = Signal(flight.position.time, np.hstack([flight.position.values, flight.quaternion]))
+    true = flight.signal("pose")
     pose, at = _match_times(flight.signal("measured_pose"), true)
     turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
     offset = pose.values[:, :3] - true.values[at, :3]
     errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
     groups = axis_groups(errors, (("base position error", "m"), ("base attitude error", "rad")))
-    shape, at = _match_times(flight.signal("measured_q"), flight.shape)
+    shape, at = _match_times(flight.signal("measured_q"), flight.signal("q"))
     if len(shape):
-        off = Signal(shape.time, shape.values - flight.shape.values[at])
+        off = Signal(shape.time, shape.values - flight.q[at])
         units = {"m": "m", "rad": "rad"}
         groups += joint_groups(flight, off, "joint position error", units)
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]

@@ -90,7 +90,7 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     places = places[: len(indices)]
     for axes, scene, index in zip(places, scenes, indices, strict=True):
         draw_robot(axes, [*scene, *around], points, view)
-        axes.set_title(f"t = {flight.position.time[index]:.5g} s")
+        axes.set_title(f"t = {flight.time[index]:.5g} s")
     keys = draw_goal_and_path(places[-1], flight, view)
     if not narrow():
         legend_above(places[-1], keys)
@@ -127,13 +127,13 @@ def _choose_instants(flight: FlightReport) -> list[int]:
     Of a gait that ends with equal cycles, three are before the cycles and three at one phase of the
     cycles.
     """
-    time, cycles = flight.position.time, flight.cycles
+    time, cycles = flight.time, flight.cycles
     if cycles is not None and cycles.start > 0.0:
         places = [0.0, 0.5 * cycles.start, cycles.start]
         places += [cycles.start + cycles.period * (cycles.count * k // 3) for k in (1, 2, 3)]
         found = np.searchsorted(time, np.array(places) - 1e-9)
         return _indices_ending_at(len(time) - 1, found)
-    moved = np.column_stack([flight.position.values, flight.attitude.values, flight.joints])
+    moved = np.column_stack([flight.pose[:, :3], flight.attitude.values, flight.joints])
     extent = np.maximum(np.ptp(moved, axis=0), 1e-3)
     steps = np.linalg.norm(np.diff(moved, axis=0) / extent, axis=1)
     progress = np.append(0.0, np.cumsum(steps))
@@ -187,7 +187,7 @@ def draw_robot(axes: Axes, solids: Sequence[PlacedSolid], points: Array, view: V
 def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Line2D]:
     """Draw the base at the goal as a ghost, and the base path; return legend entries."""
     keys = []
-    path = flight.position.values
+    path = flight.pose[:, :3]
     limits = axes.axis()
     if float(np.ptp(path, axis=0).max()) > 0.0:
         flat = view(path)
@@ -218,9 +218,9 @@ _FLIGHT_COLOURS = (BASE_COLOUR, PALETTE[1], *PALETTE[5:])
 def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> ReportFigure | str:
     """The base path in three views, together with the paths of the end-effector and of other
     flights."""
-    if not len(flight.position):
+    if not len(flight.time):
         return NO_POSES_TEXT
-    if len(flight.position) < 2 and not beside:
+    if len(flight.time) < 2 and not beside:
         return ONE_STATE_TEXT
     goals = []
     if flight.base_goal is not None and flight.position_counts:
@@ -229,9 +229,9 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     goals += [goal.position for goal in flight.link_goals.values()]
     # Beside the reach of an arm, the path of a base without thrust would be a dot.
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
-    flown = [flight, *(other for other in beside if len(other.position))]
+    flown = [flight, *(other for other in beside if len(other.time))]
     tints = [_FLIGHT_COLOURS[k % len(_FLIGHT_COLOURS)] for k in range(len(flown))]
-    paths = [(each.position.values, tint) for each, tint in zip(flown, tints, strict=True)]
+    paths = [(each.pose[:, :3], tint) for each, tint in zip(flown, tints, strict=True)]
     names = [each.label for each in flown] if beside else ["base"]
     keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
     if shows_tool:
@@ -317,9 +317,9 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
     names = [flight.joint_names[i] for i in columns]
     if len(names) < 2:
         return "A loop in shape space requires at least two joints."
-    if not len(flight.shape):
+    if not len(flight.q):
         return NO_JOINTS_TEXT
-    if len(flight.shape) < 2:
+    if len(flight.q) < 2:
         return ONE_STATE_TEXT
     pairs = list(itertools.combinations(range(len(names)), 2))
     cycles = flight.cycles
@@ -327,7 +327,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
     factor, angle = angle_unit()
     scale = [factor if unit == "rad" else 1.0 for unit in joint_units]
     joint_units = [angle if unit == "rad" else unit for unit in joint_units]
-    part = Signal(flight.shape.time, flight.shape.values[:, columns] * scale)
+    part = Signal(flight.signal("q").time, flight.q[:, columns] * scale)
     if cycles is not None:
         part = part.between(*cycles.last(_SHOWN_CYCLES))
     one = len(pairs) == 1
@@ -392,13 +392,9 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
 
     None if no method repeats cycles, or the joints do not return to the same shape several times.
     """
-    if (
-        not flight.repeats_cycles
-        or not len(flight.shape)
-        or len(flight.attitude) != len(flight.shape)
-    ):
+    if not flight.repeats_cycles or not len(flight.q) or len(flight.attitude) != len(flight.q):
         return None
-    ends = loop_ends(flight.shape)
+    ends = loop_ends(flight.signal("q"))
     if len(ends) < _MIN_LOOPS:
         return None
     number, goal = np.arange(float(len(ends))), flight.base_goal
@@ -411,7 +407,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
         "of a loop; number 0 is before the first loop"
     )
     if goal is not None:
-        poses = zip(flight.position.values[ends], flight.quaternion[ends], strict=True)
+        poses = zip(flight.pose[ends, :3], flight.pose[ends, 3:], strict=True)
         left = Signal(number, np.array([[PoseError.between(r, q, goal).angle] for r, q in poses]))
         groups.append(error_group(flight, left, "attitude", "base", PALETTE[0]))
         caption += "; dashed: goal. Below: remaining angle to the goal, on a logarithmic axis"

@@ -98,30 +98,10 @@ class FlightReport(Flight):
     # -- signals ------------------------------------------------------------------------------
 
     @cached_property
-    def position(self) -> Signal:
-        """True base link position in the world (N, 3), m."""
-        return Signal(self.time, self.pose[:, :3])
-
-    @property
-    def quaternion(self) -> Array:
-        """True base link attitude in the world (N, 4)."""
-        return self.pose[:, 3:]
-
-    @cached_property
     def attitude(self) -> Signal:
         """Base attitude as exponential coordinates (N, 3), rad, continuous beyond half
         revolutions."""
-        return Signal(self.position.time, rotvecs(self.quaternion))
-
-    @cached_property
-    def shape(self) -> Signal:
-        """True joint positions (N, n), m or rad."""
-        return self.signal("q")
-
-    @cached_property
-    def rates(self) -> Signal:
-        """True joint velocities (N, n), m/s or rad/s."""
-        return self.signal("qdot")
+        return Signal(self.time, rotvecs(self.pose[:, 3:]))
 
     @cached_property
     def unexplained_momentum(self) -> Signal:
@@ -133,7 +113,7 @@ class FlightReport(Flight):
         values[:, :6] -= expected.values - expected.values[0]
         return Signal(balance.time, values)
 
-    @cached_property
+    @property
     def tool(self) -> Signal:
         """End-effector pose in the world (N, 7)."""
         return self.signal("end_effector_pose")
@@ -224,7 +204,7 @@ class FlightReport(Flight):
     @property
     def end(self) -> float:
         """Time of the last sample or status, s."""
-        signals = (self.position, self.shape, self.signal("momentum"))
+        signals = map(self.signal, ("pose", "q", "momentum"))
         times = [float(signal.time[-1]) for signal in signals if len(signal)]
         return max([0.0, *times, *(time for time, _ in self.timed_statuses)])
 
@@ -314,7 +294,7 @@ class FlightReport(Flight):
             return {}
         rows = self.samples(_MAX_LINK_ERROR_STATES)
         poses = link_poses(self.robot, continuous(self.pose)[rows], self.joints[rows])
-        time = self.position.time[rows]
+        time = self.time[rows]
         return {link: Signal(time, poses[link]) for link in links if link in poses}
 
     def _errors_of_link(self, link: str) -> tuple[Signal, Signal]:
@@ -375,10 +355,10 @@ class FlightReport(Flight):
         lacking = []
         if self.robot is None:
             lacking.append("no robot description (robot_description)")
-        if not len(self.position):
+        if not len(self.time):
             lacking.append("no base poses (odom)")
         named = self.robot.joint_names if self.robot is not None else ()
-        absent = named if not len(self.shape) else [x for x in named if x not in self.joint_names]
+        absent = named if not len(self.q) else [x for x in named if x not in self.joint_names]
         if absent:
             more = f" and {len(absent) - 1} more" if len(absent) > 1 else ""
             lacking.append(f"no positions of joint '{absent[0]}'{more} (joint_states)")
@@ -403,7 +383,7 @@ class FlightReport(Flight):
 
     def samples(self, count: int) -> list[int]:
         """Recorded states at about equal intervals, including the first and the last."""
-        last = len(self.position) - 1
+        last = len(self.time) - 1
         return np.unique(np.linspace(0, last, count).astype(int)).tolist()
 
     @cached_property
@@ -413,13 +393,13 @@ class FlightReport(Flight):
         Reaction wheel angles are set to 0: a body of revolution looks the same at any angle.
         """
         assert self.robot is not None
-        time, found = self.position.time, []
-        at_poses = np.array_equal(time, self.shape.time)
+        time, found = self.time, []
+        at_poses = np.array_equal(time, self.signal("q").time)
         for name in self.robot.joint_names:
-            values = self.shape.values[:, self.joint_names.index(name)]
+            values = self.q[:, self.joint_names.index(name)]
             if name in self.robot.wheel_names:
                 values = np.zeros(len(values))
-            found.append(values if at_poses else np.interp(time, self.shape.time, values))
+            found.append(values if at_poses else np.interp(time, self.signal("q").time, values))
         return np.column_stack(found) if found else np.empty((len(time), 0))
 
     @property
@@ -440,12 +420,12 @@ class FlightReport(Flight):
         starts = [0.0, *(time for time, _ in self.executing)]
         spans = list(zip(starts, [*starts[1:], self.end], strict=True))
         start, end = max(spans, key=lambda span: span[1] - span[0])
-        return find_cycles(self.rates.between(start, end))
+        return find_cycles(self.signal("qdot").between(start, end))
 
     @property
     def tick(self) -> float:
         """Time between recorded poses, s; 0 if there are fewer than two."""
-        return float(np.median(np.diff(self.position.time))) if len(self.position) > 1 else 0.0
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
 
     @cached_property
     def wheel_columns(self) -> tuple[int, ...]:

@@ -294,11 +294,11 @@ def view_of_flight(flight: FlightReport) -> View3D | str:
     points, flat = _visible_points(flight), is_flat(flight)
     low, high = points.min(axis=0), points.max(axis=0)
     center, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
-    moving = bodies_of(flight, range(len(flight.position)), most)
+    moving = bodies_of(flight, range(len(flight.time)), most)
     ghosts = _goal_commands(flight, most, radius)
     frames = [_key_frames_of(flight, each, radius) for each in moving]
     clips = [
-        _clip(_path_of(each), flight.position.time[found.indices], each.poses[found.indices])
+        _clip(_path_of(each), flight.time[found.indices], each.poses[found.indices])
         for each, found in zip(moving, frames, strict=True)
     ]
     commands = [
@@ -329,7 +329,7 @@ def _body_commands(bodies: Iterable[Body], opacity: float = 1.0) -> list[Command
 
 def _visible_points(flight: FlightReport) -> Array:
     """Return points (N, 3) of robot, paths, goals and target in W, m, which are to be seen."""
-    clouds = [flight.position.values, flight.tool.values[:, :3], flight.target_pose.values[:, :3]]
+    clouds = [flight.pose[:, :3], flight.tool.values[:, :3], flight.target_pose.values[:, :3]]
     rows = flight.samples(12)
     bodies = bodies_of(flight, rows, _MAX_MESH_FACES)
     clouds += [corner_points(placed_solids(bodies, instant)) for instant in range(len(rows))]
@@ -343,7 +343,7 @@ def _visible_points(flight: FlightReport) -> Array:
 def _key_frames_of(flight: FlightReport, body: Body, radius: float) -> KeyFrames:
     # A quaternion's numbers change by half as much as the angle.
     tolerances = np.repeat([_POSITION_TOLERANCE * radius, _ANGLE_TOLERANCE / 2], [3, 4])
-    return key_frames(Signal(flight.position.time, body.poses / tolerances), flight.cycles)
+    return key_frames(Signal(flight.time, body.poses / tolerances), flight.cycles)
 
 
 def _worst_of(frames: list[KeyFrames]) -> KeyFrames:
@@ -400,7 +400,7 @@ def _grid_lines(center: Array, radius: float, spacing: float, flat: bool) -> Arr
 
 
 def _path_commands(flight: FlightReport) -> list[Command]:
-    lines = [("path of the base", flight.position.values, BASE_COLOUR)]
+    lines = [("path of the base", flight.pose[:, :3], BASE_COLOUR)]
     lines += [(f"plan {k}", path, PLANNED_COLOUR) for k, path in enumerate(flight.planned)]
     if len(flight.tool):
         lines.append(("path of the end-effector", flight.tool.values[:, :3], HAND_COLOUR))
@@ -440,7 +440,7 @@ def _goal_commands(flight: FlightReport, most: int, radius: float) -> list[Comma
 
 
 def _time_spans(flight: FlightReport) -> list[tuple[str, float, float]]:
-    end = float(flight.position.time[-1])
+    end = float(flight.time[-1])
     parts = [("whole flight", 0.0, end)]
     cycles = flight.cycles
     if cycles is not None and cycles.count > 2 * FULL_CYCLES:
@@ -466,10 +466,10 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
     text += "; the green ghost is the goal" if ghosts else ""
     text += "; obstacles have the geometry used to measure distances" * bool(flight.obstacles)
     text += "; the target moves according to target/odom" * (flight.target is not None)
-    if len(flight.position) < 2:
+    if len(flight.time) < 2:
         return f"{text}.{flight.missing_meshes}"
     text += (
-        f". {len(frames.indices)} key frames from {len(flight.position)} recorded states; motion "
+        f". {len(frames.indices)} key frames from {len(flight.time)} recorded states; motion "
         "in between is interpolated"
     )
     within = max(frames.error, 1.0)

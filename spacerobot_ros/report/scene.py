@@ -96,7 +96,7 @@ def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body
     found = robot_bodies(flight.robot, flight.meshes, base, flight.joints[at], most)
     target, seen = flight.target, flight.target_pose
     if target is not None and len(seen):
-        times = np.searchsorted(seen.time, flight.position.time[at] - 1e-9)
+        times = np.searchsorted(seen.time, flight.time[at] - 1e-9)
         poses = continuous(seen.values)[np.minimum(times, len(seen) - 1)]
         solids = (
             _moved(each, target.frames[each.link][1]) for each in visuals_of(target, {}, most)
@@ -125,7 +125,7 @@ def goal_of_base(flight: FlightReport, most: int) -> Body | None:
     goal, robot = flight.base_goal, flight.robot
     if goal is None or robot is None or not flight.controls("base"):
         return None
-    position = goal.position if flight.position_counts else flight.position.values[-1]
+    position = goal.position if flight.position_counts else flight.pose[-1, :3]
     pose = np.concatenate([position, goal.quaternion])[np.newaxis]
     solids = tuple(
         _moved(each, robot.frames[each.link][1])

@@ -83,7 +83,7 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         off = f"{quantity(about.distance, 'm')} from the grapple"
         nearest = "" if math.isnan(about.distance) else off
         rows.append(("Target captured", done, nearest))
-    if len(time := flight.position.time) > 1:
+    if len(time := flight.time) > 1:
         ticks = f"{time[-1] - time[0]:.6g} s, ticks of {flight.tick:.4g} s"
         rows.append(("Recorded", f"{len(time) - 1} ticks", ticks))
     return rows
@@ -128,9 +128,9 @@ def result_table(flight: FlightReport) -> Table:
     refused = " (refused)" if last == "refused" and not flight.executing else ""
     for part, text in _base_goal_texts(flight).items():
         rows.append((f"Goal {part}{refused if part != _FREE_BASE else ''}", text))
-    if len(flight.position):
-        rows.append(("Final position", _position_text(flight.position.values[-1])))
-        attitude = rotvec_from_quaternion(flight.quaternion[-1])
+    if len(flight.time):
+        rows.append(("Final position", _position_text(flight.pose[-1, :3])))
+        attitude = rotvec_from_quaternion(flight.pose[-1, 3:])
         rows.append(("Final attitude", _format_attitude(attitude)))
     if flight.tool_goals and len(flight.tool):
         goal = flight.tool_goals[-1].goal
@@ -212,13 +212,13 @@ def payload_text(estimate: PayloadEstimate) -> str:
 
 def joint_table(flight: FlightReport) -> Table | None:
     """Return the first and last joint positions and peak joint velocities, with limits."""
-    if not flight.joint_names or not len(flight.shape):
+    if not flight.joint_names or not len(flight.q):
         return None
     rows = []
     for i, name in enumerate(flight.joint_names):
         joint = flight.joint(name)
         unit = joint_unit(flight, name)
-        ends = [numbers([x]) for x in flight.shape.values[[0, -1], i].tolist()]
+        ends = [numbers([x]) for x in flight.q[[0, -1], i].tolist()]
         if i in flight.wheel_columns:
             ends = [_NO_VALUE] * 2  # The angle of a body of revolution means nothing.
         limits = limit = share = peak_text = _NO_VALUE
@@ -227,8 +227,8 @@ def joint_table(flight: FlightReport) -> Table | None:
                 limits = f"{joint.limits.lower:.5g} to {joint.limits.upper:.5g}"
             if math.isfinite(joint.limits.velocity):
                 limit = f"{joint.limits.velocity:.5g} {unit}/s"
-        if len(flight.rates):
-            peak = float(np.abs(flight.rates.values[:, i]).max())
+        if len(flight.qdot):
+            peak = float(np.abs(flight.qdot[:, i]).max())
             peak_text = f"{peak:.5f} {unit}/s"
             if joint is not None and 0 < joint.limits.velocity < math.inf:
                 share = f"{100 * peak / joint.limits.velocity:.1f} %"
@@ -257,7 +257,7 @@ def published_table(flight: FlightReport) -> Table | None:
 
 
 def _measured_values(flight: FlightReport, row: Published) -> tuple[list[float], str]:
-    whole = flight.error is not None and len(flight.shape) and len(flight.rates)
+    whole = flight.error is not None and len(flight.q) and len(flight.qdot)
     value = flight.summary().get(row.quantity) if whole else None
     if isinstance(value, float | list):
         return np.atleast_1d(value).tolist(), "flight"

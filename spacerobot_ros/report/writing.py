@@ -194,7 +194,7 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
     """
     format = PictureFormat.of(picture)
     flight = read_report(bag, namespace)
-    if not len(flight.position):
+    if not len(flight.time):
         raise SpaceRobotError(over_time.NO_POSES_TEXT)
     with drawing():
         write_output(picture, picture_of(_overview_figure(flight), format, _PICTURE_PIXELS))
@@ -202,11 +202,11 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
 
 def _overview_figure(flight: FlightReport) -> Figure:
     groups = [over_time.position_group(flight), over_time.attitude_group(flight)]
-    if len(flight.shape):
+    if len(flight.q):
         groups += over_time.shape_groups(flight)[:1]
     robot, around = [], placed_solids(obstacles_of(flight), 0)
     if not flight.hidden_links_text:
-        last = [len(flight.position) - 1]
+        last = [len(flight.time) - 1]
         robot = placed_solids(bodies_of(flight, last, MAX_MESH_FACES), 0)
     right = room_for([name for group in groups for name in group.names])
     beside = _ROBOT_PANEL_WIDTH if robot else 0.1

@@ -74,8 +74,8 @@ def poses_by_pinocchio(report: FlightReport, link: str) -> tuple[Array, Array]:
     data, full = model.createData(), pin.neutral(model)
     places = [model.joints[model.getJointId(name)].idx_q for name in report.joint_names]
     R, r = [], []
-    for k, q in enumerate(report.shape.values):
-        full[:3], full[3:7], full[places] = report.position.values[k], report.quaternion[k], q
+    for k, q in enumerate(report.q):
+        full[:3], full[3:7], full[places] = report.pose[k, :3], report.pose[k, 3:], q
         pin.framesForwardKinematics(model, data, full)
         pose = data.oMf[model.getFrameId(link)]
         R.append(pose.rotation.copy())
@@ -89,7 +89,7 @@ def test_errors_of_links_are_those_of_their_true_poses(hands: FlightReport) -> N
         R, r = poses_by_pinocchio(hands, link)
         goal = hands.link_goals[link]
         off = np.linalg.norm(r - goal.position, axis=1)
-        np.testing.assert_array_equal(errors[0].time, hands.position.time)
+        np.testing.assert_array_equal(errors[0].time, hands.time)
         np.testing.assert_allclose(errors[0].values[:, 0], off, atol=1e-12)
         np.testing.assert_allclose(hands.link_poses[link].values[:, :3], r, atol=1e-12)
         if goal.quaternion is None:
@@ -115,7 +115,7 @@ def test_each_goal_counts_until_the_next(hands: FlightReport) -> None:
     ]
     report = other(hands, _all_targets=targets)
     assert report.targets == targets[1:], "goals of the base"
-    errors, time = report.link_errors, hands.position.time
+    errors, time = report.link_errors, hands.time
     early, late = time <= 0.4, time >= 0.7
     np.testing.assert_allclose(errors[RIGHT][0].time, time[early])
     np.testing.assert_allclose(errors[LEFT][0].time, [*time[early], *time[late]])
@@ -388,10 +388,10 @@ def test_joints_are_known_by_their_names_and_not_by_their_places(
     flight = read_report(path)
     assert flight.joint_names == ("a", "b", "c")
     times = [0.0, 0.5, 1.5, 2.5, 3.0, 4.0]
-    assert flight.shape.time.tolist() == times
+    assert flight.signal("q").time.tolist() == times
     expected = np.array([1.0, 2.0, 3.0]) + np.array(times)[:, np.newaxis]
-    np.testing.assert_array_equal(flight.shape.values, expected)
-    np.testing.assert_array_equal(flight.rates.values, np.tile([10.0, 20.0, 30.0], (6, 1)))
+    np.testing.assert_array_equal(flight.q, expected)
+    np.testing.assert_array_equal(flight.qdot, np.tile([10.0, 20.0, 30.0], (6, 1)))
 
 
 # -- what the picture report is made with: arithmetic on time series, and the drawing of ---------

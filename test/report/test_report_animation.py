@@ -102,10 +102,10 @@ def test_links_are_where_pinocchio_has_them(flight: FlightReport) -> None:
         places = np.reshape(position["values"], (-1, 3))
         turns = np.reshape(quaternion["values"], (-1, 4))
         for time, r, attitude in zip(position["times"], places, turns, strict=True):
-            index = int(np.argmin(np.abs(flight.position.time - time)))
+            index = int(np.argmin(np.abs(flight.time - time)))
             q = pin.neutral(model)
-            q[:3], q[3:7] = flight.position.values[index], flight.quaternion[index]
-            q[order] = flight.shape.values[index]
+            q[:3], q[3:7] = flight.pose[index, :3], flight.pose[index, 3:]
+            q[order] = flight.q[index]
             pin.framesForwardKinematics(model, data, q)
             expected = data.oMf[model.getFrameId(path.rpartition("/")[2])]
             np.testing.assert_allclose(r, expected.translation, atol=2e-5)

@@ -104,13 +104,13 @@ def test_charts_have_the_numbers_of_the_bag(window: Browser, flight: FlightRepor
         "none"
     )
     time, *columns = chart(window, 0, "chart.plot.data")
-    np.testing.assert_allclose(time, flight.position.time, atol=1e-12)
-    np.testing.assert_allclose(np.transpose(columns), flight.position.values, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(time, flight.time, atol=1e-12)
+    np.testing.assert_allclose(np.transpose(columns), flight.pose[:, :3], rtol=1e-6, atol=1e-7)
     # What stands below a chart when the cursor is on it.
     chart(window, 0, "chart.plot.setCursor({left: chart.plot.valToPos(4.0, 'x'), top: 5})")
     words = window.evaluate("document.querySelector('.u-legend').innerText")
-    k = int(np.argmin(np.abs(flight.position.time - 4.0)))
-    for value in flight.position.values[k]:
+    k = int(np.argmin(np.abs(flight.time - 4.0)))
+    for value in flight.pose[k, :3]:
         assert f"{float(f'{value:.4g}'):g}"[:5] in words
 
 

@@ -409,7 +409,7 @@ def test_momenta_that_thrusters_put_in_are_no_drift(tmp_path: Path) -> None:
 
 def test_errors_are_goal_minus_measured_in_the_world(tmp_path: Path) -> None:
     found = flight(tmp_path)
-    base = replace(found.position, values=np.hstack([found.position.values, found.quaternion]))
+    base = found.signal("pose")
     errors = pose_errors(base, found.targets)
     np.testing.assert_allclose(errors.values[0], [0.3, 0.0, 3.0, 0.0, -0.1, 0.0], atol=1e-12)
     np.testing.assert_allclose(errors.values[-1], [0.3, 0.0, -0.4, 0.0, -0.3, 0.0], atol=1e-12)
@@ -427,9 +427,9 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
             say("/joint_states_true", joint_states(time, NAMES, shape, [0.0, 0.6]), time)
 
     found = flight(tmp_path, more=more)
-    np.testing.assert_array_equal(found.position.values[:, 0], [0.7, 0.95, 0.95, 0.95])
-    np.testing.assert_allclose(found.shape.values[:, 1], [-0.5, 0.35, 1.1, 1.85])
-    assert found.rates.values[:, 1].tolist() == [0.0, 0.6, 0.6, 0.6]
+    np.testing.assert_array_equal(found.pose[:, 0], [0.7, 0.95, 0.95, 0.95])
+    np.testing.assert_allclose(found.q[:, 1], [-0.5, 0.35, 1.1, 1.85])
+    assert found.qdot[:, 1].tolist() == [0.0, 0.6, 0.6, 0.6]
     assert found.error is not None
     assert found.error.distance == pytest.approx(math.hypot(0.05, 0.4))
     top = {label: (value, note) for label, value, note in headline(found)}
@@ -456,8 +456,8 @@ def test_sensors_that_err_for_a_while_are_right_before_and_after(tmp_path: Path)
             say("/odom_true", odometry(time, *true, *STILL), time)
 
     found = flight(tmp_path, more=more)
-    np.testing.assert_array_equal(found.position.time, [0.0, 0.5, 1.0, 1.5])
-    np.testing.assert_array_equal(found.position.values[:, 0], [0.7, 0.95, 0.95, 0.7])
+    np.testing.assert_array_equal(found.time, [0.0, 0.5, 1.0, 1.5])
+    np.testing.assert_array_equal(found.pose[:, 0], [0.7, 0.95, 0.95, 0.7])
 
 
 def test_an_attitude_error_is_along_axes_of_the_world(tmp_path: Path) -> None:

@@ -126,7 +126,7 @@ def _report(
         gait=next((each for each in told if isinstance(each, PlannerStatus) and each.method), None),
     )
     report = replace(FlightReport.of(bag, flight), events=tuple(events))
-    position = report.position
+
     least = np.inf if clearance is None else float(clearance.min())
     vars(report)["clearance"] = (
         clearance
@@ -135,7 +135,7 @@ def _report(
             geometry=SimpleNamespace(exact=least > 0),
             nearest=Approach(LinkPair("link_0", "link_1"), 0, least, 20.0, np.zeros(3)),
             nearest_time=1.25,
-            over_time=lambda most: (position.time[:most], clearance[:most]),
+            over_time=lambda most: (report.time[:most], clearance[:most]),
         )
     )
     return report
