@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.figures import (
+    EVENTS,
     PALETTE,
     SECONDARY_COLOUR,
     TEXT_COLOUR,
@@ -173,7 +174,7 @@ def draw_events(axes: Axes, events: Sequence[tuple[float, Event]]) -> None:
     lane.spines[:].set_visible(False)
     lane.set_facecolor("#f4f5f7")
     lane.tick_params(left=False, bottom=False, labelleft=False, labelbottom=False)
-    lane.set_label("events")
+    lane.set_label(EVENTS)
     for kind, mark in _MARKS.items():
         times = [time for time, each in shown if each.kind is kind]
         if times:

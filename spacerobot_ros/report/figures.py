@@ -23,7 +23,6 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
-from matplotlib.text import Annotation
 from matplotlib.ticker import MaxNLocator
 
 from spacerobot_ros.errors import SpaceRobotError
@@ -74,7 +73,6 @@ class _Look(NamedTuple):
 
     width: float = WIDTH
     degrees: bool = False
-    lettered: bool = False
     scale: float = 1.0
 
 
@@ -89,7 +87,6 @@ def drawing(
     own: Path | None = None,
     *,
     degrees: bool = False,
-    lettered: bool = False,
 ) -> Iterator[None]:
     """Apply the figure style within the block.
 
@@ -103,8 +100,6 @@ def drawing(
         User style file, or name of a style in this package or in matplotlib; overrides ``style``.
     degrees
         Whether angles over time are in degrees instead of rad.
-    lettered
-        Whether multiple panels in a figure are labelled (a), (b) and so on.
 
     Raises
     ------
@@ -118,7 +113,7 @@ def drawing(
             _require_fonts(own)
         mpl.rcParams.update(_FIXED_SETTINGS)
         scale = float(mpl.rcParams["font.size"]) / _FONT_SIZE
-        before = _look.set(_Look(width, degrees, lettered, scale))
+        before = _look.set(_Look(width, degrees, scale))
         try:
             yield
         finally:
@@ -227,8 +222,6 @@ def sheet(
     if narrow() and left > 0.5:
         # Panels are small, so tick labels have few digits.
         left = max(left, 0.95)
-    if _look.get().lettered:
-        left = max(left, _LETTER_WIDTH)
     left, right, top = (scale * x for x in (left, right, top))
     bottom, gap = scale * (bottom + lane), scale * (gap + lane)
     heights = [scale * each for each in heights]
@@ -252,31 +245,22 @@ def sheet(
             x += across + between
         panels.append(row)
         y -= gap
-    _letter_panels([axes for row in panels for axes in row], left)
     return figure, panels
 
 
+EVENTS = "events"
+"""Label of the axes of event strips."""
+
 _LETTER_WIDTH = 0.32
-"""Space for the letter to the left of a panel, inches."""
-
-_LETTER = "letter"
-"""Group ID of the panel letters."""
+"""Space for the letter above a panel, inches."""
 
 
-def _letter_panels(panels: Sequence[Axes], left: float) -> None:
-    """Write (a), (b) and so on ``left`` of the top of each panel, inches, if that is wanted."""
-    if not _look.get().lettered or len(panels) < 2:
-        return
-    for number, axes in enumerate(panels):
-        axes.annotate(
-            f"({chr(ord('a') + number % 26)})",
-            (0.0, 1.0),
-            (-72.0 * left + 1.0, 3.0),
-            xycoords="axes fraction",
-            textcoords="offset points",
-            annotation_clip=False,
-            gid=_LETTER,
-        )
+def letter_panels(figure: Figure) -> None:
+    """Begin the titles of panels by (a), (b) and so on if there are several."""
+    panels = [each for each in figure.axes if each.get_visible() and each.get_label() != EVENTS]
+    where = mpl.rcParams["axes.titlelocation"]
+    for number, axes in enumerate(panels if len(panels) > 1 else ()):
+        axes.set_title(f"({chr(ord('a') + number % 26)}) {axes.get_title(where)}".rstrip())
 
 
 _LEFT_EDGE = 0.03
@@ -298,10 +282,6 @@ def widen_panels(figure: Figure) -> None:
         return
     for axes, place in zip(figure.axes, places, strict=True):
         axes.set_position((place.x0 - share, place.y0, place.width + share, place.height))
-        for text in axes.texts:
-            if isinstance(text, Annotation) and text.get_gid() == _LETTER:
-                across, up = text.xyann
-                text.xyann = (across + 72.0 * spare, up)
 
 
 def new_figure(height: float) -> Figure:
@@ -497,8 +477,7 @@ def legend_above(axes: Axes, keys: Sequence[Line2D]) -> None:
         )
         figure = axes.figure
         assert isinstance(figure, Figure)
-        left = _LETTER_WIDTH * figure.dpi if _look.get().lettered else 0.0
-        fit_legend(legend, axes.bbox.x1 - left)
+        fit_legend(legend, axes.bbox.x1 - inches(_LETTER_WIDTH) * figure.dpi)
 
 
 def fit_legend(legend: Legend, room: float) -> None:

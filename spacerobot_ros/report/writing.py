@@ -18,6 +18,7 @@ from spacerobot_ros.report.figures import (
     ReportFigure,
     drawing,
     legend_above,
+    letter_panels,
     panel,
     picture_of,
     room_for,
@@ -152,7 +153,7 @@ def write_figures(
     if not events:
         flight = replace(flight, events=())
     made: dict[str, Path | str] = {}
-    with drawing(width / 25.4, "paper", style, degrees=degrees, lettered=True):
+    with drawing(width / 25.4, "paper", style, degrees=degrees):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             try:
                 if others and name == "path":
@@ -162,6 +163,7 @@ def write_figures(
                 else:
                     figure = FIGURES[name](flight)
                 if isinstance(figure, ReportFigure):
+                    letter_panels(figure.figure)
                     widen_panels(figure.figure)
                 picture = (
                     picture_of(figure.figure, format) if isinstance(figure, ReportFigure) else b""

@@ -25,6 +25,7 @@ from spacerobot_ros.report.figures import (
     TraceGroup,
     angle_unit,
     drawing,
+    letter_panels,
     sheet,
 )
 from spacerobot_ros.report.figures_over_time import figure_of_flights, range_without_peaks
@@ -357,14 +358,16 @@ def test_traces_in_degrees_have_goals_limits_and_window_in_degrees() -> None:
     np.testing.assert_allclose(found.window or (), [-180.0, 57.29578], rtol=1e-6)
 
 
-def test_panels_have_letters_only_in_papers_and_where_there_are_several() -> None:
-    def letters(rows: int, *, lettered: bool) -> list[str]:
-        with drawing(lettered=lettered):
-            figure, _ = sheet([[1.0, 2.0]] * rows if rows else [[1.0]], [1.0] * max(rows, 1))
-        return [text.get_text() for axes in figure.axes for text in axes.texts]
+def test_panels_have_letters_if_there_are_several() -> None:
+    def titles(rows: list[list[float]]) -> list[str]:
+        with drawing():
+            figure, panels = sheet(rows, [1.0] * len(rows))
+            panels[0][0].set_title("first")
+            letter_panels(figure)
+            return [axes.get_title("left") for axes in figure.axes]
 
-    assert letters(2, lettered=True) == ["(a)", "(b)", "(c)", "(d)"]
-    assert letters(0, lettered=True) == letters(2, lettered=False) == []
+    assert titles([[1.0, 2.0], [1.0, 2.0]]) == ["(a) first", "(b)", "(c)", "(d)"]
+    assert titles([[1.0]]) == ["first"]
 
 
 def test_panels_of_a_column_reach_its_left_edge(tmp_path: Path) -> None:
