@@ -296,11 +296,12 @@ def view_of_flight(flight: FlightReport) -> View3D | str:
     center, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-3)
     moving = bodies_of(flight, range(len(flight.time)), most)
     ghosts = _goal_commands(flight, most, radius)
-    frames = [_key_frames_of(flight, each, radius) for each in moving]
-    clips = [
-        _clip(_path_of(each), flight.time[found.indices], each.poses[found.indices])
-        for each, found in zip(moving, frames, strict=True)
-    ]
+    # A quaternion's numbers change by half as much as the angle.
+    tolerances = np.repeat([_POSITION_TOLERANCE * radius, _ANGLE_TOLERANCE / 2], [3, 4])
+    motion = Signal(flight.time, np.hstack([each.poses / tolerances for each in moving]))
+    frames = key_frames(motion, flight.cycles)
+    rows = frames.indices
+    clips = [_clip(_path_of(each), flight.time[rows], each.poses[rows]) for each in moving]
     commands = [
         *_stage_commands(points, center, radius, flat),
         *_body_commands([*moving, *obstacles_of(flight)]),
@@ -308,7 +309,7 @@ def view_of_flight(flight: FlightReport) -> View3D | str:
         *ghosts,
         {"type": "set_animation", "animations": clips, "options": {"play": True}},
     ]
-    caption = _caption_text(flight, _worst_of(frames), radius, bool(ghosts))
+    caption = _caption_text(flight, frames, radius, bool(ghosts))
     return View3D(commands, _time_spans(flight), caption)
 
 
@@ -338,18 +339,6 @@ def _visible_points(flight: FlightReport) -> Array:
     goals += [each.position for each in flight.link_goals.values()]
     clouds.append(np.array(goals).reshape(-1, 3))
     return np.concatenate(clouds)
-
-
-def _key_frames_of(flight: FlightReport, body: Body, radius: float) -> KeyFrames:
-    # A quaternion's numbers change by half as much as the angle.
-    tolerances = np.repeat([_POSITION_TOLERANCE * radius, _ANGLE_TOLERANCE / 2], [3, 4])
-    return key_frames(Signal(flight.time, body.poses / tolerances), flight.cycles)
-
-
-def _worst_of(frames: list[KeyFrames]) -> KeyFrames:
-    """Return the key frames of the body that has most, with the largest error of all."""
-    most = max(frames, key=lambda each: len(each.indices))
-    return KeyFrames(most.indices, max(each.error for each in frames), most.every)
 
 
 def _camera_position(points: Array, flat: bool) -> Array:
