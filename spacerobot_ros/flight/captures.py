@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from spacerobot_ros.control.wheels import momentum_budget
 from spacerobot_ros.errors import SpaceRobotError
@@ -58,65 +57,24 @@ class HeldTarget:
     payload: Payload
 
 
-@dataclass(frozen=True)
-class States:
-    """Robot states with known base and joints.
+def _states(flight: Flight, robot: RobotDescription, prefix: str = "") -> Signal:
+    """Return the states with known base and joints, (N, 13 + 2 n): pose, twist, q, qdot.
 
-    Attributes
-    ----------
-    time
-        (N,) s.
-    pose, twist
-        (N, 7) base poses and (N, 6) base twists.
-    q, qdot
-        (N, n) in the robot's joint order.
+    Joints are in the robot's order; with the prefix ``measured_``, states are the measured ones.
     """
+    pose, q = flight.signal(f"{prefix}pose"), flight.signal(f"{prefix}q")
+    names = list(flight.joint_names)
+    if not set(robot.joint_names) <= set(names):
+        return Signal.empty(13 + 2 * len(robot.joint_names))
+    time, base, joints = np.intersect1d(pose.time, q.time, return_indices=True)
+    columns = [names.index(name) for name in robot.joint_names]
+    twist, qdot = flight.signal(f"{prefix}twist"), flight.signal(f"{prefix}qdot")
+    of_joints = (each.values[joints][:, columns] for each in (q, qdot))
+    return Signal(time, np.hstack([pose.values[base], twist.values[base], *of_joints]))
 
-    time: Array
-    pose: Array
-    twist: Array
-    q: Array
-    qdot: Array
 
-    @classmethod
-    def of(cls, flight: Flight, robot: RobotDescription, prefix: str = "") -> States:
-        """Return the states of a flight; empty if its joints differ from the robot's.
-
-        With the prefix ``measured_``, they are the measured states.
-        """
-        pose, q = flight.signal(f"{prefix}pose"), flight.signal(f"{prefix}q")
-        names = list(flight.joint_names)
-        time, base, joints = np.intersect1d(pose.time, q.time, return_indices=True)
-        if not set(robot.joint_names) <= set(names):
-            time, base, joints = time[:0], base[:0], joints[:0]
-            columns = []
-        else:
-            columns = [names.index(name) for name in robot.joint_names]
-        return cls(
-            time,
-            pose.values[base],
-            flight.signal(f"{prefix}twist").values[base],
-            q.values[joints][:, columns],
-            flight.signal(f"{prefix}qdot").values[joints][:, columns],
-        )
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def at(self, rows: npt.NDArray[np.int64]) -> States:
-        """Return some of the states."""
-        return States(
-            self.time[rows], self.pose[rows], self.twist[rows], self.q[rows], self.qdot[rows]
-        )
-
-    def between(self, start: float, end: float) -> States:
-        """Return the states from ``start`` to ``end``, s, inclusive."""
-        inside = (self.time >= start - _SAME_TIME) & (self.time <= end + _SAME_TIME)
-        return self.at(np.flatnonzero(inside))
-
-    def sample_rows(self, most: int) -> npt.NDArray[np.int64]:
-        """Return the rows of at most ``most`` states, at about equal intervals."""
-        return np.unique(np.linspace(0, len(self) - 1, most).round().astype(np.int64))
+def _motion(state: Array) -> RobotMotion:
+    return RobotMotion(*np.split(state, [7, 13, (13 + len(state)) // 2]))
 
 
 def held_bodies(flight: Flight) -> tuple[HeldTarget, ...]:
@@ -144,13 +102,14 @@ def _held_between(
     """Return the body that was held between a capture and a release; none without states."""
     if math.isnan(start):
         return []
-    states = States.of(flight, robot).between(start, end)
+    states = _states(flight, robot).between(start, end)
     poses = flight.signal("target_pose")
     _, own, other = np.intersect1d(states.time, poses.time, return_indices=True)
     if not len(own):
         return []
     link, kinematics = capturing_link(robot, flight.scenario.plant), ForwardKinematics(robot)
-    hand = kinematics.link_in_world(link, states.pose[own[0]], states.q[own[0]])
+    first = _motion(states.values[own[0]])
+    hand = kinematics.link_in_world(link, first.pose, first.q)
     held = relative_pose(hand, poses.values[other[0]])
     grasp = Pose(matrix_from_quaternion(held[3:]), held[:3])
     return [HeldTarget(start, end, Payload(link, target.bodies[0].inertia.moved(grasp)))]
@@ -178,23 +137,22 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
     """
     if flight.robot is None:
         return Signal.empty(len(BUDGET_PARTS))
-    states = States.of(flight, flight.robot)
+    states = _states(flight, flight.robot)
     if not len(states):
         return Signal.empty(len(BUDGET_PARTS))
-    states = states.at(states.sample_rows(most))
+    rows = np.unique(np.linspace(0, len(states) - 1, most).round().astype(np.int64))
     wheels = ReactionWheels.of(flight.robot)
     alone = SpaceRobot(wheels.gyrostat)
     held = [(each, each.payload.attached_to(alone)) for each in held_bodies(flight)]
-    values = np.empty((len(states), len(BUDGET_PARTS)))
-    for row, time in enumerate(states.time.tolist()):
+    values = np.empty((len(rows), len(BUDGET_PARTS)))
+    for row, (time, state) in enumerate(zip(states.time[rows], states.values[rows], strict=True)):
         # The state of the capture itself shows the motion before it.
         robot = next((r for each, r in held if each.start < time <= each.end), alone)
-        q, qdot, others = states.q[row], states.qdot[row], wheels.other
-        parts = momentum_budget(
-            wheels, robot, states.twist[row, 3:], q[others], qdot[others], qdot[wheels.index]
-        )
+        motion, others = _motion(state), wheels.other
+        omega, q, qdot = motion.twist[3:], motion.q[others], motion.qdot
+        parts = momentum_budget(wheels, robot, omega, q, qdot[others], qdot[wheels.index])
         values[row] = [np.linalg.norm(parts[name]) for name in BUDGET_PARTS]
-    return Signal(states.time, values)
+    return Signal(states.time[rows], values)
 
 
 def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate, ...]:
@@ -230,7 +188,7 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
             "them."
         )
     prefix = "measured_" if len(flight.signal("measured_pose")) else ""
-    states, alone = States.of(flight, robot, prefix), SpaceRobot(robot)
+    states, alone = _states(flight, robot, prefix), SpaceRobot(robot)
     # The state of the capture itself shows the motion before it.
     spans = [
         (each.payload.link, states.between(each.start + 2 * _SAME_TIME, each.end)) for each in held
@@ -241,9 +199,9 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
 
 
 def _payload_estimate(
-    flight: Flight, robot: SpaceRobot, link: str, states: States, most: int
+    flight: Flight, robot: SpaceRobot, link: str, states: Signal, most: int
 ) -> PayloadEstimate:
-    about = states.pose[:, :3].mean(axis=0)
+    about = states.values[:, :3].mean(axis=0)
     impulses = _impulses(flight, states, about)
     # No state is in two triples.
     triples = max(min(most, len(states)) // 3, 1)
@@ -251,15 +209,13 @@ def _payload_estimate(
     rows = (middle[:, np.newaxis] + np.arange(-1, 2)).reshape(-1)
     regressors, known = np.empty((len(rows), 6, 10)), np.empty((len(rows), 6))
     for at, row in enumerate(rows.tolist()):
-        pose, twist, q, qdot = (
-            each[row] for each in (states.pose, states.twist, states.q, states.qdot)
-        )
-        motion = RobotMotion(pose, twist, q, qdot)
-        p, L, _ = robot.momentum(pose[3:], q, twist[:3], twist[3:], qdot)
+        motion = _motion(states.values[row])
+        pose, twist, q = motion.pose, motion.twist, motion.q
+        p, L, _ = robot.momentum(pose[3:], q, twist[:3], twist[3:], motion.qdot)
         center = pose[:3] + motion.R_WB @ robot.center_of_mass(q)
         known[at, :3], known[at, 3:] = p, L + np.cross(center - about, p)
         regressors[at] = momentum_regressor(frame_motion(robot, link, motion), about)
-    inertia = robot.inertia_matrix(states.q[0])[3:6, 3:6]
+    inertia = robot.inertia_matrix(_motion(states.values[0]).q)[3:6, 3:6]
     radius = math.sqrt(float(np.trace(inertia)) / 2 / robot.total_mass)
     return estimate_payload(
         link,
@@ -270,21 +226,21 @@ def _payload_estimate(
     )
 
 
-def _impulses(flight: Flight, states: States, about: Array) -> Array:
+def _impulses(flight: Flight, states: Signal, about: Array) -> Array:
     """Return the impulses (N, 6) of the thrust since the first of N states, N s and N m s about a
     point, in W. Wrenches are constant over a tick in the frame of the base.
     """
     wrench = _thrust_during_ticks_before(flight, states.time[1:])
     step = np.diff(states.time)[:, np.newaxis]
-    r, q = states.pose[:, :3], states.pose[:, 3:]
+    r, q, twist = (states.values[:, part] for part in (slice(3), slice(3, 7), slice(7, 13)))
     R = matrices_from_quaternions(q)
     turn = rotvecs_from_quaternions(quaternion_multiply(quaternion_inverse(q[:-1]), q[1:]))
-    omega = states.twist[:, 3:]
+    omega = twist[:, 3:]
     turn_to_middle = turn / 2 + step * (omega[:-1] - omega[1:]) / 8
     middle = matrices_from_quaternions(
         quaternion_multiply(q[:-1], quaternions_from_rotvecs(turn_to_middle))
     )
-    v = np.einsum("nij,nj->ni", R, states.twist[:, :3])
+    v = np.einsum("nij,nj->ni", R, twist[:, :3])
     r_middle = (r[:-1] + r[1:]) / 2 + step * (v[:-1] - v[1:]) / 8
     total = np.zeros((len(states), 6))
     for share, rotation, place in (

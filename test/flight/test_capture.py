@@ -19,7 +19,6 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.captures import (
     BUDGET_PARTS,
-    States,
     held_bodies,
     momentum_budget_over_time,
     payload_estimates,
@@ -370,20 +369,19 @@ def test_a_flight_without_a_robot_or_its_joints_has_no_budget(capture: Flight) -
     assert (len(empty), empty.width) == (0, 4)
 
 
-def test_states_are_those_at_which_base_and_joints_are_known(capture: Flight) -> None:
-    q = capture.signal("q")
-    fewer = Signal(q.time[3:9], q.values[3:9])
-    flight = replace(capture, series={**capture.series, "q": fewer, "qdot": fewer})
-    assert flight.robot is not None
-    backward = replace(flight, joint_names=flight.joint_names[::-1])
-    states = States.of(backward, flight.robot)
-    assert np.array_equal(states.time, q.time[3:9])
-    assert np.array_equal(states.pose, capture.pose[3:9])
-    assert np.array_equal(states.q, fewer.values[:, ::-1])
-    middle = states.between(float(q.time[4]), float(q.time[6]))
-    assert np.array_equal(middle.time, q.time[4:7])
-    assert np.array_equal(states.time[states.sample_rows(2)], q.time[[3, 8]])
-    assert len(states.sample_rows(100)) == 6
+def test_a_budget_is_of_the_states_in_which_base_and_joints_are_known(capture: Flight) -> None:
+    q, qdot = (capture.signal(name) for name in ("q", "qdot"))
+    backward = {
+        name: Signal(each.time[3:9], each.values[3:9, ::-1])
+        for name, each in (("q", q), ("qdot", qdot))
+    }
+    flight = replace(
+        capture, series={**capture.series, **backward}, joint_names=capture.joint_names[::-1]
+    )
+    found, whole = (momentum_budget_over_time(each, 10_000) for each in (flight, capture))
+    assert np.array_equal(found.time, q.time[3:9])
+    np.testing.assert_allclose(found.values, whole.values[3:9], rtol=1e-12)
+    assert np.array_equal(momentum_budget_over_time(flight, 2).time, q.time[[3, 8]])
 
 
 def test_a_planar_flight_determines_seven_parameters_of_the_block(capture: Flight) -> None:
