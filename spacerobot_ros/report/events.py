@@ -8,7 +8,10 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Affine2D
 
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.figures import (
@@ -44,77 +47,58 @@ class _Mark:
     """
 
     label: str
-    marker: str
+    glyph: str
     colour: str
     row: int
-    hollow: bool = False
     strong: bool = False
 
 
 _MARKS = {
-    EventKind.GOAL_ACCEPTED: _Mark("goal", "v", _PLAIN, 0),
-    EventKind.GOAL_REFUSED: _Mark("goal refused", "v", _BAD, 0, hollow=True),
-    EventKind.PLAN_STARTED: _Mark("plan begun", "o", _PLAIN, 0, hollow=True),
-    EventKind.PLAN_READY: _Mark("plan", "o", _PLAIN, 0),
-    EventKind.PLAN_TAKEN_OVER: _Mark("takeover", ">", _PLAIN, 0),
-    EventKind.PLAN_LATE: _Mark("plan late", ">", _WARN, 0, hollow=True),
-    EventKind.PLAN_DISTURBED: _Mark("plan disturbed", "<", _WARN, 0, hollow=True),
-    EventKind.CORRECTION: _Mark("correction", "s", _PLAIN, 0, hollow=True),
-    EventKind.GOAL_REACHED: _Mark("goal reached", "*", _GOOD, 0),
-    EventKind.GOAL_REACHED_PARTLY: _Mark("goal reached in part", "*", _WARN, 0),
-    EventKind.GOAL_FAILED: _Mark("goal failed", "X", _BAD, 0),
-    EventKind.GOAL_ABORTED: _Mark("aborted", "X", _WARN, 0, strong=True),
-    EventKind.FAULT_INJECTED: _Mark("fault on", "^", _WARN, 1, strong=True),
-    EventKind.FAULT_ENDED: _Mark("fault off", "^", _WARN, 1, hollow=True, strong=True),
-    EventKind.FAULTS_CLEARED: _Mark("faults off", "^", _WARN, 1, hollow=True, strong=True),
-    EventKind.DISTURBANCE: _Mark("disturbance", "<", _WARN, 1, strong=True),
-    EventKind.DISTURBANCE_ENDED: _Mark("disturbance over", "<", _WARN, 1, hollow=True, strong=True),
-    EventKind.WHEEL_NEAR_LIMIT: _Mark("wheel near its limit", "o", _WARN, 2, hollow=True),
-    EventKind.WHEEL_SATURATED: _Mark("wheel saturated", "o", _WARN, 2),
-    EventKind.WHEEL_FAILED: _Mark("wheel failed", "o", _BAD, 2, strong=True),
-    EventKind.DUMP_STARTED: _Mark("momentum dump", "o", _PLAIN, 2),
-    EventKind.DUMP_ENDED: _Mark("momentum dumped", "o", _GOOD, 2),
-    EventKind.CONTACT: _Mark("contact", "P", _BAD, 2, strong=True),
-    EventKind.CONTACT_ENDED: _Mark("contact over", "P", _BAD, 2, hollow=True),
-    EventKind.APPROACH_STARTED: _Mark("approach", ">", _PLAIN, 2, hollow=True),
-    EventKind.DETUMBLE_STARTED: _Mark("detumbling", "v", _PLAIN, 2, hollow=True),
-    EventKind.DETUMBLED: _Mark("detumbled", "v", _GOOD, 2),
-    EventKind.CAPTURED: _Mark("captured", "D", _GOOD, 2, strong=True),
-    EventKind.RELEASED: _Mark("released", "D", _GOOD, 2, hollow=True),
-    EventKind.LATCHED: _Mark("latched", "s", _BAD, 2, strong=True),
-    EventKind.REARMED: _Mark("rearmed", "s", _GOOD, 2, hollow=True),
-    EventKind.STUCK_JOINT: _Mark("stuck joint", "D", _BAD, 2, strong=True),
-    EventKind.FAILED: _Mark("node failed", "X", _BAD, 2),
-    EventKind.RESTING: _Mark("at rest", "|", SECONDARY_COLOUR, 2),
-    EventKind.RUNNING: _Mark("running", "|", _GOOD, 2),
-    EventKind.PAUSED: _Mark("paused", "|", TEXT_COLOUR, 2),
-    EventKind.RESUMED: _Mark("resumed", "|", _PLAIN, 2),
-    EventKind.RESET: _Mark("reset", "P", TEXT_COLOUR, 2),
-    EventKind.RECORDING_FAILED: _Mark("recording failed", "d", _BAD, 2),
-    EventKind.FILE_SPLIT: _Mark("next file", "d", SECONDARY_COLOUR, 2, hollow=True),
-    EventKind.NODE_SILENT: _Mark("node silent", "h", _BAD, 2),
-    EventKind.NODE_BACK: _Mark("node back", "h", _GOOD, 2, hollow=True),
-    EventKind.NODE_RESTARTED: _Mark("node restarted", "h", _WARN, 2),
+    EventKind.GOAL_ACCEPTED: _Mark("goal", "▼", _PLAIN, 0),
+    EventKind.GOAL_REFUSED: _Mark("goal refused", "▽", _BAD, 0),
+    EventKind.PLAN_STARTED: _Mark("plan begun", "○", _PLAIN, 0),
+    EventKind.PLAN_READY: _Mark("plan", "●", _PLAIN, 0),
+    EventKind.PLAN_TAKEN_OVER: _Mark("takeover", "▶", _PLAIN, 0),
+    EventKind.PLAN_LATE: _Mark("plan late", "▷", _WARN, 0),
+    EventKind.PLAN_DISTURBED: _Mark("plan disturbed", "◁", _WARN, 0),
+    EventKind.CORRECTION: _Mark("correction", "□", _PLAIN, 0),
+    EventKind.GOAL_REACHED: _Mark("goal reached", "★", _GOOD, 0),
+    EventKind.GOAL_REACHED_PARTLY: _Mark("goal reached in part", "★", _WARN, 0),
+    EventKind.GOAL_FAILED: _Mark("goal failed", "✖", _BAD, 0),
+    EventKind.GOAL_ABORTED: _Mark("aborted", "✖", _WARN, 0, strong=True),
+    EventKind.FAULT_INJECTED: _Mark("fault on", "▲", _WARN, 1, strong=True),
+    EventKind.FAULT_ENDED: _Mark("fault off", "△", _WARN, 1, strong=True),
+    EventKind.FAULTS_CLEARED: _Mark("faults off", "△", _WARN, 1, strong=True),
+    EventKind.DISTURBANCE: _Mark("disturbance", "◀", _WARN, 1, strong=True),
+    EventKind.DISTURBANCE_ENDED: _Mark("disturbance over", "◁", _WARN, 1, strong=True),
+    EventKind.WHEEL_NEAR_LIMIT: _Mark("wheel near its limit", "○", _WARN, 2),
+    EventKind.WHEEL_SATURATED: _Mark("wheel saturated", "●", _WARN, 2),
+    EventKind.WHEEL_FAILED: _Mark("wheel failed", "●", _BAD, 2, strong=True),
+    EventKind.DUMP_STARTED: _Mark("momentum dump", "●", _PLAIN, 2),
+    EventKind.DUMP_ENDED: _Mark("momentum dumped", "●", _GOOD, 2),
+    EventKind.CONTACT: _Mark("contact", "✚", _BAD, 2, strong=True),
+    EventKind.CONTACT_ENDED: _Mark("contact over", "✙", _BAD, 2),
+    EventKind.APPROACH_STARTED: _Mark("approach", "▷", _PLAIN, 2),
+    EventKind.DETUMBLE_STARTED: _Mark("detumbling", "▽", _PLAIN, 2),
+    EventKind.DETUMBLED: _Mark("detumbled", "▼", _GOOD, 2),
+    EventKind.CAPTURED: _Mark("captured", "◆", _GOOD, 2, strong=True),
+    EventKind.RELEASED: _Mark("released", "◇", _GOOD, 2),
+    EventKind.LATCHED: _Mark("latched", "■", _BAD, 2, strong=True),
+    EventKind.REARMED: _Mark("rearmed", "□", _GOOD, 2),
+    EventKind.STUCK_JOINT: _Mark("stuck joint", "◆", _BAD, 2, strong=True),
+    EventKind.FAILED: _Mark("node failed", "✖", _BAD, 2),
+    EventKind.RESTING: _Mark("at rest", "❙", SECONDARY_COLOUR, 2),
+    EventKind.RUNNING: _Mark("running", "❙", _GOOD, 2),
+    EventKind.PAUSED: _Mark("paused", "❙", TEXT_COLOUR, 2),
+    EventKind.RESUMED: _Mark("resumed", "❙", _PLAIN, 2),
+    EventKind.RESET: _Mark("reset", "✚", TEXT_COLOUR, 2),
+    EventKind.RECORDING_FAILED: _Mark("recording failed", "⧫", _BAD, 2),
+    EventKind.FILE_SPLIT: _Mark("next file", "◊", SECONDARY_COLOUR, 2),
+    EventKind.NODE_SILENT: _Mark("node silent", "⬢", _BAD, 2),
+    EventKind.NODE_BACK: _Mark("node back", "⬡", _GOOD, 2),
+    EventKind.NODE_RESTARTED: _Mark("node restarted", "⬢", _WARN, 2),
 }
 """Event marks by kind; other kinds, such as node starts and stops, are not drawn."""
-
-
-_GLYPHS = {
-    "v": "▼▽",
-    "^": "▲△",
-    ">": "▶▷",
-    "<": "◀◁",
-    "o": "●○",
-    "s": "■□",
-    "D": "◆◇",
-    "d": "◆◇",
-    "h": "⬢⬡",
-    "*": "★☆",
-    "X": "✖✖",
-    "|": "❙❙",
-    "P": "✚✚",
-}
-"""matplotlib markers as characters, filled and hollow."""
 
 
 def event_style(kind: EventKind) -> dict[str, Any]:
@@ -122,7 +106,7 @@ def event_style(kind: EventKind) -> dict[str, Any]:
     mark = _MARKS[kind]
     return {
         "kind": kind.value,
-        "glyph": _GLYPHS[mark.marker][mark.hollow],
+        "glyph": mark.glyph,
         "colour": mark.colour,
         "row": mark.row,
         "strong": mark.strong,
@@ -202,10 +186,8 @@ def draw_events(axes: Axes, events: Sequence[tuple[float, Event]]) -> None:
 
 
 def _marker_style(mark: _Mark) -> dict[str, Any]:
-    return {
-        "linestyle": "none",
-        "marker": mark.marker,
-        "markersize": 5.0,
-        "markeredgecolor": mark.colour,
-        "markerfacecolor": "none" if mark.hollow else mark.colour,
-    }
+    path = TextPath((0.0, 0.0), mark.glyph, prop=FontProperties(family="DejaVu Sans"))
+    (x0, y0), (x1, y1) = path.get_extents().get_points()
+    centered = path.transformed(Affine2D().translate(-(x0 + x1) / 2, -(y0 + y1) / 2))
+    look = {"color": mark.colour, "markeredgewidth": 0.0, "linestyle": "none"}
+    return {"marker": centered, "markersize": 6.0, **look}

@@ -140,7 +140,7 @@ def test_figures_for_papers_show_events_only_if_asked(tmp_path: Path) -> None:
 
 
 def test_every_kind_is_a_mark_of_its_own() -> None:
-    looks = [(m.marker, m.colour, m.hollow, m.row) for m in _MARKS.values()]
+    looks = [(m.glyph, m.colour, m.row) for m in _MARKS.values()]
     different = set(looks)
     # Faults that end and faults that are cleared are one thing to the eye.
     assert len(different) == len(looks) - 1
