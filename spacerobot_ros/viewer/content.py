@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Generic, TypeVar
 
@@ -115,7 +114,7 @@ def progress(state: StackState) -> float | None:
 
 def status_html(
     state: StackState,
-    errors: Mapping[Part, GoalDistance] | None = None,
+    errors: Mapping[Part, GoalErrors] | None = None,
     tolerance: Tolerance | None = None,
     *,
     described: bool = True,
@@ -179,7 +178,7 @@ def status_html(
 
 
 def _distance_lines(
-    state: StackState, errors: Mapping[Part, GoalDistance], tolerance: Tolerance | None
+    state: StackState, errors: Mapping[Part, GoalErrors], tolerance: Tolerance | None
 ) -> list[str]:
     """Return a line on each part with a goal: how far it is from it, and the time to go."""
     left = time_to_go(state) if state.planner is None else None
@@ -191,7 +190,7 @@ def _distance_lines(
         # Once a planner has decided on a goal of the base, its message has the numbers.
         by_planner = flies if not of_link else planner is not None
         if by_planner or (not of_link and state.controller is not None):
-            text = error.describe(tolerance, not_controlled(state, part))
+            text = _errors_text(error, tolerance, not_controlled(state, part))
             line = _line_html(f"{part} is {text}{'' if of_link else to_go}.", None)
             whose = "planner" if state.controller is None or of_link else "controller"
             lines.append(_grey_out(line, offline=whose in state.absent))
@@ -349,37 +348,23 @@ def log_html(notices: Iterable[Notice]) -> str:
 # -- errors, momenta ----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class GoalDistance:
-    """Error of a robot part relative to its goal: ``distance``, m, and ``angle``, rad; None: any
-    attitude."""
+GoalErrors = tuple[float, ...]
+"""Distance of a robot part from its goal, m, and angle, rad, unless any attitude is accepted."""
 
-    distance: float
-    angle: float | None
 
-    def describe(
-        self, tolerance: Tolerance | None = None, left_out: Sequence[Controlled] = ()
-    ) -> str:
-        """Return a clause with the errors, their tolerances, and the components that are not
-        controlled."""
-        limits = (0.0, 0.0) if tolerance is None else (tolerance.position, tolerance.attitude)
-        errors, tolerances = [], []
-        for part, value, unit, limit in (
-            ("position", self.distance, "m", limits[0]),
-            ("attitude", self.angle, "rad", limits[1]),
-        ):
-            if value is None:
-                continue
-            free = part in left_out
-            errors.append(quantity(value, unit) + (" (not controlled)" if free else ""))
-            tolerances += [] if free or tolerance is None else [quantity(limit, unit)]
-        within = f" (tolerance {', '.join(tolerances)})" if tolerances else ""
-        return f"{' and '.join(errors)} from its goal{within}"
-
-    @property
-    def numbers(self) -> tuple[float, ...]:
-        """The distance, and the angle if an attitude is required."""
-        return (self.distance,) if self.angle is None else (self.distance, self.angle)
+def _errors_text(
+    errors: GoalErrors, tolerance: Tolerance | None, left_out: Sequence[Controlled]
+) -> str:
+    """Return a clause with errors, their tolerances, and the components not controlled."""
+    limits = (0.0, 0.0) if tolerance is None else (tolerance.position, tolerance.attitude)
+    texts, bounds = [], []
+    parts = zip(("position", "attitude"), errors, ("m", "rad"), limits, strict=False)
+    for part, error, unit, limit in parts:
+        free = part in left_out
+        texts.append(quantity(error, unit) + " (not controlled)" * free)
+        bounds += [] if free or tolerance is None else [quantity(limit, unit)]
+    within = f" (tolerance {', '.join(bounds)})" if bounds else ""
+    return f"{' and '.join(texts)} from its goal{within}"
 
 
 def _task_before_goals(state: StackState) -> str:
@@ -388,11 +373,11 @@ def _task_before_goals(state: StackState) -> str:
     return task if state.goals and "controller" not in state.absent else ""
 
 
-def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, GoalDistance]:
+def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, GoalErrors]:
     """Return the error of each robot part that has a goal and a known pose. Goals that a controller
     pursues after a task, such as an approach, are omitted.
     """
-    measured, errors = state.measured, {}
+    measured, errors = state.measured, dict[Part, GoalErrors]()
     if _task_before_goals(state):
         return {}
     for part, goal in state.goals.items():
@@ -407,8 +392,8 @@ def goal_errors(state: StackState, kinematics: ForwardKinematics) -> dict[Part, 
             pose = state.tool
         if pose is not None:
             error = PoseError.of_link(pose, aim)
-            angle = None if aim.quaternion is None else error.angle
-            errors[part] = GoalDistance(error.distance, angle)
+            turned = () if aim.quaternion is None else (error.angle,)
+            errors[part] = (error.distance, *turned)
     return errors
 
 

@@ -112,14 +112,15 @@ class TimeLine:
     """Replay controls: play, hold, and a time slider."""
 
     def __init__(self, gui: viser.GuiApi, defer: Defer, act: RequestAction) -> None:
-        self._gui, self._defer, self._act = gui, defer, act
+        self._act = act
         self._folder = gui.add_folder("Replay", visible=False)
         with self._folder:
             self._buttons = gui.add_button_group("Replay", ("Play", "Hold"))
-        self._slider: Any = None
+            self._slider: Any = gui.add_slider("Time (s)", 0.0, 1.0, 1e-3, 0.0)
         self._duration = 0.0
         self._left_alone_until = -math.inf
         react(self._buttons.on_click, defer, lambda label: act(Request(label.lower())))
+        react(self._slider.on_update, defer, self._seek)
 
     def show(self, state: StackState, now: float) -> None:
         """Show the replay position, if there is a replay."""
@@ -127,21 +128,13 @@ class TimeLine:
         self._folder.visible = replay is not None
         if replay is None:
             return
-        if self._slider is None or replay.duration_s != self._duration:
-            self._add_slider(replay.duration_s)
+        if replay.duration_s != self._duration:
+            self._duration = replay.duration_s
+            step = max(10.0 ** math.floor(math.log10(max(self._duration, 1e-3) / 1000)), 1e-3)
+            self._slider.step = step
+            self._slider.max = max(math.ceil(self._duration / step) * step, step)
         if now >= self._left_alone_until:
             self._slider.value = min(max(replay.position_s, 0.0), self._slider.max)
-
-    def _add_slider(self, duration: float) -> None:
-        if self._slider is not None:
-            self._slider.remove()
-        self._duration = duration
-        step = max(10.0 ** math.floor(math.log10(max(duration, 1e-3) / 1000)), 1e-3)
-        with self._folder:
-            self._slider = self._gui.add_slider(
-                "Time (s)", 0.0, max(math.ceil(duration / step) * step, step), step, 0.0
-            )
-        react(self._slider.on_update, self._defer, self._seek)
 
     def _seek(self, seconds: float) -> None:
         self._left_alone_until = time.monotonic() + _SLIDER_HOLD_S
@@ -326,7 +319,7 @@ class Plots:
             with self._joint_tab:
                 self._shape = _Plot(self._gui, "Joints", names, 0.01, units, signed=True)
 
-    def add(self, state: StackState, errors: Mapping[Part, content.GoalDistance]) -> None:
+    def add(self, state: StackState, errors: Mapping[Part, content.GoalErrors]) -> None:
         """Append the last state and its goal errors to the curves."""
         measured = state.measured
         if measured is None:
@@ -334,8 +327,7 @@ class Plots:
         time_s = measured.time_s
         self._show_parts(errors)
         for part, error in errors.items():
-            numbers = 1e3 * np.array(error.numbers)
-            self._errors[part, len(numbers)].add(time_s, numbers)
+            self._errors[part, len(error)].add(time_s, 1e3 * np.array(error))
         if state.momenta is not None:
             if self._first is None:
                 self._first = state.momenta.actual
@@ -355,12 +347,12 @@ class Plots:
         """Show the current momentum budget of a robot with wheels."""
         self._budget_text.content = content.momentum_html(state)
 
-    def _show_parts(self, errors: Mapping[Part, content.GoalDistance]) -> None:
+    def _show_parts(self, errors: Mapping[Part, content.GoalErrors]) -> None:
         """Show one plot for each part with an error, and none for others.
 
         A hidden plot is used again: browsers complain about curves of removed ones.
         """
-        shown = [(part, len(error.numbers)) for part, error in errors.items()]
+        shown = [(part, len(error)) for part, error in errors.items()]
         for part, count in shown:
             if (part, count) not in self._errors:
                 title, units = f"Error of {shortened(part)}", ("mm", "mrad")[:count]
@@ -858,7 +850,7 @@ class Page:
             paths[BASE_GOAL_KEY] = state.planned_path
         around.draw_paths("planned", paths)
 
-    def _goal_errors(self, state: StackState) -> dict[Part, content.GoalDistance]:
+    def _goal_errors(self, state: StackState) -> dict[Part, content.GoalErrors]:
         return {} if self._kinematics is None else content.goal_errors(state, self._kinematics)
 
     def _draw_texts(self, shown: StackState) -> None:

@@ -187,9 +187,8 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
         off = shown(verdict, "(?:: |is )# m") if position_counts else truth.distance
         same(off, shown(verdict, "# rad"), 3)
 
-    live = goal_errors(state_of(flight), ForwardKinematics(flight.robot))["base"]
-    assert live.angle is not None
-    same(live.distance, live.angle, 9)
+    distance, angle = goal_errors(state_of(flight), ForwardKinematics(flight.robot))["base"]
+    same(distance, angle, 9)
     head = live_head(flight, bag)
     line = next(text for text in head if text.startswith("base is "))
     same(shown(line, r"base is # m"), shown(line, r"and # rad"), 3)

@@ -408,7 +408,7 @@ def test_a_controller_has_the_distances_of_base_and_end_effector() -> None:
         controller=ControllerStatus(ControllerState.TRACKING, "Tracks."),
         goals={"base": goal},
     )
-    errors = {"base": content.GoalDistance(5.0, 0.0)}
+    errors = {"base": (5.0, 0.0)}
     assert "base is 5 m and 0 rad from its goal." in content.status_html(state, errors)
     due = replace(state, controller=ControllerStatus(ControllerState.TRACKING, ends_at_s=4.25))
     assert content.time_to_go(due) == 3.25

@@ -197,7 +197,7 @@ def test_errors_are_to_the_goal() -> None:
     kinematics = ForwardKinematics(robot)
 
     def errors(state: StackState) -> dict[str, tuple[float, ...]]:
-        return {part: e.numbers for part, e in content.goal_errors(state, kinematics).items()}
+        return content.goal_errors(state, kinematics)
 
     assert errors(STATE) == {}
     turned = quaternion_of((0.0, 0.0, 0.5))
@@ -221,12 +221,12 @@ def test_errors_of_links_are_those_of_their_measured_poses() -> None:
     goals = {link: Goal.of_end_effectors([pose])}
     state = replace(STATE, goals=goals, planner=PlannerStatus(PlannerState.EXECUTING, "Flies."))
     errors = content.goal_errors(state, kinematics)
-    assert errors[link].numbers == pytest.approx((0.5, 0.25))
+    assert errors[link] == pytest.approx((0.5, 0.25))
     head = content.status_html(state, errors)
     assert f"{link} is 0.5 m and 0.25 rad from its goal." in head
     place = replace(state, goals={link: Goal.of_end_effectors([replace(pose, quaternion=None)])})
     errors = content.goal_errors(place, kinematics)
-    assert errors[link].numbers == pytest.approx((0.5,))
+    assert errors[link] == pytest.approx((0.5,))
     assert f"{link} is 0.5 m from its goal." in content.status_html(place, errors)
     assert "from its goal" not in content.status_html(place)
     base = replace(state, goals={"base": Goal(HERE[:3], HERE[3:])})
@@ -292,7 +292,7 @@ def test_what_a_controller_does_not_control_is_said_beside_its_number() -> None:
         )
         control = ControllerStatus(ControllerState.TRACKING, command=report)
         goals = {name: Goal(HERE[:3], HERE[3:]) for name in ("base", "end_effector")}
-        distances = {name: content.GoalDistance(0.25, 0.5) for name in goals}
+        distances = dict.fromkeys(goals, (0.25, 0.5))
         state = replace(STATE, controller=control, goals=goals)
         return content.status_html(state, distances, Tolerance(0.01, 0.02))
 

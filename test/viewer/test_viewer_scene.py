@@ -26,7 +26,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.viewer import scene
-from spacerobot_ros.viewer.content import GoalDistance
+from spacerobot_ros.viewer.content import GoalErrors
 from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot, view_beside_panel
 from spacerobot_ros.viewer.server import ViewerConfig, start_server, stop_server
 from spacerobot_ros.viewer.state import Measured, Momenta, StackState
@@ -225,7 +225,7 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     hand = Goal.of_end_effectors([EndEffectorGoal("hand", np.ones(3))])
     base = Goal.checked(np.ones(3), [0.0, 0.0, 0.0, 1.0])
 
-    def add(time_s: float, goals: dict[str, Goal], **errors: GoalDistance) -> None:
+    def add(time_s: float, goals: dict[str, Goal], **errors: GoalErrors) -> None:
         measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
         plots.add(StackState(measured, goals=goals), errors)
         plots.draw()
@@ -243,11 +243,11 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     add(0.0, {})
     assert shown() == []
     assert plots._no_errors.visible
-    add(1.0, {"hand": hand}, hand=GoalDistance(0.5, None))
+    add(1.0, {"hand": hand}, hand=(0.5,))
     assert shown() == ["Error of hand"], "the base is free"
-    add(2.0, {"hand": hand}, hand=GoalDistance(0.25, None))
+    add(2.0, {"hand": hand}, hand=(0.25,))
     assert numbers("hand")[:2] == [[1.0, 2.0], [500.0, 250.0]], "in mm"
-    add(3.0, {"hand": hand, "base": base}, hand=GoalDistance(0.2, 0.7), base=GoalDistance(3.0, 2.0))
+    add(3.0, {"hand": hand, "base": base}, hand=(0.2, 0.7), base=(3.0, 2.0))
     assert shown() == ["Error of hand", "Error of base"]
     assert numbers("hand")[:3] == [[3.0], [200.0], [700.0]]
     # Tolerances, and an upright line at the time that is looked back to.
@@ -259,10 +259,10 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     assert [axis["scale"] for axis in handle.axes[1:]] == ["mm", "mrad"]
     # A logarithmic axis begins at a micrometre.
     plots._logarithmic.value = True
-    add(4.0, {"base": base}, base=GoalDistance(0.0, 2.0))
+    add(4.0, {"base": base}, base=(0.0, 2.0))
     assert handle.scales["mm"] == {"distr": 3}
     assert numbers("base")[1] == [3000.0, 1e-3]
-    add(5.0, {"end_effector": base}, end_effector=GoalDistance(0.75, 0.5))
+    add(5.0, {"end_effector": base}, end_effector=(0.75, 0.5))
     assert shown() == ["Error of end_effector"], "that of a controller"
     plots.show_robot(None)
     assert shown() == []
