@@ -2,8 +2,7 @@
 arm.
 
 The process has low priority, so that neither the page nor the plant waits for it. It works on
-one goal at a time: a newer goal cancels the plan in progress. Numbered questions and answers are
-pickled on its standard input and output, which no other program can write to.
+one goal at a time: a newer goal cancels the plan in progress. Questions and answers are numbered.
 
 A controller flies to any pose, and reports only in flight that the arm is too short. Its goals are
 checked by searching for joint positions with both the base and the end-effector at their goals.
@@ -13,9 +12,7 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -23,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from functools import reduce
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from queue import SimpleQueue
 
 import numpy as np
@@ -234,7 +231,6 @@ class GoalChecker:
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
-        self._answers: Connection | None = None
         self._number = self._begun = 0
         self._last: GoalQuestion | None = None
         self._progress = ""
@@ -244,13 +240,13 @@ class GoalChecker:
 
     def ask(self, question: GoalQuestion) -> None:
         """Cancel the check in progress, and start checking a question."""
-        process = self._running_process()
+        self._require_process()
         self._number += 1
         if not self._answered and self._cancelled_at is None:
             self._cancelled_at = time.monotonic()
         self._answered, self._asked_at = False, time.monotonic()
         self._last = question
-        self._send_question(process, question)
+        self._send_question(question)
 
     def cancel(self) -> bool:
         """Cancel the check in progress; return whether there was one."""
@@ -259,7 +255,7 @@ class GoalChecker:
         self._number += 1
         self._cancelled_at = self._cancelled_at or time.monotonic()
         self._answered = True
-        self._send_question(self._process, None)
+        self._send_question(None)
         return True
 
     def latest_answer(self) -> GoalCheck | None:
@@ -277,7 +273,8 @@ class GoalChecker:
         if self._cancellation_ignored():
             # A solver, or a compiler, that does not look for its cancellation.
             self.close()
-            self._send_question(self._running_process(), self._last)
+            self._require_process()
+            self._send_question(self._last)
         seconds, found = time.monotonic() - self._asked_at, self._progress
         return GoalCheck(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
 
@@ -295,30 +292,26 @@ class GoalChecker:
         self._cancelled_at = None
         return self._begun != self._number
 
-    def _running_process(self) -> subprocess.Popen[bytes]:
+    def _require_process(self) -> None:
         if self._process is None or self._process.poll() is not None:
             self.close()
             self._begun = 0
-            words = ["-c", f"from {__name__} import main; main()"]
-            self._process = start_child(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-            assert self._process.stdout is not None
-            self._answers = Connection(os.dup(self._process.stdout.fileno()), writable=False)
-        return self._process
+            self._connection, theirs = Pipe()
+            words = ["-c", f"from {__name__} import main; main({theirs.fileno()})"]
+            # Output of libraries goes to standard error.
+            self._process = start_child(words, pass_fds=[theirs.fileno()], stdout=2)
+            theirs.close()
 
-    def _send_question(
-        self, process: subprocess.Popen[bytes], question: GoalQuestion | None
-    ) -> None:
+    def _send_question(self, question: GoalQuestion | None) -> None:
         """Send a numbered question; None cancels the earlier question."""
-        assert process.stdin is not None
         with suppress(OSError):  # The process has ended; latest_answer notices it.
-            pickle.dump((self._number, question), process.stdin)
-            process.stdin.flush()
+            self._connection.send((self._number, question))
 
     def _received_answer(self) -> GoalCheck | None:
         """Return the answer to the last question, if it is there; note what comes before."""
         with suppress(OSError, EOFError):  # The process has ended.
-            while self._answers is not None and self._answers.poll():
-                number, answer = self._answers.recv()
+            while self._connection.poll():
+                number, answer = self._connection.recv()
                 if answer is None:
                     self._begun, self._progress = number, ""
                 elif isinstance(answer, str):
@@ -425,27 +418,25 @@ def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
     return GoalCheck(Verdict.REFUSED, message, shape=shape)
 
 
-def main() -> None:
-    """Answer questions until standard input ends."""
+def main(descriptor: int) -> None:
+    """Answer questions on a connection until it ends."""
     with guarded(), suppress(Terminated):
         os.nice(_NICENESS)
-        # Keep output of libraries out of the answers.
-        answers = Connection(os.dup(1), readable=False)
-        os.dup2(2, 1)
+        connection = Connection(descriptor)
         questions: SimpleQueue[tuple[int, GoalQuestion | None, Cancellation]] = SimpleQueue()
 
         def receive_questions() -> None:
             cancellation = Cancellation()
-            with suppress(EOFError):
+            with suppress(EOFError, OSError):
                 while True:
-                    number, question = pickle.load(sys.stdin.buffer)
+                    number, question = connection.recv()
                     cancellation.cancel()
                     cancellation = Cancellation()
                     questions.put((number, question, cancellation))
             os._exit(0)
 
         def send_answer(number: int, answer: GoalCheck | str | None) -> None:
-            answers.send((number, answer))
+            connection.send((number, answer))
 
         threading.Thread(target=receive_questions, daemon=True).start()
         planner, number = Planner(), 0
