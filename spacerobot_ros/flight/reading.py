@@ -46,6 +46,9 @@ from spacerobot_ros.topics import TOPICS, StateField, goal_topic, path_topic, to
 _SAME_CLOCK_TOLERANCE = 1.0
 """If stamps differ by less from the log times, s, both come from the same clock."""
 
+_STATE_QUANTITIES = {"odom": ("pose", "twist"), "joint_states": ("q", "qdot", "effort")}
+"""Quantities of the fields of the topics with true and measured variants."""
+
 _COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
 
 _QUANTITY_TOPICS = (
@@ -171,49 +174,26 @@ class FlightBag(RecordedRobot):
         width = len(field.members) or len(field.array_entry_names) or len(self.names(name))
         return self.signal(name, field.columns, width)
 
-    def true_signal(self, name: str, number: int) -> Signal:
-        """Return the true values of a field of ``odom`` or ``joint_states``.
-
-        They are on ``<name>_true`` while sensors have errors, and on ``name`` otherwise.
-        """
-        measured = self.quantity(name, TOPICS[name].state[number])
-        true = self.quantity(f"{name}_true", TOPICS[f"{name}_true"].state[number])
-        if not len(true):
-            return measured
-        if not len(measured):
-            return true
-        before, after = measured.time < true.time[0], measured.time > true.time[-1]
-        parts = [
-            (measured.time[before], measured.values[before]),
-            (true.time, true.values),
-            (measured.time[after], measured.values[after]),
-        ]
-        return Signal(*map(np.concatenate, zip(*parts, strict=True)))
-
-    def measured_signal(self, name: str, number: int) -> Signal:
-        """Return a field of ``odom`` or ``joint_states`` while sensors have errors."""
-        began, *_, ended = self._times(self[f"{name}_true"])[[0, -1]]
-        return self.quantity(name, TOPICS[name].state[number]).between(began, ended)
-
     def series(self) -> dict[str, Signal]:
-        """Return all quantities in :attr:`Flight.series` that the bag contains."""
+        """Return all quantities in :attr:`Flight.series` that the bag contains.
+
+        While sensors have errors, true states are on ``odom_true`` and ``joint_states_true``.
+        """
         found: dict[str, Signal] = {}
-        erring = "odom_true" in self
-        for name, quantities in {
-            "odom": ("pose", "twist"),
-            "joint_states": ("q", "qdot", "effort"),
-        }.items():
+        for name, quantities in _STATE_QUANTITIES.items():
+            if name not in self and f"{name}_true" not in self:
+                continue
             for number, quantity in enumerate(quantities):
-                if name in self or f"{name}_true" in self:
-                    found[quantity] = self.true_signal(name, number)
-                if erring and quantity != "effort" and f"{name}_true" in self:
-                    found[f"measured_{quantity}"] = self.measured_signal(name, number)
-        for name in _QUANTITY_TOPICS:
-            for field in TOPICS[name].state if name in self else ():
-                found[field.quantity] = self.quantity(name, field)
-        for name in self.topic_names():
-            if name.endswith("/pose") and name in self:
-                field = topic_named(name).state[0]
+                measured, true = (
+                    self.quantity(each, TOPICS[each].state[number])
+                    for each in (name, f"{name}_true")
+                )
+                found[quantity] = _completed(true, measured)
+                if len(true) and quantity != "effort":
+                    found[f"measured_{quantity}"] = measured.between(*true.time[[0, -1]].tolist())
+        poses = (name for name in self.topic_names() if name.endswith("/pose"))
+        for name in filter(self.__contains__, (*_QUANTITY_TOPICS, *poses)):
+            for field in topic_named(name).state:
                 found[field.quantity] = self.quantity(name, field)
         return found
 
@@ -306,6 +286,19 @@ class FlightBag(RecordedRobot):
             )
             found[name] = Commands(series.stamp_ns // config.period_ns, values)
         return found
+
+
+def _completed(true: Signal, measured: Signal) -> Signal:
+    """Return true values, and measured ones before the first and after the last of them."""
+    if not (len(true) and len(measured)):
+        return true if len(true) else measured
+    before, after = measured.time < true.time[0], measured.time > true.time[-1]
+    parts = [
+        (measured.time[before], measured.values[before]),
+        (true.time, true.values),
+        (measured.time[after], measured.values[after]),
+    ]
+    return Signal(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 # -- any bag ----------------------------------------------------------------------------------

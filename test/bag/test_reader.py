@@ -311,7 +311,7 @@ def test_the_truth_is_what_was_measured_until_it_is_published(tmp_path: Path) ->
 
     def truth(namespace: str) -> list[list[float]]:
         flight = FlightBag(bag, namespace)
-        q, qdot = (flight.true_signal("joint_states", number) for number in (0, 1))
+        q, qdot = (flight.series()[name] for name in ("q", "qdot"))
         return np.column_stack([q.time, q.values, qdot.values]).tolist()
 
     assert truth("") == [[0, 0.1, -0.1], [1, 1.1, -1.1], [2, 2.0, -2.0], [3, 3.0, -3.0]]
