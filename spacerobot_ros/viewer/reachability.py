@@ -235,15 +235,12 @@ class GoalChecker:
         self._last: GoalQuestion | None = None
         self._progress = ""
         self._asked_at = 0.0
-        self._cancelled_at: float | None = None
         self._answered = True
 
     def ask(self, question: GoalQuestion) -> None:
         """Cancel the check in progress, and start checking a question."""
         self._require_process()
         self._number += 1
-        if not self._answered and self._cancelled_at is None:
-            self._cancelled_at = time.monotonic()
         self._answered, self._asked_at = False, time.monotonic()
         self._last = question
         self._send_question(question)
@@ -253,7 +250,6 @@ class GoalChecker:
         if self._process is None or self._answered:
             return False
         self._number += 1
-        self._cancelled_at = self._cancelled_at or time.monotonic()
         self._answered = True
         self._send_question(None)
         return True
@@ -265,32 +261,24 @@ class GoalChecker:
             return None
         answer = self._received_answer()
         if answer is not None:
-            self._answered, self._cancelled_at = True, None
+            self._answered = True
             return answer
         if self._process is not None and self._process.poll() is not None:
             self._answered = True
             return GoalCheck(Verdict.UNCHECKED, "The process that checks goals has terminated.")
-        if self._cancellation_ignored():
-            # A solver, or a compiler, that does not look for its cancellation.
+        seconds, found = time.monotonic() - self._asked_at, self._progress
+        if 0 < self._begun < self._number and seconds > _MAX_CANCELLATION_S:
+            # A solver, or a compiler, of an earlier goal does not look for its cancellation.
             self.close()
             self._require_process()
             self._send_question(self._last)
-        seconds, found = time.monotonic() - self._asked_at, self._progress
         return GoalCheck(Verdict.PLANNING, f"Planning for {seconds:.0f} s{found}.")
 
     def close(self) -> None:
         """Terminate the child process that checks goals."""
         process, self._process = self._process, None
-        self._cancelled_at = None
         if process is not None:
             end_child(process, {})
-
-    def _cancellation_ignored(self) -> bool:
-        since = self._cancelled_at
-        if since is None or time.monotonic() - since < _MAX_CANCELLATION_S:
-            return False
-        self._cancelled_at = None
-        return self._begun != self._number
 
     def _require_process(self) -> None:
         if self._process is None or self._process.poll() is not None:
