@@ -32,7 +32,7 @@ __getattr__ = lazy_names(
 )
 
 _MIN_SHARED_MEMORY = 16 * 2**10
-"""Minimum free shared memory, bytes: with less, loading ROS ends the process."""
+"""Minimum free shared memory in bytes; with less, loading ROS ends the process."""
 
 
 def _warn_of_full_shared_memory() -> None:
@@ -43,8 +43,8 @@ def _warn_of_full_shared_memory() -> None:
         return
     if facts.f_blocks and facts.f_bavail * facts.f_frsize < _MIN_SHARED_MEMORY:
         logging.getLogger(__name__).warning(
-            "/dev/shm is full: ROS may end here with SIGBUS (bus error). Free it; fastrtps_* files "
-            "left by killed processes may be deleted while nothing runs."
+            "/dev/shm is full: ROS may end here with SIGBUS (bus error). Free space in /dev/shm; "
+            "fastrtps_* files left by killed processes may be deleted while nothing runs."
         )
 
 

@@ -21,17 +21,18 @@ def printable(text: str) -> str:
 
 
 def reason(error: Exception) -> str:
-    """Return why a file cannot be used, without the error number and the path."""
+    """Return the reason why a file cannot be used, without the error number and the path."""
     return getattr(error, "strerror", None) or str(error)
 
 
 def sentence_case(text: str) -> str:
-    """Return a string with a capital first letter, as at the beginning of a sentence."""
+    """Return a string with its first letter capitalised, as at the beginning of a sentence."""
     return text[:1].upper() + text[1:]
 
 
 def quantity(value: float, unit: str) -> str:
-    """Return a number as a readable string: three digits; rounding errors are shown as a bound.
+    """Return a number as a readable string with three digits; a rounding error is shown as an
+    upper bound.
 
     m, rad, m/s and rad/s get SI prefixes: ``1.38 mm``, ``< 1 µrad``.
     """
@@ -46,12 +47,12 @@ def quantity(value: float, unit: str) -> str:
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> str:
-    """Format numbers with ``digits`` decimals; a rounded zero has no sign."""
+    """Format numbers with ``digits`` decimals; a number that is rounded to zero has no sign."""
     return ", ".join(f"{round(float(x), digits) + 0.0:.{digits}f}" for x in values)
 
 
 def shortened(name: str, length: int = 21) -> str:
-    """Return a name, shortened in the middle if it is too long for a label."""
+    """Return a name, shortened in the middle if the name is too long for a label."""
     half = (length - 1) // 2
     return name if len(name) <= length else f"{name[:half]}…{name[-half:]}"
 
@@ -87,14 +88,14 @@ class PlanningError(SpaceRobotError):
 
 
 class Proof(Enum):
-    """Kinds of proof that a goal is unreachable."""
+    """Types of proof that a goal is unreachable."""
 
     LIMITS = "joint limits"
     """No joint positions within the limits reach the goal."""
 
     MOMENTUM = "momentum"
-    """The goal requires moving the centre of mass, which is impossible at zero momentum, or
-    more angular momentum than reaction wheels can store."""
+    """The goal requires a displacement of the centre of mass, which is impossible at zero
+    momentum, or more angular momentum than the reaction wheels can store."""
 
     COLLISION = "collision"
     """In the goal configuration, links are in contact or closer than the clearance."""
@@ -104,7 +105,7 @@ class Proof(Enum):
 
 
 class UnreachableError(PlanningError):
-    """A goal that the robot cannot reach; ``proof`` is the kind of proof.
+    """A goal that the robot cannot reach; ``proof`` is the type of proof.
 
     If the search merely found no manoeuvre, the error is a :class:`NotFoundError`.
     """
@@ -128,8 +129,8 @@ class UnreadMeshError(PlanningError):
 def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError:
     """Return a single error for a goal that several methods have rejected.
 
-    A proof by one method applies to all. Without a proof, the result is a NotFoundError if one is
-    given.
+    A proof by one method applies to all. If there is no proof, the result is a NotFoundError if
+    one of the errors is a NotFoundError.
     """
     refusals = list(refusals)
     for refusal in refusals:
@@ -141,7 +142,7 @@ def refusal_of_all(message: str, refusals: Iterable[Exception]) -> PlanningError
 
 
 class GoalError(PlanningError):
-    """An invalid goal: not finite, not a rotation, or a wrong number of entries."""
+    """An invalid goal: it is not finite, is not a rotation, or has the wrong number of entries."""
 
 
 class RecordingError(SpaceRobotError):

@@ -1,7 +1,7 @@
 """Flight events, and the conversion of events and statuses to key-value pairs.
 
-Every status and event is a diagnostic_msgs/DiagnosticStatus, whose content is pairs of strings. A
-:class:`KeyValueFormat` describes the pairs of a class for both writing and reading.
+Every status and event is a diagnostic_msgs/DiagnosticStatus, which contains pairs of strings. A
+:class:`KeyValueFormat` describes the pairs that represent a class, for both writing and reading.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class TextFormat:
 
 
 def number_format(specification: str) -> TextFormat:
-    """Return the format of a number with a format specification such as ``.9g``."""
+    """Return the format of a number, given a format specification such as ``.9g``."""
     return TextFormat(lambda number: format(number, specification), float)
 
 
@@ -60,12 +60,12 @@ class KeyValueField:
     key
         Key of the pair; empty: the attribute name.
     prefix
-        For a mapping, with one pair per item: the key prefix. Empty: all pairs not used by earlier
-        fields.
+        Key prefix, if the attribute is a mapping with one pair per item. Empty: all pairs not used
+        by earlier fields.
     always
         Whether to write the attribute even if it has its default value.
     present_with
-        Attribute without which this one is not written; empty: none.
+        Attribute whose absence means that this attribute is not written either; empty: none.
     """
 
     attribute: str
@@ -80,7 +80,7 @@ _Record = TypeVar("_Record")
 
 
 class KeyValueFormat:
-    """The key-value pairs of the statuses or events of one class, in the order of its fields.
+    """The key-value pairs of the statuses or events of one class, in the order of the class fields.
 
     Parameters
     ----------
@@ -113,12 +113,13 @@ class KeyValueFormat:
     def from_values(self, kind: type[_Record], values: Mapping[str, str], **given: Any) -> _Record:
         """Return a status or event from the pairs returned by :meth:`to_values`.
 
-        Attributes missing from the pairs are taken from ``given``, or have their defaults.
+        Attributes missing from the pairs are taken from ``given`` or, if missing there, have their
+        defaults.
 
         Raises
         ------
         SpaceRobotError
-            A pair is missing or unreadable; the message names it.
+            A pair is missing or unreadable; the message names the pair.
         """
         left, arguments = dict(values), dict(given)
         defaults = self._defaults(kind)
@@ -183,7 +184,7 @@ class EventKind(str, Enum):
     """An external wrench becomes active."""
     DISTURBANCE_ENDED = "disturbance_ended"
     CONTACT = "contact"
-    """Two links of the robot touch; the exact plant continues through the contact."""
+    """Two links of the robot touch; the exact plant lets the links pass through each other."""
     CONTACT_ENDED = "contact_ended"
     CAPTURED = "captured"
     """The robot has captured the target; its model changes from now on."""
@@ -191,7 +192,7 @@ class EventKind(str, Enum):
     """The robot has released the target."""
 
     APPROACH_STARTED = "approach_started"
-    """The end-effector has a trajectory to the target."""
+    """A trajectory of the end-effector to the target was planned."""
     DETUMBLE_STARTED = "detumble_started"
     """The robot is brought to rest together with the held target."""
     DETUMBLED = "detumbled"
@@ -214,11 +215,11 @@ class EventKind(str, Enum):
     PLAN_STARTED = "plan_started"
     PLAN_READY = "plan_ready"
     PLAN_TAKEN_OVER = "plan_taken_over"
-    """A plan replaces another plan while the joints move."""
+    """A plan replaces another plan while the joints are moving."""
     PLAN_LATE = "plan_late"
     """A plan was not ready at the start time of its schedule."""
     PLAN_DISTURBED = "plan_disturbed"
-    """An external wrench changes the momenta, which a plan assumes to be constant."""
+    """An external wrench changes momenta that a plan assumes to be constant."""
     CORRECTION = "correction"
     STUCK_JOINT = "stuck_joint"
 
@@ -244,9 +245,9 @@ class Event:
     message
         One sentence for people.
     level
-        Level of diagnostic_msgs/DiagnosticStatus: 0 OK, 1 WARN, 2 ERROR.
+        Level of diagnostic_msgs/DiagnosticStatus: 0 (OK), 1 (WARN) or 2 (ERROR).
     time_s
-        Simulated time, s; None if unknown to the node.
+        Simulated time, s; None if the node does not know it.
     goal_id
         The goal to which the event refers; empty: none.
     about

@@ -1,4 +1,4 @@
-"""Atomic file replacement, files that only this user can have written, and the cache.
+"""Atomic file replacement, files that no other user can have modified, and the cache.
 
 Files are replaced completely or not at all, because disks may fill up and processes may be killed.
 Files that are executed or resumed are read only if no other user on the machine can have written
@@ -143,14 +143,14 @@ def load_yaml(text: str, loader: Any = None) -> Any:
 
 
 def read_private(path: Path) -> bytes:
-    """Return the content of a file that only this user, or root, can have written.
+    """Return the content of a file that only this user, or root, can have modified.
 
     Raises
     ------
     OSError
         It cannot be read.
     UntrustedFileError
-        It belongs to another user, or others can write to it.
+        The file belongs to another user, or others can write to it.
     """
     _require_own(path)
     return path.read_bytes()
@@ -163,13 +163,13 @@ def _require_own(path: Path) -> None:
         raise UntrustedFileError(f"'{path}' belongs to user {facts.st_uid}; use your own.")
     if facts.st_mode & _OTHERS_MAY_WRITE:
         raise UntrustedFileError(
-            f"others can write to '{path}' (mode {stat.S_IMODE(facts.st_mode):o}); make it yours "
-            f"alone with chmod go-w '{path}'."
+            f"others can write to '{path}' (mode {stat.S_IMODE(facts.st_mode):o}); remove their "
+            f"permission with chmod go-w '{path}'."
         )
 
 
 class Cache:
-    """A folder of files that can be recomputed. Its methods log warnings instead of raising
+    """A folder of files that can be recomputed. The methods log warnings instead of raising
     exceptions.
 
     The last line of each file contains its key, length and SHA-256, to detect truncated files.

@@ -10,12 +10,12 @@ from spacerobot_ros.errors import SpaceRobotError
 
 
 def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a package whose names come from other modules.
+    """Return the ``__getattr__`` of a package whose names are defined in other modules.
 
     Parameters
     ----------
     package
-        Its name, for messages about missing names.
+        Package name, for messages about missing names.
     modules
         Module of each name.
     """

@@ -1,8 +1,8 @@
 """The measures of a flight: key figures for the whole flight, each defined once.
 
-Campaigns, the summary of ``spacerobot run``, reports and the live page use them. A
+Campaigns, the summary of ``spacerobot run``, reports and the live page use these measures. A
 :class:`~spacerobot_ros.flight.flight.Flight` computes them from its arrays over time; SIMD lanes,
-which store only extreme values and the last state, return them directly.
+which store only extreme values and the last state, return the measures directly.
 """
 
 from __future__ import annotations
@@ -23,21 +23,24 @@ from spacerobot_ros.planning.execution.status import PlannerStatus, manoeuvre_ti
 
 
 class Outcome(str, Enum):
-    """Outcome of a goal; each value but the last is also a ``state`` in status messages."""
+    """Outcome of a goal; each value except the last is also a ``state`` in status messages."""
 
     REACHED = "reached"
     REACHED_PARTLY = "reached_partly"
-    """Reached except for a required base pose component that is not controlled."""
+    """The goal was reached except for a required component of the base pose that is not
+    controlled.
+    """
     FAILED = "failed"
     REFUSED = "refused"
     ABORTED = "aborted"
     INTERRUPTED = "interrupted"
-    """The flight ended before the goal did."""
+    """The flight ended before the goal was decided."""
 
 
 @dataclass(frozen=True)
 class CaptureMeasures:
-    """The measures of a capture; NaN without a target, or for events that did not occur.
+    """The measures of a capture; values are NaN if there is no target, or if the respective
+    event did not occur.
 
     Attributes
     ----------
@@ -48,14 +51,14 @@ class CaptureMeasures:
     time
         Time of the first capture, s.
     distance
-        Distance between end-effector and grapple frame at that time, m; without a capture, the
-        smallest during the flight.
+        Distance, m, between end-effector and grapple frame at the capture; without a capture, the
+        smallest distance during the flight.
     impulse, angular_impulse
         Norms of the impulse, N s, and of its moment at the end-effector, N m s.
     joint_impulse
         Largest grasp impulse along a joint coordinate, N m s or N s.
     detumbling_time, detumbling_bound
-        Time until the robot and the target came to rest, and the shortest possible time, s.
+        Time, s, until the robot and the target came to rest, and the shortest possible time.
     """
 
     captured: float = math.nan
@@ -76,18 +79,18 @@ class Measures:
     Attributes
     ----------
     outcome, message
-        Outcome of the goal, and a sentence about it.
+        Outcome of the goal, and its description in one sentence.
     duration
         Simulated time, s.
     manoeuvre_time
-        Duration of the schedules flown for the goal, or of a controller's tracking, s; see
+        Duration, s, of the schedules flown for the goal, or of the tracking by a controller; see
         :func:`flown_time`.
     error
         Error of the last base pose relative to its goal; None without a goal or a pose.
     end_effector_distance, end_effector_angle
-        Final distance (m) and angle (rad) of the end-effector from its goal, the largest if there
-        are several; NaN without a goal or a pose. The angle is also NaN if the attitude is free or
-        not controlled.
+        Final distance (m) and angle (rad) of the end-effector from its goal; with several
+        end-effectors, the largest values; NaN without a goal or a pose. The angle is also NaN if
+        the attitude is free or not controlled.
     peak_rate, peak_effort
         (n,) largest absolute rates (m/s or rad/s) and actuator efforts (N or N m) of the joints.
     peak_wrench
@@ -95,13 +98,13 @@ class Measures:
     lowest, highest
         (n,) joint position ranges, m or rad.
     momentum_drift
-        (2,) see :func:`momentum_drift`, kg m/s and kg m^2/s.
+        (2,) momentum drift, kg m/s and kg m^2/s; see :func:`momentum_drift`.
     corrections
-        Number of corrections: plans after the first.
+        Number of corrections, that is, plans after the first one.
     propellant
         Propellant used by the thrusters, kg; NaN without thrusters.
     plan_time, wall_time
-        Wall time for planning and for the whole flight, s; NaN if unknown.
+        Wall times of the planning and of the whole flight, s; NaN if unknown.
     clearance
         Smallest distance between two links, m; a negative value is the penetration depth. Infinite
         for a robot without pairs that could touch, NaN if not measured.
@@ -145,8 +148,8 @@ def momentum_change(momenta: Array, reference: Array) -> Array:
 def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
     """Return the largest change (..., 2) in linear and angular momentum not explained by thrust.
 
-    It is ``max |m(t) - m(0)|`` over each flight, with the momenta ``m`` minus those produced by
-    thrusters.
+    The change is ``max |m(t) - m(0)|`` over each flight, where ``m`` are the momenta
+    without the contribution of the thrusters.
 
     Parameters
     ----------
@@ -154,8 +157,8 @@ def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
         (..., N, 6) or more columns, the momenta first: kg m/s and kg m^2/s. Rows that are not
         finite are ignored.
     expected
-        (N, 6) initial momenta plus those produced by thrusters; If None, or if the number of rows
-        differs, no thrust is assumed.
+        (N, 6) initial momenta plus the momenta produced by thrusters; if None, or if the number of
+        rows differs, no thrust is assumed.
     """
     m = momenta[..., :6]
     if expected is not None and len(expected) == len(m):
@@ -170,23 +173,28 @@ def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
 
 
 def peak(values: Array) -> Array:
-    """Return the largest absolute value (k,) of each column of values (N, k); 0 without rows."""
+    """Return the largest absolute value (k,) of each column of values (N, k), or 0 if there are no
+    rows.
+    """
     return np.asarray(np.abs(values).max(axis=0, initial=0.0))
 
 
 def peak_wrench(wrenches: Array) -> Array:
-    """Return the largest force and torque norms (2,) of wrenches (N, 6); 0 without wrenches."""
+    """Return the largest force and torque norms (2,) of wrenches (N, 6), or 0 if there are no
+    wrenches.
+    """
     return peak(np.linalg.norm(wrenches.reshape(-1, 2, 3), axis=2))
 
 
 def flown_time(
     statuses: Iterable[tuple[float, PlannerStatus | ControllerStatus]], end: float
 ) -> float | None:
-    """Return the flight time for the last goal, s.
+    """Return the flight time, s, for the last goal.
 
-    With a planner it is the duration of the flown schedules
-    (:func:`~spacerobot_ros.planning.execution.status.manoeuvre_time`); otherwise the time from the
-    first state that a controller tracked for its last completed goal until the goal ended.
+    With a planner, this is the duration of the flown schedules
+    (:func:`~spacerobot_ros.planning.execution.status.manoeuvre_time`); otherwise, it is the time
+    from the first state that a controller tracked for its last completed goal to the end of this
+    goal.
 
     Parameters
     ----------
@@ -219,21 +227,23 @@ def flown_time(
 
 @dataclass(frozen=True)
 class Metric:
-    """A flight measure as a number with a unit.
+    """A measure of a flight as a number with a unit.
 
     Attributes
     ----------
     unit, description
         SI unit (empty: none) and a short description for the user.
     evaluate
-        Function of the measures and the robot. It returns one number, NaN if not applicable; or one
-        number per joint, (..., n) for joint measures (..., n) of several flights.
+        Function of the measures and the robot. The function returns one number (NaN if not
+        applicable), or one number per joint: (..., n) for joint measures (..., n) of several
+        flights.
     by_joint
-        Whether ``<name>.<joint>`` is the value for a joint, and ``<name>`` the worst joint value.
+        Whether there is a value ``<name>.<joint>`` for each joint, and ``<name>`` is the worst of
+        these.
     smallest_is_worst
         Whether the smallest value is the worst.
     yes_or_no
-        Whether the value is 1 for yes and 0 for no.
+        Whether the value is a flag (1 for yes, 0 for no).
     """
 
     unit: str
@@ -262,7 +272,7 @@ def _joint_margin(measures: Measures, robot: RobotDescription) -> Array:
 def _margin_metric(quantity: str, limit: str, peak_of: Callable[[Measures], Array]) -> Metric:
     return Metric(
         "",
-        f"unused share of the {quantity} limit of a joint",
+        f"unused fraction of a joint's {quantity} limit",
         lambda measures, robot: 1.0 - peak_of(measures) / robot.limits(limit),
         by_joint=True,
         smallest_is_worst=True,
@@ -284,13 +294,14 @@ METRICS: dict[str, Metric] = {
     ),
     "end_effector_position_error_m": Metric(
         "m",
-        "final distance of the end-effector from its goal, the largest if there are several",
+        "final distance of the end-effector from its goal (the largest if there are several "
+        "end-effectors)",
         lambda m, _: m.end_effector_distance,
     ),
     "end_effector_attitude_error_rad": Metric(
         "rad",
-        "final angle of the end-effector from its goal, the largest if there are several, if its "
-        "attitude is controlled",
+        "final angle of the end-effector from its goal if its attitude is controlled (the "
+        "largest if there are several end-effectors)",
         lambda m, _: m.end_effector_angle,
     ),
     "duration_s": Metric("s", "simulated time of the flight", lambda m, _: m.duration),
@@ -341,7 +352,7 @@ METRICS: dict[str, Metric] = {
         "distance",
         "m",
         "distance between end-effector and grapple frame at the capture; without a capture, the "
-        "smallest",
+        "smallest distance",
     ),
     "capture_impulse_Ns": _capture_metric("impulse", "N s", "impulse of the capture"),
     "capture_angular_impulse_Nms": _capture_metric(

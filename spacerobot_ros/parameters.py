@@ -1,9 +1,8 @@
-"""Parameters: declared once, as configuration fields, and checked on input.
+"""Parameters, which are declared once, as configuration fields, and are checked on input.
 
 A configuration is a frozen dataclass whose fields are created by :func:`parameter`, :func:`group`
-and
-:func:`registered`. Everything else follows from it: ROS parameters, input checks on the command
-line and in :func:`spacerobot_ros.plan`, and the tables in the documentation.
+and :func:`registered`. Everything else is derived from the configuration: ROS parameters, input
+checks on the command line and in :func:`spacerobot_ros.plan`, and the tables in the documentation.
 """
 
 from __future__ import annotations
@@ -33,8 +32,8 @@ _GROUP_OF_EVERY_NODE = "qos_overrides."
 def is_of_every_node(name: str) -> bool:
     """Whether a parameter is common to all nodes rather than part of a node's configuration.
 
-    rclpy declares them, and they appear in `ros2 param dump` and in bags; ``autostart`` is
-    this package's. They are irrelevant to a flight.
+    rclpy declares such parameters, and they appear in `ros2 param dump` and in bags; ``autostart``
+    is this package's. Such parameters are irrelevant to a flight.
     """
     return name in _OF_EVERY_NODE or name.startswith(_GROUP_OF_EVERY_NODE)
 
@@ -47,7 +46,8 @@ def as_numbers(
     Raises
     ------
     SpaceRobotError
-        The values are not real numbers. Its type is ``error``; its message begins with ``name``.
+        The values are not real numbers. The exception has type ``error``, and its message begins
+        with ``name``.
     """
     try:
         numbers = np.asarray(given)
@@ -59,7 +59,7 @@ def as_numbers(
 
 
 _PARAMETER, _GROUP, _REGISTERED = "parameter", "group", "registered"
-"""Metadata keys of dataclass fields: one per function that creates a field."""
+"""Metadata keys of dataclass fields, one for each function that creates a field."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Parameter:
     name
         Full name, including its groups: ``sensors.joint_noise``.
     default
-        Value if the parameter is not set.
+        Value that is used if the parameter is not set.
     unit, description
         SI unit and a short description for the user.
     minimum, maximum
@@ -86,10 +86,10 @@ class Parameter:
         Whether the array consists of strings; a single string with entries separated by line breaks
         or semicolons is also accepted.
     of_joints
-        Whether the array has one entry per joint, or the string lists joints.
+        Whether the array has one entry per joint, or the string is a list of joints.
     by_name
-        Whether entries of such an array may be given for only some joints, by name: as a mapping,
-        or as strings ``NAME:VALUE``. The value then consists of such strings.
+        Whether such an array may be given for only some joints, by name, as a mapping or as
+        strings ``NAME:VALUE``. In that case, the value consists of such strings.
     """
 
     name: str
@@ -197,14 +197,14 @@ def _named_entries(value: Any) -> dict[str, Any] | None:
 
 
 def parameter(default: Value, description: str, unit: str = "", **attributes: Any) -> Any:
-    """Return a field of a configuration; ``attributes`` are further attributes of
-    :class:`Parameter`."""
+    """Return a field of a configuration; ``attributes`` are additional attributes
+    of :class:`Parameter`."""
     declaration = Parameter("", default, unit, description, **attributes)
     return field(default=default, metadata={_PARAMETER: declaration})
 
 
 def nonnegative(default: Value, description: str, unit: str = "", **attributes: Any) -> Any:
-    """Return a :func:`parameter` whose value, or every entry, is at least 0."""
+    """Return a :func:`parameter` whose value is, or whose entries are, at least 0."""
     return parameter(default, description, unit, minimum=0.0, **attributes)
 
 
@@ -258,7 +258,8 @@ def _declared_in_class(
 
 
 def configured(kind: type[C], values: Mapping[str, Any]) -> C:
-    """Return a configuration with ``values`` by full name; omitted parameters have their defaults.
+    """Return a configuration with these ``values``, given by full name; omitted parameters have
+    their defaults.
 
     Values with other names are ignored; see :func:`require_known`.
 
@@ -287,7 +288,7 @@ def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
     Raises
     ------
     ParameterError
-        A name is unknown; the message states that ``owner`` has no such option.
+        A name is unknown; the error message states that ``owner`` has no such option.
     """
     unknown = sorted(set(names) - {parameter.name for parameter in declared(config)})
     if unknown:

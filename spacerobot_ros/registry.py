@@ -1,6 +1,6 @@
-"""Registries of control laws, gait methods and metrics: the package's own and the user's.
+"""Registries of control laws, gait methods and metrics from this package and from users.
 
-A user's class is added to a registry in one of three ways:
+A user-defined class is added to a registry in one of three ways:
 
 - an installed package declares it as an entry point of the registry's group;
 - the environment variable ``SPACEROBOT_PLUGINS`` (or ``--plugin``) names the Python file that
@@ -38,7 +38,7 @@ class Registry(dict[str, type[T]]):
     Parameters
     ----------
     kind
-        Kind of class, for messages: ``control law``.
+        Type of the classes, for messages: ``control law``.
     group
         Entry point group through which installed packages add classes.
     base
@@ -65,13 +65,13 @@ class Registry(dict[str, type[T]]):
         self._own = frozenset([*self, *reserved])
 
     def register(self, entry: type[T]) -> type[T]:
-        """Add a class, replacing one with the same name and file; usable as a decorator.
+        """Add a class, replacing a class with the same name and file; can be used as a decorator.
 
         Raises
         ------
         ParameterError
-            It is not derived from the base class or lacks an abstract member, it has no name, or
-            the name is used by the package or by a class in another file.
+            The class is not derived from the base class, lacks an abstract member or a name, or
+            its name is already used by the package or by a class in another file.
         """
         name = self._usable_name(entry)
         self[name] = entry
@@ -81,7 +81,7 @@ class Registry(dict[str, type[T]]):
         """Add the classes from installed packages and from the files in ``SPACEROBOT_PLUGINS``.
 
         An invalid entry point is skipped with a warning, because it must not affect users who do
-        not use it.
+        not need this entry.
 
         Raises
         ------
@@ -130,11 +130,11 @@ class Registry(dict[str, type[T]]):
             )
         if name in self._own and self.get(name) is not entry:
             raise ParameterError(
-                f"{named} has the name of the package's own '{name}': choose another name."
+                f"{named} has the same name as the package's own '{name}': choose another name."
             )
         if name in self and _origin(self[name]) != _origin(entry):
             raise ParameterError(
-                f"Two classes are the {self.kind} '{name}': '{self[name].__name__}' of "
+                f"Two classes define the {self.kind} '{name}': '{self[name].__name__}' of "
                 f"{_origin(self[name])} and '{entry.__name__}' of {_origin(entry)}. Rename one of "
                 "them, or omit its file."
             )
@@ -149,8 +149,8 @@ def _origin(entry: type[Any]) -> str:
 def import_plugins() -> None:
     """Import the files in ``SPACEROBOT_PLUGINS`` before anything else in this package.
 
-    They may import the whole package, which is only partly loaded when a registry is imported. The
-    registries report files that cannot be imported.
+    These files may import the whole package, which is only partially loaded when a registry
+    is imported. The registries report files that cannot be imported.
     """
     for file in _plugin_files():
         with suppress(ParameterError):
@@ -173,7 +173,7 @@ def add_plugin(file: Path) -> None:
     ------
     ParameterError
         The file cannot be imported, or contains an invalid class. Registries that are imported
-        later raise the error then.
+        later raise the error at that time.
     """
     files = dict.fromkeys([*_plugin_files(), file.resolve()])
     os.environ[PLUGINS_VARIABLE] = os.pathsep.join(map(str, files))

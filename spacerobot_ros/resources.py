@@ -28,7 +28,7 @@ def installed_share_directory(package: str) -> Path | None:
 
 @lru_cache(maxsize=1)
 def share_directory() -> Path:
-    """Return the folder with ``urdf/`` and ``config/``: the checkout's, or the installed one.
+    """Return the folder with ``urdf/`` and ``config/``, either in the checkout or as installed.
 
     Raises
     ------
@@ -51,12 +51,12 @@ def share_directory() -> Path:
 
 
 def resource_names(folder: str, suffix: str) -> list[str]:
-    """Return the names, without suffix, of all files of one kind (``urdf``, ``config``)."""
+    """Return the names, without suffix, of all files of one type (``urdf``, ``config``)."""
     return sorted(path.stem for path in (share_directory() / folder).glob(f"*{suffix}"))
 
 
 def robot_file(name: str) -> Path:
-    """Return a robot's file, by path (URDF or xacro) or by the name of a packaged robot.
+    """Return the file of a robot, given by path (URDF or xacro) or by the name of a packaged robot.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def robot_file(name: str) -> Path:
     nearby = sorted(path.name for path in Path(name).parent.glob("*") if is_path(path.name))
     nearby += resource_names("urdf", ".urdf")
     raise ParameterError(
-        f"There is no robot '{name}': there is no such URDF file."
+        f"There is no robot '{name}': no such URDF file exists."
         f"{suggestion(Path(name).name, nearby)}"
     )
 

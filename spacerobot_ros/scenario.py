@@ -1,4 +1,4 @@
-"""Scenarios: ROS parameter files for the nodes of a flight, with a section for its goals.
+"""Scenarios: ROS parameter files for the nodes of a flight, with a section for the goals.
 
 This module also reads parameter files and command line settings.
 """
@@ -84,10 +84,10 @@ _OTHER_GOAL = "Flown to a goal other than the scenario's"
 
 @dataclass(frozen=True)
 class Published:
-    """A published figure for this scenario, for comparison with the measured figure.
+    """A published value for this scenario, for comparison with the measured value.
 
     ``quantity`` is a key in the run summary, or a gait note in the planner's status;
-    ``note`` comments on the printed figure (a misprint, an integration error).
+    ``note`` is a comment on the printed value (a misprint, an integration error).
     """
 
     quantity: str
@@ -97,7 +97,9 @@ class Published:
 
 @dataclass(frozen=True)
 class Kill:
-    """A node that is killed ``at`` a simulated time and offline ``until`` another, s."""
+    """A node that is killed at the simulated time ``at``, s, and stays offline until
+    ``until``, s.
+    """
 
     node: str
     at: float
@@ -126,9 +128,9 @@ class Scenario:
     commanders
         Nodes that command the robot.
     published, published_method
-        Published figures, and the gait method to which they apply; empty: any.
+        Published figures, and the gait method to which they apply (empty: any method).
     kills
-        The nodes that are killed during the flight, by time.
+        The nodes that are killed during the flight, in order of time.
     in_file, overrides
         Parameters by node and full name; overrides take precedence over the file.
     has_goal
@@ -153,12 +155,13 @@ class Scenario:
     """Cached results of :meth:`config` by node."""
 
     def config(self, node: str) -> Any:
-        """Return the configuration of a node: defaults, the file's parameters, the overrides.
+        """Return the configuration of a node, from defaults, parameters in the file, and overrides.
 
         Raises
         ------
         ParameterError
-            The node has no such parameter, or a value is invalid; the message names both.
+            The node has no such parameter, or a value is invalid; the message names the node and
+            the parameter.
         """
         if node not in self._configs:
             self._configs[node] = self._make_config(node)
@@ -252,8 +255,8 @@ class Scenario:
     def records(self, nodes: Sequence[str]) -> dict[str, dict[str, str]]:
         """Return the metadata records for a bag of the flight, by name.
 
-        ``scenario`` contains name, description, goals and published figures, ``parameters/<node>``
-        all parameters of a node as a JSON string.
+        ``scenario`` contains the name, the description, the goals and the published figures;
+        ``parameters/<node>`` contains all parameters of a node as a JSON string.
         """
         scenario = {"name": self.name, "description": self.description}
         scenario |= {key: " ".join(map(repr, pose)) for key, pose in self._goal_poses().items()}
@@ -338,12 +341,12 @@ class Scenario:
     def with_method(self, method: str) -> Scenario:
         """Return the scenario with another gait method, or another control law.
 
-        If it is a control law, a robot without a scenario uses a controller instead of a planner.
+        With a control law, a robot without a scenario uses a controller instead of a planner.
 
         Raises
         ------
         ParameterError
-            The scenario has no planner or controller that could use it.
+            The scenario has no planner or controller that could use this method or law.
         """
         if method not in (*LAWS, *METHODS):
             known = [*METHODS, *LAWS]
@@ -361,7 +364,8 @@ class Scenario:
         if node not in self.commanders:
             raise ParameterError(
                 f"'{method}' is a {kind}, and the scenario '{self.name}' has no section "
-                f"'{node}' that could use it: it flies with {' and '.join(self.commanders)}."
+                f"'{node}' that could use it: this scenario flies with "
+                f"{' and '.join(self.commanders)}."
             )
         return self.with_overrides(node, {parameter: method})
 
@@ -397,8 +401,8 @@ class Scenario:
         rotvec: Sequence[float] | None = None,
         rpy_deg: Sequence[float] | None = None,
     ) -> Scenario:
-        """Return the scenario with a new goal pose (7,) or position (3,), and a new attitude (3,),
-        if given.
+        """Return the scenario with a new goal pose (7,) or position (3,), and with a new attitude
+        (3,), if they are given.
 
         The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). See
         :meth:`with_other_goal`.
@@ -431,22 +435,22 @@ class Scenario:
         return self.with_other_goal(aimed)
 
     def with_other_goal(self, goal: Goal) -> Scenario:
-        """Return the scenario with another goal and a description that reports this.
+        """Return the scenario with another goal and a description that mentions this goal.
 
-        The published figures, which apply to the published goal, are dropped.
+        The published figures, which apply only to the published goal, are dropped.
         """
         made = replace(self, goal=goal, published=(), has_goal=True)
         return made.described_for_other_goal() if self.has_goal else made
 
     def described_for_other_goal(self) -> Scenario:
-        """Return the scenario with a description that reports another goal."""
+        """Return the scenario with a description that mentions another goal."""
         return replace(self, description=self.description and _OTHER_GOAL)
 
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
     ) -> Scenario:
-        """Return the scenario with other end-effector goals, and with its base goal limited to
-        ``base``.
+        """Return the scenario with other end-effector goals, and with the components of its
+        base goal limited to ``base``.
 
         Raises
         ------
@@ -475,8 +479,8 @@ class Scenario:
         return heard.with_overrides("plant", {"end_effectors": [*published, *more]})
 
     def require_goal(self) -> None:
-        """Raise an error if the scenario has no goal, for example if it is from a robot file or a
-        dump.
+        """Raise an error if the scenario has no goal, for example because it was created from a
+        robot file or a dump.
 
         Raises
         ------
@@ -505,8 +509,8 @@ def _changed(file: Path) -> float:
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """Return the scenario as parameter file text, with its overrides, but without published figures
-    and node kills.
+    """Return the scenario as parameter file text, including its overrides, but not the published
+    values and node kills.
     """
     about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
     for part, keys in _KEYS_OF_PARTS.items():
@@ -543,7 +547,7 @@ def load_scenario(name: str) -> Scenario:
     Raises
     ------
     ParameterError
-        There is no such scenario, or its file cannot be used; the message names it.
+        There is no such scenario, or the file cannot be used; the message names the file.
     """
     path = Path(name)
     if path.suffix in (".yaml", ".yml"):
@@ -682,7 +686,8 @@ def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
     Raises
     ------
     ParameterError
-        A line has a different format, its node cannot be killed, or its times are not in order.
+        A line has a different format, its node cannot be killed, or its times are not in ascending
+        order.
     """
     if not isinstance(lines, list):
         raise ParameterError(
@@ -755,14 +760,14 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     """Return the parameters in a parameter file, by node and full name.
 
     A section applies to a node in any namespace (``/**/plant``), in one namespace
-    (``/robot_1/plant``), in no namespace (``plant``), or to all nodes (``/**``); if two sections
-    set the same parameter, the later one
-    takes precedence; a section for all nodes has the lowest precedence.
+    (``/robot_1/plant``), in no namespace (``plant``), or to all nodes (``/**``). If two sections
+    set the same parameter, the later one takes precedence. A section for all nodes has the lowest
+    precedence.
 
     Raises
     ------
     ParameterError
-        The file cannot be read, or a section has no ``ros__parameters`` with parameters under it.
+        The file cannot be read, or a section has no ``ros__parameters`` that contains parameters.
     """
     return _sections(_read_content(path), path)
 
@@ -770,7 +775,7 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
     """Return each parameter that differs between the scenarios, with its unit and values.
 
-    Values are texts; ``–`` if a scenario uses the default. Robot
+    Values are strings; a value is ``–`` if the scenario uses the default. Robot
     descriptions are omitted.
     """
     given = [{(n, p): v for n in CONFIGS for p, v in s.parameters(n).items()} for s in scenarios]

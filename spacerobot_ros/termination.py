@@ -1,13 +1,13 @@
-"""Signals that end a process, and child processes that end with it.
+"""Signals that end a process, and child processes that end with their parent.
 
 A process installs its guard at its first import (:func:`guarded`). SIGINT, SIGTERM and SIGHUP then
 raise :class:`Terminated` in the main thread; work that must be completed, such as a flight or a
 bag, receives a request instead (:func:`graceful_shutdown`). A second signal, at least one second
-later, ends the process immediately. So does a timer if a library swallows the exception. Python
-handles
-signals once a call of C code has returned.
+later, ends the process immediately. A timer also ends the process if a library suppresses the
+exception. Python handles signals once a call to C code has returned.
 
-On Linux, if a process ends, the kernel signals its children started by :func:`start_child`.
+On Linux, if a process ends, the kernel sends a signal to the children that the process started with
+:func:`start_child`.
 """
 
 from __future__ import annotations
@@ -33,13 +33,15 @@ _MESSAGE_BY_SIGNAL = {
 }
 
 _LONGEST_UNWINDING_TIME = 1.2
-"""Wall time within which the main thread must end after a signal's exception, s."""
+"""Wall time, s, within which the main thread must end after the exception raised by a signal."""
 
 _SAME_SIGNAL_TIME = 1.0
-"""Wall time within which signals are treated as one, s: launcher and terminal both send one."""
+"""Wall time, s, within which several signals are treated as one, because both a launcher and a
+terminal send a signal.
+"""
 
 _TIME_AFTER_PARENT_END = 1.5
-"""Wall time from the end of the parent until the kernel kills this process, s."""
+"""Wall time, s, from the end of the parent until the kernel kills this process."""
 
 _PARENT_VARIABLE = "SPACEROBOT_PARENT"
 """Environment variable with which a child receives its parent's process id."""
@@ -50,8 +52,8 @@ _PR_SET_PDEATHSIG = 1
 
 
 class Terminated(KeyboardInterrupt):
-    """A signal that ends the process. Like KeyboardInterrupt, it is not caught by ``except
-    Exception``.
+    """A signal that ends the process. Like KeyboardInterrupt, this exception is not caught
+    by ``except Exception``.
 
     Parameters
     ----------
@@ -97,7 +99,9 @@ class _Guard:
             self._errors, sys.stderr = None, self._errors
 
     def watch_parent(self) -> None:
-        """Make the kernel (Linux) signal the parent's end, which may already have happened."""
+        """Make the Linux kernel send a signal when the parent ends; the parent may have ended
+        already.
+        """
         if not self._parent:
             return
         with suppress(ImportError, OSError, AttributeError):
@@ -146,8 +150,8 @@ _guard: _Guard | None = None
 def guarded() -> Iterator[bool]:
     """End the process on signals and when the parent ends, within this context.
 
-    Yields whether the guard is new: inside another guard it has no effect. Outside the main thread,
-    the only thread that receives signals, it has no effect.
+    Yields whether the guard is new: a guard inside another guard has no effect. It also has no
+    effect outside the main thread, because only that thread receives signals.
 
     Raises
     ------
@@ -173,12 +177,13 @@ def graceful_shutdown(
 ) -> Iterator[Callable[[], bool]]:
     """Convert signals to a request while work is completed.
 
-    Yields a function that returns whether termination was requested; the work calls it regularly.
+    Yields a function that returns whether termination was requested; the code in the context calls
+    it regularly.
 
     Parameters
     ----------
     on_request
-        Called in the main thread on the first signal: may cancel a computation.
+        Function called in the main thread on the first signal; it may cancel a computation.
 
     Raises
     ------
@@ -212,7 +217,9 @@ def termination() -> Terminated | None:
 
 
 def announce(ending: Terminated) -> None:
-    """Write the signal that ends this process to standard error, if still open."""
+    """Write the signal that ends this process to standard error, if standard error is still
+    open.
+    """
     if _guard is not None:
         _guard.restore_stderr()
     with suppress(OSError):  # The terminal may be closed.
@@ -223,10 +230,10 @@ def announce(ending: Terminated) -> None:
 def start_child(
     words: Sequence[str], environment: Mapping[str, str] | None = None, **options: Any
 ) -> subprocess.Popen[bytes]:
-    """Start Python with arguments ``words`` in a new session that ends with this process.
+    """Start Python with arguments ``words`` in a new session that ends together with this process.
 
-    The child must be guarded. ``environment`` is its environment, by default a copy of this
-    process's; for ``options`` see ``subprocess.Popen``.
+    The child must be guarded. ``environment`` is the environment of the child, by default a
+    copy of this process's environment; for ``options``, see ``subprocess.Popen``.
     """
     import subprocess
 
@@ -255,8 +262,9 @@ def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) ->
     process
         The child.
     signals
-        Signals to send in turn, each with the maximum wait for the end, s of wall time; signal 0
-        only waits. Then the child is killed with its whole session.
+        Signals to send in turn, each with the maximum wall time, s, to wait for the child to
+        end; signal 0 means only waiting. After that, the child is killed together with its whole
+        session.
     """
     import subprocess
 
@@ -277,10 +285,11 @@ def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) ->
 
 @contextmanager
 def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a program, such as a compiler, and kill it with its children at the end of the context.
+    """Start a program, such as a compiler, and kill it together with its children at the end of
+    the context.
 
-    It runs in its own session, without input. A signal raises :class:`Terminated` in this context,
-    even within :func:`graceful_shutdown`.
+    The program runs in its own session, without input. A signal raises :class:`Terminated` in this
+    context, even within :func:`graceful_shutdown`.
 
     Parameters
     ----------

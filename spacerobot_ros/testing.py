@@ -1,4 +1,4 @@
-"""This package's nodes and your own in one executor, for your pytest tests."""
+"""Nodes from this package and custom nodes in one executor, for pytest tests."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ class Arrival(NamedTuple):
 
 
 class Stack:
-    """Nodes in one executor, in lockstep, in their own ROS domain; a context manager.
+    """Context manager for nodes in one executor, in lockstep, in a separate ROS domain.
 
-    The plant starts at the first goal, once all nodes are connected. Time continues while nodes
-    spin.
+    The plant starts at the first goal, once all nodes are connected. Simulated time continues
+    while the nodes spin.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Stack:
         Robot or scenario (a name or a file) that configures the nodes.
     nodes
         Names of this package's nodes, and functions or classes that take an rclpy context and
-        return your own node.
+        return a custom node.
     parameters
         Further parameters by node: ``{"planner": {"method": "lie_bracket"}}``.
     timeout
@@ -116,11 +116,13 @@ class Stack:
         z: float | None = None,
         rotvec: npt.ArrayLike | None = None,
     ) -> Arrival:
-        """Send a goal and spin until the planner, or else the controller, completes it.
+        """Send a goal and spin until the planner or, without a planner, the controller completes
+        it.
 
-        ``goal`` is any goal; None: the base at ``x``, ``y``, ``z`` (m), rotated by ``rotvec``
-        (rad), 0 unless given; without coordinates any position is accepted, without ``rotvec`` any
-        attitude. Raises :class:`.SpaceRobotError` if a node fails, or time is up.
+        ``goal`` is any goal. If it is None, the base is sent to ``x``, ``y``, ``z`` (m), rotated by
+        ``rotvec`` (rad), each 0 by default. If no coordinates are given, any position is accepted;
+        if ``rotvec`` is not given, any attitude is accepted. Raises :class:`.SpaceRobotError` if a
+        node fails or the time limit expires.
         """
         if goal is None:
             place = [x or 0.0, y or 0.0, z or 0.0]
@@ -169,7 +171,7 @@ class Stack:
             client.send(goal)
 
     def spin_until(self, condition: Callable[[], bool]) -> None:
-        """Spin until a condition is true; raises SpaceRobotError if a node fails or time is up."""
+        """Spin until a condition is true; raises SpaceRobotError on failure or timeout."""
         end = time.monotonic() + self._timeout
         while not condition():
             for node in self._flight_nodes:

@@ -1,4 +1,4 @@
-"""Stamps and clock times: whole nanoseconds, split into seconds and remainder."""
+"""Stamps and clock times in whole nanoseconds, split into seconds and a remainder."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ SECOND = 1_000_000_000
 """Nanoseconds in a second."""
 
 LATEST_NS = 2**31 * SECOND - 1
-"""Latest time of a builtin_interfaces/Time, whose seconds have 32 bits, ns."""
+"""Latest time, ns, of a builtin_interfaces/Time, whose seconds have 32 bits."""
 
 HEADER_STAMP = slice(4, 12)
-"""Stamp bytes in a serialised message that begins with a header or a time."""
+"""Bytes of the stamp in a serialised message that begins with a header or a time."""
 
 _TIME_LAYOUT = struct.Struct("<iI")
 
@@ -30,7 +30,7 @@ def stamp_bytes(time_ns: int) -> bytes:
     Raises
     ------
     SpaceRobotError
-        The time is beyond the stamp range.
+        The time is outside the range of stamps.
     """
     try:
         return _TIME_LAYOUT.pack(*divmod(time_ns, SECOND))

@@ -1,7 +1,7 @@
 """Table of all topics, used by publishers, reports and the documentation.
 
-For the plant's state topics the table also lists the values in their messages, for the plant's
-publisher and the re-simulation of bags. A new state topic needs an entry here
+For the state topics of the plant, the table also lists the values in the messages, as needed
+by the publisher and by the re-simulation of bags. A new state topic needs an entry here
 and a quantity in :mod:`spacerobot_ros.simulation.sensors`.
 """
 
@@ -69,7 +69,7 @@ class Topic:
     type
         Name of the message type, such as ``nav_msgs/msg/Odometry``.
     publishers
-        The nodes that publish it; ``user`` for topics from outside the stack.
+        The nodes that publish the topic; ``user`` for topics from outside the stack.
     meaning
         Description of the content.
     condition
@@ -148,7 +148,7 @@ _TOPIC_TABLE = (
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_PLANT,
         "true pose of the link `end_effector_frame` in the world",
-        condition="the robot has that link",
+        condition="the robot has a link with that name",
         state=(StateField("pose", "end_effector_pose", _POSE_MEMBERS),),
     ),
     Topic(
@@ -182,8 +182,8 @@ _TOPIC_TABLE = (
         "target/odom",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "measured pose of the target's root link in the world, and its twist in its own frame, "
-        "floating or held",
+        "measured pose of the target's root link in the world, and twist of this link in its own "
+        "frame, whether the target is floating or held",
         condition="`target.robot` is set",
         state=_odometry("target"),
     ),
@@ -216,7 +216,7 @@ _TOPIC_TABLE = (
         "odom",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_PLANT,
-        "measured base link pose in the world, and its twist in its own frame",
+        "measured pose of the base link in the world, and twist of the base link in its own frame",
         state=_odometry("measured"),
     ),
     Topic(
@@ -240,8 +240,8 @@ _TOPIC_TABLE = (
         "thrusters",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_PLANT,
-        "by thruster name: total on-time (position, s), fraction of the last tick (velocity), mean "
-        "force in that tick (effort, N)",
+        "by thruster name: total on-time (position, s), on-time as a fraction of the last tick "
+        "(velocity), and mean force in that tick (effort, N)",
         condition="`thrusters` is set",
         state=(
             StateField("position", "thruster_on_time"),
@@ -257,14 +257,14 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "base link in the world and links in their parent frames, from odom and joint_states, "
         "every `tf_period`",
-        condition="tf2_msgs is installed; in bags always",
+        condition="tf2_msgs is installed; always in bags",
     ),
     Topic(
         "/tf_static",
         _TRANSFORMS_TYPE,
         _PUBLISHED_BY_PLANT,
         "links on fixed joints in their parent frames",
-        condition="tf2_msgs is installed and the robot has such links; in bags always",
+        condition="tf2_msgs is installed and the robot has such links; always in bags",
         latched=True,
     ),
     Topic(
@@ -301,7 +301,7 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_PLANT,
         "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
         "(m; negative: penetration depth), and the links `first` and `second`; `second_is` is "
-        "`obstacle` if the second is an obstacle",
+        "`obstacle` if `second` is an obstacle",
         condition="robot links could touch",
     ),
     Topic(
@@ -321,27 +321,27 @@ _TOPIC_TABLE = (
         _STRING_TYPE,
         _PUBLISHED_BY_USER,
         "URDF of all fixed obstacles, for the planner, a controller that plans, the plant and "
-        "viewers; it replaces all previous obstacles; empty: none",
+        "viewers; each message replaces all previous obstacles; an empty string removes them",
         latched=True,
     ),
     Topic(
         "joint_commands",
         _JOINT_STATE_TYPE,
         ("planner", "coordinated_control"),
-        "velocities or efforts (by `actuation`) of all joints by name, with the stamp of their "
-        "state",
+        "velocities or efforts (by `actuation`) of all joints by name, with the stamp of the "
+        "state to which they respond",
     ),
     Topic(
         "base_wrench",
         _WRENCH_STAMPED_TYPE,
         ("coordinated_control",),
-        "commanded thruster force and torque at the base link origin, in its frame",
+        "commanded thruster force and torque at the base link origin, in the base link frame",
     ),
     Topic(
         "goal_pose",
         _POSE_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
-        "base goal pose in the world; NaN: any position, or any attitude",
+        "base goal pose in the world; NaN means any position or any attitude",
     ),
     Topic(
         "goal_path",
@@ -354,7 +354,7 @@ _TOPIC_TABLE = (
         "goal_joint_states",
         _JOINT_STATE_TYPE,
         _PUBLISHED_BY_USER,
-        "final joint positions for later goals; without joints: any",
+        "final joint positions for later goals; a message without joints allows any positions",
     ),
     Topic(
         "end_effector/goal_pose",
@@ -362,21 +362,22 @@ _TOPIC_TABLE = (
         _PUBLISHED_BY_USER,
         "end-effector goal pose in the world; also `NAME/goal_pose` for links in the planner's "
         "`end_effectors`. For the planner, an all-zero orientation means any attitude, and poses "
-        "with the same stamp, including the base's, form one goal",
+        "with the same stamp, including the base pose, form one goal",
     ),
     Topic(
         "end_effector/twist",
         _TWIST_STAMPED_TYPE,
         _PUBLISHED_BY_USER,
         "commanded end-effector twist in the frame in its header: the world, the base link or the "
-        "end-effector; also `NAME/twist` for links in the planner's `end_effectors`. The "
-        "joints brake if none arrives for `twist_timeout`",
+        "end-effector; also `NAME/twist` for links in the planner's `end_effectors`. The joints "
+        "brake if no twist arrives for `twist_timeout`",
     ),
     Topic(
         "end_effector/path",
         _PATH_TYPE,
         _PUBLISHED_BY_USER,
-        "end-effector path in the world, straight from pose to pose; the last pose is the goal, "
+        "end-effector path in the world, which is straight from pose to pose; the last pose is "
+        "the goal, "
         "and the base is free; also `NAME/path` for links in the planner's `end_effectors`. "
         "If all orientations are zero, any attitude is accepted",
     ),
@@ -391,7 +392,7 @@ _TOPIC_TABLE = (
         "base_reference",
         _ODOMETRY_TYPE,
         _PUBLISHED_BY_USER,
-        "a moving reference for the base for coordinated control, one message per state",
+        "moving base reference for coordinated control, one message per state",
     ),
     Topic(
         "gait_schedule",
@@ -434,8 +435,8 @@ _TOPIC_TABLE = (
         "replay/status",
         _STATUS_TYPE,
         ("replay",),
-        "position of a replay: `state` is playing, paused or ended, `position_s` and `duration_s` "
-        "from its beginning, `rate`; on every change, and five times per second",
+        "replay status: `state` (playing, paused or ended), `position_s` from the beginning, "
+        "`duration_s` and `rate`; on every change, and five times per second",
         condition="a bag is replayed",
         latched=True,
     ),
@@ -443,22 +444,22 @@ _TOPIC_TABLE = (
         "replay/seek",
         "std_msgs/msg/Float64",
         _PUBLISHED_BY_USER,
-        "time at which a replay continues, s from its beginning",
+        "time at which a replay continues, s after the beginning of the bag",
         condition="a bag is replayed",
     ),
     Topic(
         "events",
         _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
-        "one record per state change: `event` is its kind, `time` simulated time, `wall_time` "
-        "since the epoch (not for flights without nodes), both in s",
+        "one record per state change: `event` is the type of change, `time` is the simulated "
+        "time (s), and `wall_time` the time since the epoch (s; not in flights without nodes)",
     ),
     Topic(
         "heartbeat",
         _STATUS_TYPE,
         ("plant", "planner", "coordinated_control", "recorder", "replay"),
         "five times per second of wall time from every active node: `name`, `hardware_id` (its "
-        "role), `message` (active, busy or inactive); in bags only on request",
+        "role), `message` (active, busy or inactive); recorded in bags only on request",
     ),
 )
 
@@ -466,14 +467,16 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TOPIC_TABLE}
 """Every topic of the stack by name; the plant's topics are in publication order."""
 
 GLOBAL_TOPICS = ("/clock", "/tf", "/tf_static")
-"""Topics with absolute names; a stack in a namespace remaps them into it."""
+"""Topics with absolute names; a stack in a namespace remaps them to that namespace."""
 
 TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/heartbeat")
 """Suffixes of topics that are recorded only on request."""
 
 
 def goal_topic(end_effector: str) -> str:
-    """Return the goal topic of an end-effector, with its name converted for topics."""
+    """Return the goal topic of an end-effector, with the link name converted to a valid topic
+    name.
+    """
     return _name_in_topics(end_effector) + "/goal_pose"
 
 
@@ -488,7 +491,9 @@ def path_topic(end_effector: str) -> str:
 
 
 def pose_topic(end_effector: str) -> Topic:
-    """Return the entry for an end-effector's poses, with its name converted for topics."""
+    """Return the entry for the poses of an end-effector, with the link name converted to a valid
+    topic name.
+    """
     name = _name_in_topics(end_effector)
     state = StateField("pose", f"pose_of_{name}", _POSE_MEMBERS)
     return replace(TOPICS["end_effector/pose"], name=f"{name}/pose", state=(state,))
@@ -516,6 +521,8 @@ def topic_named(name: str) -> Topic:
 
 
 def state_topics(end_effectors: Iterable[str] = ()) -> list[Topic]:
-    """Return a plant's state topics, including these end-effectors' poses, in publication order."""
+    """Return the state topics of a plant, including the poses of these end-effectors, in
+    publication order.
+    """
     poses = {topic.name: topic for topic in map(pose_topic, end_effectors)}
     return [topic for topic in {**poses, **TOPICS}.values() if topic.state]

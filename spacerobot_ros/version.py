@@ -1,4 +1,4 @@
-"""The package version, at the bottom of its layers; ``package.xml`` has the same."""
+"""The package version, in the lowest layer; ``package.xml`` has the same version."""
 
 import hashlib
 from functools import lru_cache
@@ -9,7 +9,9 @@ __version__ = "0.2.0"
 
 @lru_cache(maxsize=1)
 def source_hash() -> str:
-    """Return a hash of the package's code, which distinguishes checkouts of one version."""
+    """Return a hash of the package's code, which distinguishes different checkouts of one
+    version.
+    """
     found, package = hashlib.sha256(), Path(__file__).parent
     for path in sorted(each for each in package.rglob("*") if each.suffix in (".py", ".hpp")):
         found.update(f"{path.relative_to(package)}\n".encode() + path.read_bytes())

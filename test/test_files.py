@@ -146,7 +146,7 @@ def test_a_private_file_is_of_this_user_alone(
         with pytest.raises(UntrustedFileError) as refused:
             read_private(path)
         assert str(refused.value) == (
-            f"others can write to '{path}' (mode {mode:o}); make it yours alone with "
+            f"others can write to '{path}' (mode {mode:o}); remove their permission with "
             f"chmod go-w '{path}'."
         )
     path.chmod(0o600)

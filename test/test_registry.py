@@ -103,7 +103,7 @@ def test_a_law_of_an_installed_package_flies_by_its_name(tmp_path: Path, install
     assert flown.returncode == 0, flown.stderr
     assert flown.stderr.count("It is omitted.") == 2
     assert "'lost = strangers.nowhere:Law' of the package 'strangers' cannot be" in flown.stderr
-    assert "has the name of the package's own 'transposed_jacobian'" in flown.stderr
+    assert "has the same name as the package's own 'transposed_jacobian'" in flown.stderr
     result = json.loads(flown.stdout)
     assert result["method"] == "lqr"
     position, quaternion = _last_pose(tmp_path / result["bag"])
@@ -151,7 +151,7 @@ class _Clash(TransposedJacobianLaw):
     [
         (_Plain, "The control law '_Plain' lacks compute."),
         (_Unnamed, "needs a name of letters, digits and underscores"),
-        (_Clash, "has the name of the package's own 'transposed_jacobian'"),
+        (_Clash, "has the same name as the package's own 'transposed_jacobian'"),
         (METHODS["optimal"], "'OptimalGait' is not a class derived from ControlLaw."),
         ("lqr", "'lqr' is not a class derived from ControlLaw."),
     ],
@@ -235,7 +235,7 @@ def test_two_plugins_of_one_name_are_refused_with_their_files(tmp_path: Path) ->
         (tmp_path / name).write_text(text)
     add_plugin(tmp_path / "one.py")
     add_plugin(tmp_path / "one.py")
-    with pytest.raises(ParameterError, match="Two classes are the control law 'pd'") as refused:
+    with pytest.raises(ParameterError, match="Two classes define the control law 'pd'") as refused:
         add_plugin(tmp_path / "other.py")
     for name in ("one.py", "other.py"):
         assert f"'{tmp_path / name}'" in str(refused.value)
@@ -314,7 +314,7 @@ def test_a_metric_of_a_plugin_is_measured_and_required(tmp_path: Path) -> None:
         (low, True),
         (high, False),
     ]
-    with pytest.raises(SpaceRobotError, match="the metric 'farthest_m' needs whole flights"):
+    with pytest.raises(SpaceRobotError, match="the metric 'farthest_m' requires whole flights"):
         run_campaign(campaign(**given, criteria=bounds), tmp_path / "lanes", engine="lanes")
 
 
@@ -328,7 +328,7 @@ def test_a_metric_that_fails_is_named_and_takes_no_name_of_the_package(tmp_path:
     assert row["outcome"] == "error"
     assert row["reason"].startswith(sentence)
     (tmp_path / "clash.py").write_text(_METRIC.replace("farthest_m", "duration_s"))
-    with pytest.raises(ParameterError, match="has the name of the package's own 'duration_s'"):
+    with pytest.raises(ParameterError, match="has the same name as the package's own 'duration_s'"):
         add_plugin(tmp_path / "clash.py")
 
 

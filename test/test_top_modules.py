@@ -161,7 +161,7 @@ def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("folder.urdf", "'folder.urdf' is a folder; name the URDF file in it."),
         (
             "robt.urdf",
-            "There is no robot 'robt.urdf': there is no such URDF file. Did you mean 'robot.urdf'?",
+            "There is no robot 'robt.urdf': no such URDF file exists. Did you mean 'robot.urdf'?",
         ),
     ):
         with pytest.raises(ParameterError) as refused:
@@ -437,7 +437,7 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
         found.with_method("transposed_jacobian")
     assert str(refused.value) == (
         "'transposed_jacobian' is a control law, and the scenario 'own' has no section "
-        "'coordinated_control' that could use it: it flies with planner."
+        "'coordinated_control' that could use it: this scenario flies with planner."
     )
     with pytest.raises(ParameterError) as unused:
         found.with_settings(["coordinated_control.law=model_based"])

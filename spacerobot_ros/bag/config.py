@@ -15,8 +15,8 @@ class RecorderConfig(WatchdogConfig):
     bag: str = parameter("", "file to write; '': spacerobot-<date>-<time>.mcap")
     when_exists: str = parameter(
         "next",
-        "if a bag with this name exists: use the next free name (NAME-1, NAME-2, ...), or refuse "
-        "to start; bags are never overwritten",
+        "what to do if a bag with this name exists: use the next free name (NAME-1, NAME-2, ...) "
+        "or refuse to start; bags are never overwritten",
         choices=("next", "refuse"),
     )
     topics: str = parameter("", "space-separated topics to record; '': all topics of the stack")
@@ -26,7 +26,7 @@ class RecorderConfig(WatchdogConfig):
     )
     describe: str = parameter("", "JSON file with named objects to store in the bag as metadata")
     diagnostics_period: float = nonnegative(
-        0.0, "wall time between diagnostics; 0: only on losses", "s"
+        0.0, "wall time between diagnostics; 0: only when messages are lost", "s"
     )
     tf_period: float = nonnegative(
         0.1,
@@ -34,7 +34,11 @@ class RecorderConfig(WatchdogConfig):
         "s",
     )
     flush_period: float = parameter(
-        0.5, "wall time between flushes: the most that a killed recorder loses", "s", minimum=0.01
+        0.5,
+        "wall time between flushes, which is also the longest period lost if the recorder is "
+        "killed",
+        "s",
+        minimum=0.01,
     )
     max_size: float = nonnegative(
         0.0, "file size at which a new file (NAME_0, NAME_1, ...) is started; 0: never", "MB"
@@ -56,7 +60,10 @@ class ReplayConfig:
     topics: str = parameter("", "space-separated topics to replay; '': all")
     remap: str = parameter("", "space-separated topic remappings 'old:=new'")
     clock: float = nonnegative(
-        0.0, "publish bag time on /clock at this rate; 0: as recorded", "Hz", maximum=10000.0
+        0.0,
+        "publish bag time on /clock at this rate; 0: publish it as recorded",
+        "Hz",
+        maximum=10000.0,
     )
     paused: bool = parameter(False, "begin paused")
     hold: bool = parameter(False, "pause at the end instead of exiting")

@@ -37,7 +37,7 @@ INFINITE_NS = 2**63 - 1
 class QosProfile:
     """Quality of service offered by a topic's publisher.
 
-    Policies are rmw's lower-case strings (``rmw_qos_*_policy_to_str``), the only ones that ``ros2
+    Policies are rmw's lower-case strings (``rmw_qos_*_policy_to_str``), the only form that ``ros2
     bag play`` accepts.
 
     Parameters
@@ -49,13 +49,14 @@ class QosProfile:
     reliability
         ``reliable``, ``best_effort``, ``system_default``, ``best_available`` or ``unknown``.
     durability
-        ``volatile``, ``transient_local`` (latched), or as above.
+        ``volatile``, ``transient_local`` (latched), or one of the last three values of
+        ``reliability``.
     deadline_ns
         Longest time between two messages, in nanoseconds.
     lifespan_ns
         Message lifespan, in nanoseconds.
     liveliness
-        ``automatic``, ``manual_by_topic``, or as above.
+        ``automatic``, ``manual_by_topic``, or one of the last three values of ``reliability``.
     liveliness_lease_duration_ns
         Time for which a silent publisher is considered alive, in nanoseconds.
     avoid_ros_namespace_conventions
@@ -246,7 +247,7 @@ class _Tail:
 
 
 class McapFile:
-    """An MCAP file that grows by whole chunks.
+    """An MCAP file to which whole chunks are appended.
 
     Every chunk, attachment and metadata record is passed to the operating system at once; a failed
     write is undone. If the process dies, the file is complete except for the record being appended.
@@ -255,9 +256,9 @@ class McapFile:
     closed.
 
     The parent folders of ``path`` are created. For ``compression``, ``chunk_size`` and
-    ``overwrite`` see :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is the profile in the MCAP
-    header. Raises RecordingError if the file cannot be created, BagExistsError if it exists or is
-    being written.
+    ``overwrite``, see :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is the profile in the
+    MCAP header. Raises RecordingError if the file cannot be created, and BagExistsError if it
+    exists or is being written.
     """
 
     def __init__(
@@ -354,7 +355,7 @@ class McapFile:
         self._commit()
 
     def add_rosbag2_metadata(self, topics: Sequence[RecordedTopic]) -> None:
-        """Append rosbag2's metadata record for the messages so far."""
+        """Append rosbag2's metadata record for the messages written so far."""
         values = _rosbag2_metadata(self.path.name, topics, self.start_ns, self.end_ns)
         self.add_metadata(METADATA_NAME, values)
 
@@ -364,7 +365,7 @@ class McapFile:
         return self._commit_full_chunk()
 
     def finish(self, topics: Sequence[RecordedTopic] | None = None) -> None:
-        """Complete the file and close it, including rosbag2's topic record if topics are given."""
+        """Complete and close the file; if topics are given, add rosbag2's topic record first."""
         try:
             self.flush()
             if topics is not None:
@@ -375,7 +376,7 @@ class McapFile:
             self.close()
 
     def close(self) -> None:
-        """Close the file; does not raise."""
+        """Close the file without raising an exception."""
         with suppress(OSError):
             self._raw.close()
 
@@ -402,6 +403,6 @@ class McapFile:
             self.message_counts = self._counts_in_file
             raise RecordingError(
                 f"Cannot write the bag {self.path}: {error.strerror or error}; "
-                f"the {self.message_counts.total()} messages written before are safe."
+                f"the {self.message_counts.total()} messages already written are safe."
             ) from error
         self._tail.start += len(data)

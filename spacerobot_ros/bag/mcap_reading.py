@@ -2,8 +2,8 @@
 
 The records are parsed by ``mcap``. Values are checked before use: records end within the file,
 chunks have the declared size, and the total inflated size of all chunks in a bag is limited. A
-violation raises a ``ValueError`` that names the byte; :class:`BagFile` converts it to a user
-message.
+violation raises a ``ValueError`` that states the byte offset; :class:`BagFile` converts it to a
+user message.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ DAMAGE_ERRORS = (
     struct.error,
     zstandard.ZstdError,
 )
-"""Exceptions raised by damaged records: the libraries have no common base class."""
+"""Exceptions that damaged records cause; the exceptions of the libraries have no common base
+class."""
 
 
 # -- files ------------------------------------------------------------------------------------
@@ -83,7 +84,8 @@ DAMAGE_ERRORS = (
 
 @contextmanager
 def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
-    """Open a bag for reading, or the temporary file with its unpacked content.
+    """Open a bag for reading; if the bag is compressed, open the temporary file with its unpacked
+    content.
 
     Raises
     ------
@@ -109,7 +111,7 @@ class RecordedChannel(NamedTuple):
     number: int
     topic: str
     encodings: tuple[str, str]
-    """Encodings of the messages and of their definition."""
+    """Encoding of the messages, and encoding of their definition."""
     type_name: str
     definition: bytes
     offered_qos: str
@@ -126,12 +128,12 @@ class BagFile:
     Parameters
     ----------
     path
-        The file; error messages name it.
+        Path of the file; error messages include it.
 
     Raises
     ------
     RecordingError
-        There is no such file, or it cannot be read, is not MCAP, or is truncated.
+        The file does not exist, cannot be read, is not an MCAP file, or is truncated.
     """
 
     def __init__(self, path: Path) -> None:
@@ -169,7 +171,8 @@ class BagFile:
 
         Raises
         ------
-        RecordingError See the class; also raised if a damaged record is found within the context.
+        RecordingError See the class; also raised if a damaged record is found while the context is
+        open.
         """
         with open_file(self.path, self._content) as file:
             _require_magic_bytes(self.path, file)
@@ -186,7 +189,7 @@ def _unpack(file: BinaryIO, unpacked: BinaryIO) -> None:
         if unpacked.tell() > limit:
             raise ValueError(
                 f"it inflates to more than the {limit} bytes allowed for its size (set "
-                f"{INFLATED_SIZE_VARIABLE} to more MB if you trust it)"
+                f"{INFLATED_SIZE_VARIABLE} to a larger number of MB if you trust it)"
             )
 
 
@@ -208,7 +211,9 @@ def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
     size = len(MCAP0_MAGIC)
     start = file.read(size)
     if not start:
-        raise RecordingError(f"The bag {path} is empty: its writer was stopped before it began.")
+        raise RecordingError(
+            f"The bag {path} is empty: its writer stopped before it wrote anything."
+        )
     require_mcap(path, start)
     length = file.seek(0, os.SEEK_END)
     file.seek(max(length - size, 0))
@@ -232,7 +237,8 @@ def file_size(file: BinaryIO) -> int:
 
 
 def records(file: BinaryIO, start: int) -> Iterator[tuple[int, int, bytes]]:
-    """Iterate over the records from a byte offset: each record's start, opcode and bytes."""
+    """Iterate over the records from a byte offset, and yield the start, opcode and bytes of each
+    record."""
     end = file_size(file)
     while start < end:
         file.seek(start)
@@ -250,8 +256,8 @@ def records(file: BinaryIO, start: int) -> Iterator[tuple[int, int, bytes]]:
 
 
 def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
-    """Iterate over the records in the unpacked chunk at ``place``: each record's first byte and
-    end."""
+    """Iterate over the records in the unpacked chunk at ``place``: the first byte of each record,
+    and the byte after its end."""
     position, size = 0, len(data)
     unpack, head = _RECORD_HEAD.unpack_from, _RECORD_HEAD.size
     while position < size:
@@ -269,14 +275,14 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
 
 
 def parse_record(record: bytes) -> McapRecord | None:
-    """Return a record; a chunk remains packed; None: the kind is not defined by MCAP."""
+    """Return a record, or None if MCAP does not define its kind; a chunk remains packed."""
     if record[0] not in _OPCODES:
         return None
     return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)
 
 
 def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
-    """Return the record at byte ``place`` of a file, which must be of the given kind."""
+    """Return the record of the given kind at byte ``place`` of a file."""
     for _, _, record in records(file, place):
         found = parse_record(record)
         if isinstance(found, kind):
@@ -301,13 +307,13 @@ class ChunkUnpacker:
         self._inflated_size = 0
 
     def count(self, size: int, place: int) -> None:
-        """Add the inflated size of the chunk at ``place`` to the total; ValueError if the total is
-        too large."""
+        """Add the inflated size of the chunk at ``place`` to the total; raise ValueError if the
+        total is too large."""
         if self._inflated_size + size > self.max_bytes:
             raise ValueError(
                 f"with the chunk at byte {place} it inflates to {self._inflated_size + size} "
                 f"bytes, more than the {self.max_bytes} allowed for its size (set "
-                f"{INFLATED_SIZE_VARIABLE} to more MB if you trust it)"
+                f"{INFLATED_SIZE_VARIABLE} to a larger number of MB if you trust it)"
             )
         self._inflated_size += size
 
@@ -325,7 +331,9 @@ class ChunkUnpacker:
         except DAMAGE_ERRORS as error:
             raise ValueError(f"the chunk at byte {place} cannot be unpacked: {error}") from error
         if len(data) != size:
-            raise ValueError(f"the chunk at byte {place} does not hold the declared {size} bytes")
+            raise ValueError(
+                f"the chunk at byte {place} does not contain the declared {size} bytes"
+            )
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError(f"the checksum of the chunk at byte {place} is wrong")
         return data
@@ -349,7 +357,7 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
     size = file_size(file)
     start = read_record(file, max(size - FOOTER_SIZE - MAGIC_SIZE, 0), Footer).summary_start
     if start > size:
-        raise ValueError(f"its summary begins at byte {start}, after its end")
+        raise ValueError(f"its summary begins at byte {start}, beyond the end of the file")
     summary, chunks = Summary(), ChunkUnpacker(size)
     for _, _, record in records(file, start) if start else ():
         match parse_record(record):
@@ -416,7 +424,7 @@ class _Wanted:
         self.start_ns, self.end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
 
     def may_be_in(self, index: ChunkIndex) -> bool:
-        """Whether a chunk may contain wanted messages."""
+        """Whether a chunk may contain requested messages."""
         channels = list(index.message_index_offsets)
         return (
             index.message_start_time <= self.end_ns
@@ -474,11 +482,11 @@ def blocks_in_time_order(
     start_ns: int = 0,
     end_ns: int = _LATEST_TIME_NS,
 ) -> Iterator[MessageBlock]:
-    """Iterate over the messages in a bag by log time, then in write order.
+    """Iterate over the messages in a bag in log time order, and in write order for equal log times.
 
-    Only messages on these topics with log times in the span (ns) are returned. A block contains the
-    messages of chunks with overlapping times; only these are in memory at the same time. Errors:
-    see :meth:`BagFile.open`.
+    Only messages on the given topics with log times in the given span (ns) are returned. A block
+    contains the messages of chunks that overlap in time; only these chunks are in memory together.
+    Errors: see :meth:`BagFile.open`.
     """
     wanted = [_Wanted(file, topics, start_ns, end_ns) for file in files]
     sections = [
@@ -537,5 +545,5 @@ def _messages_of_chunk(file: BinaryIO, index: ChunkIndex, wanted: _Wanted) -> Me
     place = index.chunk_start_offset
     chunk = read_record(file, place, Chunk)
     if chunk.uncompressed_size != index.uncompressed_size:
-        raise ValueError(f"the chunk at byte {place} and its index state different sizes")
+        raise ValueError(f"the chunk at byte {place} and its index specify different sizes")
     return _messages_in(ChunkUnpacker(file_size(file)).unpack(chunk, place), place, wanted)

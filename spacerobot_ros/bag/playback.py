@@ -89,8 +89,8 @@ class ReplayMessage:
 
 
 class SubscriberWait:
-    """Decides when a replay may start: when all known subscribers are matched and no new ones
-    appear.
+    """Decides when a replay may start: when all known subscribers are matched and no new
+    subscribers appear.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class SubscriberWait:
     longest
         Longest wait, s.
     settled
-        Time without a new subscriber after which no more are expected, s.
+        Time, in s, after which no more subscribers are expected if no new one appears.
     """
 
     def __init__(self, period: float, longest: float, settled: float = 0.3) -> None:
@@ -136,8 +136,8 @@ def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
         old = _with_slash(old)
         if old not in topics:
             raise ParameterError(
-                f"Parameter 'remap' renames '{old}', which is not replayed: "
-                f"{', '.join(sorted(topics))} are."
+                f"Parameter 'remap' renames '{old}', which is not replayed; the replayed topics "
+                f"are {', '.join(sorted(topics))}."
             )
         names[old] = new
     return names
@@ -146,7 +146,7 @@ def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
 class Playback:
     """Messages in a bag, scheduled by log time.
 
-    The last messages of latched topics before the start are due at once:
+    The last message on each latched topic before the start time is due at once:
     subscribers to a latched topic always expect its last message.
 
     Parameters
@@ -193,7 +193,7 @@ class Playback:
         self._rate = rate
         self._bag_ns = self._start_ns
         self._clock_ns: int | None = None
-        """Clock time at bag time `_bag_ns`; None: bag time is paused there."""
+        """Clock time at bag time `_bag_ns`; None if bag time is paused."""
         self._begin()
         if self._next_message is None:
             raise RecordingError(
@@ -256,12 +256,13 @@ class Playback:
         return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
-        """Jump to ``bag_ns``, limited to the replayed part of the bag; the replay remains paused if
-        it was.
+        """Jump to the bag time ``bag_ns``, clipped to the replayed part of the bag; a paused replay
+        remains paused.
 
         Returns the messages that a subscriber would have received by then: the last message of each
-        topic that is latched, or whose last message is at most a second old. If paused at the
-        beginning, these are the first messages, which are published again when time resumes.
+        topic, if the topic is latched or the message is at most one second old. If the replay is
+        paused at the beginning, the first messages are returned; they are published again when time
+        resumes.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Reads a bag as time series: all topics, or those of one robot."""
+"""Reads a bag as time series: all topics, or only the topics of one robot."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
     Raises
     ------
     RecordingError
-        There is no such bag, or it is not MCAP, is truncated or is damaged.
+        The bag does not exist, is not in MCAP format, is truncated or is damaged.
     """
     given, files = Path(path), bag_files(Path(path))
     return Bag(given if given.is_dir() and len(files) > 1 else files[0], files)
@@ -70,12 +70,12 @@ def salvaged_copy(path: Path) -> Path:
 def bag_files(path: Path) -> list[Path]:
     """Return the files of a bag in order: all files in a folder or a split recording, or one file.
 
-    If there are several files, salvaged copies replace truncated ones.
+    If there are several files, salvaged copies replace truncated files.
 
     Raises
     ------
     RecordingError
-        A folder has no MCAP file, or has several that are not listed in its ``metadata.yaml``.
+        A folder contains no MCAP file, or several that are not listed in its ``metadata.yaml``.
     """
     if path.is_dir():
         return _files_of_folder(path)
@@ -131,14 +131,14 @@ def _listed_files(folder: Path) -> list[str]:
 class Bag(Mapping[str, TopicSeries]):
     """A bag as time series: ``bag["odom"].field("pose.pose.position.x")``.
 
-    It maps topic names, with or without the leading slash, to their messages. A topic
-    is read on first access and cached. The file does not stay open.
+    A bag maps topic names, with or without the leading slash, to messages. A topic
+    is read on first access and cached. The file is not kept open.
 
     Raises
     ------
     RecordingError
-        In the constructor, as in :func:`read_bag`; in methods, if there is no such topic, the bag
-        is damaged, or pandas or xarray is not installed.
+        In the constructor, as for :func:`read_bag`; in methods, if the topic does not exist, the
+        bag is damaged, or pandas or xarray is not installed.
     """
 
     def __init__(self, path: Path, files: Sequence[Path] | None = None) -> None:
@@ -217,13 +217,13 @@ class Bag(Mapping[str, TopicSeries]):
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
-        """Keys and values of every metadata record by name; if names are equal, the last one takes
-        precedence."""
+        """Keys and values of every metadata record by name; if a name is repeated, the last record
+        takes precedence."""
         return {each.name: each.metadata for each in self._records(Metadata)}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
-        """Content of every attachment by name; if names are equal, the last one takes
+        """Content of every attachment by name; if a name is repeated, the last attachment takes
         precedence."""
         return {each.name: each.data for each in self._records(Attachment)}
 
@@ -239,22 +239,22 @@ class Bag(Mapping[str, TopicSeries]):
 
     @property
     def start_time(self) -> float:
-        """Log time of the earliest message in seconds; nan without messages."""
+        """Log time of the earliest message in seconds; nan if there is none."""
         return self.start_time_ns / SECOND if self.message_count() else float("nan")
 
     @property
     def end_time(self) -> float:
-        """Log time of the latest message in seconds; nan without messages."""
+        """Log time of the latest message in seconds; nan if there is none."""
         return self.end_time_ns / SECOND if self.message_count() else float("nan")
 
     @property
     def start_time_ns(self) -> int:
-        """Log time of the earliest message in nanoseconds; 0 without messages."""
+        """Log time of the earliest message in nanoseconds; 0 if there is none."""
         return min((int(each.message_start_time) for each in self._statistics), default=0)
 
     @property
     def end_time_ns(self) -> int:
-        """Log time of the latest message in nanoseconds; 0 without messages."""
+        """Log time of the latest message in nanoseconds; 0 if there is none."""
         return max((int(each.message_end_time) for each in self._statistics), default=0)
 
     @property
@@ -271,7 +271,7 @@ class Bag(Mapping[str, TopicSeries]):
     def raw_messages(
         self, topics: Sequence[str], start_ns: int = 0, end_ns: int = 2**63 - 1
     ) -> Iterator[tuple[str, int, bytes]]:
-        """Iterate over the messages on some topics by log time, still serialised.
+        """Iterate over the serialised messages on some topics, in log time order.
 
         Yields
         ------
@@ -294,7 +294,7 @@ class Bag(Mapping[str, TopicSeries]):
         return self[topic].time
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Iterate over the decoded messages on a topic by log time.
+        """Iterate over the decoded messages on a topic, in log time order.
 
         Yields
         ------
@@ -333,15 +333,15 @@ class Bag(Mapping[str, TopicSeries]):
     ) -> xarray.Dataset | dict[str, xarray.Dataset]:
         """Return a topic as an xarray Dataset, or all readable topics by name.
 
-        Arrays remain arrays, over ``time`` and ``joint`` for joint states; every variable has
-        ``units``. ``euler``: see :meth:`to_pandas`.
+        Arrays are kept as arrays, with dimensions ``time`` and ``joint`` for joint states; every
+        variable has ``units``. ``euler``: see :meth:`to_pandas`.
         """
         if topic is not None:
             return to_xarray(self.table(topic, euler=euler))
         return {name: to_xarray(table) for name, table in self.tables(euler=euler).items()}
 
     def table(self, topic: str, *, euler: bool = False) -> TopicTable:
-        """Return a topic as a table; joint units follow the URDF in the bag.
+        """Return a topic as a table; joint units are taken from the URDF in the bag.
 
         ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` for attitudes.
         """
@@ -350,7 +350,7 @@ class Bag(Mapping[str, TopicSeries]):
         return with_euler_angles(found) if euler else found
 
     def tables(self, *, euler: bool = False) -> dict[str, TopicTable]:
-        """Return all readable topics as tables; a warning names the others.
+        """Return all readable topics as tables; a warning names the other topics.
 
         ``euler``: see :meth:`table`.
 
@@ -443,8 +443,8 @@ class Bag(Mapping[str, TopicSeries]):
         encoding, schema = recorded.encodings
         if (encoding, schema) != ("cdr", "ros2msg"):
             raise RecordingError(
-                f"The topic {topic} of the bag {self.path} is not in ROS 2's encoding ('cdr' "
-                f"defined by 'ros2msg'), but in {encoding!r} defined by {schema!r}."
+                f"The topic {topic} of the bag {self.path} does not use ROS 2's encoding ('cdr' "
+                f"defined by 'ros2msg'), but {encoding!r} defined by {schema!r}."
             )
         try:
             return message_type(recorded.type_name, recorded.definition)
@@ -482,7 +482,7 @@ def _format_list(names: list[str], most: int = 40) -> str:
 
 
 def columns(topic: str, path: str) -> list[str]:
-    """Return the paths of a state topic's numeric fields below a message path."""
+    """Return the paths of a state topic's numeric fields nested under a message path."""
     return next(field.columns for field in TOPICS[topic].state if field.path == path)
 
 
@@ -494,7 +494,7 @@ class RecordedRobot:
     bag
         The recording.
     namespace
-        Namespace of the robot's topics, such as ``/robot_1``; empty for none.
+        Namespace of the robot's topics, such as ``/robot_1``; empty if there is no namespace.
     """
 
     def __init__(self, bag: Bag, namespace: str = "") -> None:
@@ -507,7 +507,7 @@ class RecordedRobot:
         return [name.removeprefix(prefix) for name in self.bag.topics if name.startswith(prefix)]
 
     def get(self, name: str) -> TopicSeries | None:
-        """Return a topic published by the stack; None if it has no messages or a different type."""
+        """Return a topic of the stack; None if the topic has no messages or a different type."""
         topic = f"{self.namespace}/{name}"
         if self.bag.topics.get(topic) != topic_named(name).type or not self.bag.message_count(
             topic
@@ -544,7 +544,7 @@ class RecordedRobot:
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records by name; this robot's nodes use ``parameters/NODE``.
 
-        A recorder in the robot's namespace uses these names.
+        A recorder in the robot's namespace uses the same names.
         """
         before = f"parameters{self.namespace}/"
         return {
@@ -558,11 +558,12 @@ class RecordedRobot:
 
     @property
     def joint_names(self) -> list[str]:
-        """Joint names in ``joint_states`` order; empty without that topic."""
+        """Joint names in ``joint_states`` order; empty if there is no such topic."""
         return self.names("joint_states")
 
     def names(self, topic: str) -> list[str]:
-        """Return the joint names in the first message of a topic; empty without that topic."""
+        """Return the joint names in the first message of a topic; empty if there is no such
+        topic."""
         series = self.get(topic)
         return list(map(str, next(series.messages())[1].name)) if series is not None else []
 

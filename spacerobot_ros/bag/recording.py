@@ -18,7 +18,8 @@ class RecordingState(Enum):
     """Handling of messages that arrive at a recorder."""
 
     PAUSED = "paused"
-    """Messages are dropped; the last one of each latched topic is kept until recording starts."""
+    """Messages are dropped; the last message of each latched topic is kept until recording
+    starts."""
 
     WAITING = "waiting"
     """Messages are kept in memory until it is known whether a clock is published."""
@@ -27,10 +28,11 @@ class RecordingState(Enum):
     """Messages are written with the published clock time."""
 
     ON_WALL_TIME = "on wall time"
-    """Messages are written with their wall arrival time."""
+    """Messages are written with the wall time of their arrival."""
 
     FAILED = "failed"
-    """Messages are dropped because the disk is full or lost; earlier messages are kept."""
+    """Messages are dropped because the disk is full or no longer available; earlier messages are
+    kept."""
 
     CLOSED = "closed"
     """Messages are dropped because the bag is complete."""
@@ -49,11 +51,11 @@ class _EarlyMessage(NamedTuple):
 
 
 class Recording:
-    """Writes messages with one time base for the whole bag; starts paused.
+    """Writes messages with one time base for the whole bag; it is initially paused.
 
-    Messages are logged at clock time; messages before the first clock message are logged at its
-    time. If no clock is published for ``clock_wait``, all are logged at their wall arrival time.
-    The choice is final, because a bag has one time base.
+    Messages are logged at the published clock time; earlier messages are logged at the time of the
+    first clock message. If no clock is published for ``clock_wait``, all messages are logged at the
+    wall time of their arrival. The choice is final, because a bag has one time base.
 
     Parameters
     ----------
@@ -81,11 +83,12 @@ class Recording:
         self.messages = 0
         """Number of messages written to the bag."""
         self.clock_steps_back = 0
-        """Number of times the clock jumped back: once at a restart, repeatedly with two clocks."""
+        """Number of backward clock jumps: one jump after a restart, many jumps if there are two
+        clocks."""
         self.lost: Counter[str] = Counter()
-        """Number of messages of each topic that were published but never received."""
+        """Number of messages on each topic that were published but never received."""
         self.attached: set[str] = set()
-        """File names in the bag."""
+        """Names of the files attached to the bag."""
         self.latched: dict[int, _EarlyMessage | None] = {}
         """Last message of each latched topic received during a pause, by channel."""
         self.failure: RecordingError | None = None
@@ -93,7 +96,7 @@ class Recording:
         self._on_failure = on_failure
         self._wall_time = wall_time
         self.early_messages: list[_EarlyMessage] = []
-        """Messages that wait until the bag's time base is chosen."""
+        """Messages kept until the bag's time base is chosen."""
         self._time_base: RecordingState | None = None
         self._write = writer.write
 
@@ -129,7 +132,7 @@ class Recording:
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
         """Write a message, or keep it until the bag's time base is chosen.
 
-        ``published_ns`` is its stamp; 0: the recording time.
+        ``published_ns`` is the publish time of the message; 0 selects the recording time.
         """
         if self.state is not RecordingState.ON_CLOCK:
             arrival_ns = self._wall_time()

@@ -1,4 +1,4 @@
-"""Recovers truncated or damaged bags: a complete bag, or the last state in a bag."""
+"""Recovers data from truncated or damaged bags: a complete copy, or the last state."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from spacerobot_ros.times import SECOND
 
 _STATE_TOPICS = ("odom", "joint_states", "momentum")
 _WITHOUT_STATES = ("inactive", "failed")
-"""Plant states in which no robot state is published."""
+"""Values of the plant's state for which no robot state is published."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +64,11 @@ class Salvaged:
     messages, duration
         Number of messages in the new bag, and the time span in s.
     lost_chunks
-        Chunks that could not be read.
+        Number of chunks that could not be read.
     loss_reason
         Why the first lost chunk could not be read; empty if no chunk was lost.
     lost_bytes
-        Bytes after the last complete record, which are not in the new bag.
+        Number of bytes after the last complete record; these bytes are not in the new bag.
     """
 
     path: Path
@@ -82,16 +82,16 @@ class Salvaged:
 def salvage_bag(
     path: str | os.PathLike[str], out: str | os.PathLike[str] | None = None
 ) -> Salvaged:
-    """Write the readable records of a bag into a new, complete one; the old one is unchanged.
+    """Write the readable records of a bag into a new, complete bag; the original is unchanged.
 
-    ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` next to the old
-    file. If a bag has several files, the first incomplete one is salvaged.
+    ``out`` is the new file, which must not exist; by default ``NAME-salvaged.mcap`` next to the
+    original. If a bag has several files, the first incomplete file is salvaged.
 
     Raises
     ------
     RecordingError
-        There is no such bag, or it is not MCAP, is already complete or is unreadable, or the new
-        one cannot be written.
+        The bag does not exist, is not in MCAP format, is already complete or is unreadable, or the
+        new bag cannot be written.
     """
     source = next((file for file in bag_files(Path(path)) if not is_complete(file)), None)
     if source is None:
@@ -125,7 +125,7 @@ def salvage_bag(
 
 
 def is_complete(path: Path) -> bool:
-    """Whether every message of a bag can be read without a repair."""
+    """Whether every message of a bag can be read without repairing the bag."""
     try:
         return all(_holds_what_it_counts(BagFile(file)) for file in bag_files(path))
     except RecordingError:
@@ -145,9 +145,9 @@ class _Copy:
         self.loss_reason = ""
         self._file = file
         self._schemas: dict[int, tuple[int, str]] = {}
-        """New ID and name, by ID in the old file."""
+        """New schema ID and type name, by schema ID in the old file."""
         self._channels: dict[int, tuple[int, Channel]] = {}
-        """New ID and old record, by ID in the old file."""
+        """New channel ID and old channel record, by channel ID in the old file."""
 
     def add_readable_records(self, old: BinaryIO) -> None:
         """Add the readable content of a file, up to the first truncated record."""
@@ -230,12 +230,14 @@ class LastState:
     joint_names, joints, rates
         Joint names, positions and velocities (n,).
     momenta
-        Linear over angular momentum in the world (6,), of the robot and held body together.
+        Stacked linear and angular momentum in the world (6,), of the robot together with a held
+        body.
     target
-        Pose (7,) of the target's root link in the world, and its twist (6,) in T; None: there is
+        Pose (7,) of the target's root link in the world, and its twist (6,) in T; None if there is
         no target.
     payload
-        The body that the robot holds, as a string from ``plant/status``; empty: none.
+        The body that the robot holds, as a string from ``plant/status``; empty if there is no such
+        body.
     """
 
     time_ns: int
@@ -257,7 +259,7 @@ def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
     Raises
     ------
     RecordingError
-        There is no such bag, or no state in it.
+        The bag does not exist or contains no state.
     """
     source = Path(path)
     if is_complete(source):
@@ -301,7 +303,7 @@ def _last_state(robot: RecordedRobot) -> LastState:
 
 
 def _last_target(robot: RecordedRobot, time_ns: int) -> Array | None:
-    """Return pose over twist (13,) of the target in a state; None: it was not recorded."""
+    """Return pose over twist (13,) of the target in a state; None if it was not recorded."""
     for name in ("target/odom_true", "target/odom"):
         series = robot.get(name)
         if series is None:
@@ -315,7 +317,7 @@ def _last_target(robot: RecordedRobot, time_ns: int) -> Array | None:
 
 
 def _last_payload(robot: RecordedRobot, time_ns: int) -> str:
-    """Return the text of the body that the robot held in a state; empty: none."""
+    """Return the text of the body that the robot held in a state; empty if none."""
     series, payload = robot.get("plant/status"), ""
     for _, message in () if series is None else series.messages():
         values = {pair.key: pair.value for pair in message.values}

@@ -78,7 +78,7 @@ class TopicSeries:
                 yield prefix + name
 
     def element_type(self, path: str) -> str:
-        """Return the type of a message field or of the messages in a list; otherwise empty.
+        """Return the type of a message field or of the messages in a list; empty for other fields.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class TopicSeries:
         Parameters
         ----------
         path
-            Field path, such as ``pose.pose.position.x``. It may lead through a list of
+            Field path, such as ``pose.pose.position.x``. The path may lead through a list of
             messages, as ``points.positions`` does.
 
         Returns
@@ -126,8 +126,7 @@ class TopicSeries:
         An array of shape (N,) for a number, or (N, k) for k numbers per message; integers are
         64-bit, other numbers float64. A list of N values for everything
         else: strings, lists, messages, arrays of varying length. Joint state
-        arrays and names are in :attr:`joint_names` order; joints missing in a message
-        are nan.
+        arrays and names are in :attr:`joint_names` order; joints missing from a message are nan.
 
         Raises
         ------
@@ -176,7 +175,7 @@ class TopicSeries:
         return self._columns is not None and self._columns.constant("name")
 
     def of_joints(self, path: str, names: Sequence[str]) -> NDArray[np.float64]:
-        """Return a joint state array of shape (N, n), a column per joint; nan if a joint is
+        """Return a joint state array of shape (N, n), with one column per joint; nan if a joint is
         missing.
 
         ``path`` is ``position``, ``velocity`` or ``effort``, and ``names`` are n joint names.
@@ -211,11 +210,12 @@ class TopicSeries:
         fields
             Paths as in :meth:`field`, all of scalars or all of arrays.
         width
-            Number of columns, equal for all fields; by default one per field.
+            Number of columns, the same for all fields; by default one per field.
 
         Returns
         -------
-        Shape (N, width). If a field of a message has a different number of values, they are nan.
+        Shape (N, width). If a field has a different number of values in a message, the columns of
+        the field are nan in the row of that message.
 
         Raises
         ------

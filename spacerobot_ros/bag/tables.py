@@ -1,7 +1,7 @@
 """Topic messages as a table, for pandas, xarray, CSV, Parquet and MATLAB.
 
-Each row is a message, each column contains numbers or strings. A table includes units, and joint
-names for array entries.
+Each row is a message, and each column contains numbers or strings. A table includes units, and the
+names of the joints that array entries belong to.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _TIME_COLUMNS = ("time", "time_ns", "stamp", "stamp_ns")
 """Time columns in every table; a message field with the same name gets the prefix ``message``."""
 
 _MAX_ARRAY_COLUMNS = 1000
-"""Largest array that is split into columns; images, for example, are not."""
+"""Largest array that is split into columns; images, for example, are larger and are not split."""
 
 _JOINT_UNITS = {
     "position": ("m", "rad"),
@@ -75,7 +75,7 @@ class Field:
     values
         Numbers (N,) or (N, k), or strings (N,) as objects.
     units
-        One per column; empty if unknown or not applicable.
+        Units, one per column; empty if unknown or not applicable.
     labels
         Names of the k array entries; empty for one value per message.
     column_kind
@@ -98,7 +98,7 @@ class Field:
 
 @dataclass(frozen=True)
 class TopicTable:
-    """The messages on a topic as a table, one row each, in log time order.
+    """The messages on a topic as a table, one row per message, in log time order.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class TopicTable:
     time
         Log times in seconds, shape (N,): simulated time in bags from this stack.
     fields
-        The fields; an array is one field. The first is ``time_ns``, the log time in whole
+        The fields; an array is one field. The first field is ``time_ns``, the log time in whole
         nanoseconds. If the messages have a header, its stamp follows: ``stamp`` in seconds and
         ``stamp_ns``.
     """
@@ -139,10 +139,10 @@ class TopicTable:
 def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -> TopicTable:
     """Return the messages on a topic as a table.
 
-    Numbers and strings become columns; an array with the same length (at most a thousand entries)
-    in every message becomes one column per entry, named after the joint or thruster if the messages
-    contain names. Each status key becomes a column, empty if a message lacks the key.
-    Everything else, such as path points, is JSON in one string column.
+    Numbers and strings become columns. If an array has the same length in every message (at most a
+    thousand), each entry becomes a column, named after the joint or thruster if the messages
+    contain names. Each status key becomes a column, whose entry is empty for a message that lacks
+    the key. Everything else, such as path points, is stored as JSON in one string column.
 
     Seconds are float64 and lose the last digits of wall time; nanoseconds are integers.
 
@@ -151,7 +151,8 @@ def table_of(series: TopicSeries, prismatic: Mapping[str, bool] | None = None) -
     series
         The topic.
     prismatic
-        Whether each joint is prismatic, which determines its units; missing joints have no units.
+        Whether each joint is prismatic, which determines the units of the joint; joints that are
+        not listed have no units.
 
     Raises
     ------
@@ -228,7 +229,7 @@ def number_field(path: str, values: NDArray[Any]) -> Field:
 
 
 def with_euler_angles(table: TopicTable) -> TopicTable:
-    """Return a table with each attitude also given as rotations about the fixed axes x, y, z.
+    """Return a table that also contains each attitude as rotations about the fixed axes x, y, z.
 
     The fields ``roll``, ``pitch`` and ``yaw`` (rad) are siblings of ``orientation``:
     ``pose.pose.yaw`` and ``pose.pose.orientation.z``.
@@ -289,7 +290,7 @@ def _json_value(value: Any) -> Any:
 
 
 COLUMNS = "_columns.csv"
-"""File stored with CSV tables: topic, file, name and unit of every column."""
+"""Index file stored with CSV tables; it lists the topic, file, name and unit of every column."""
 
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_.-]+")
 _MAX_VARIABLE_NAME = 63
@@ -493,7 +494,7 @@ def _mat_content(tables: dict[str, TopicTable]) -> bytes:
     try:
         savemat(content, variables, long_field_names=True, do_compression=True)
     except (MatWriteError, ValueError, OverflowError) as error:
-        raise RecordingError(f"MAT cannot hold these tables: {error}.") from error
+        raise RecordingError(f"MAT files cannot contain these tables: {error}.") from error
     return content.getvalue()
 
 

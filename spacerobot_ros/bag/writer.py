@@ -30,7 +30,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     Messages are collected in a chunk in memory. A full chunk is passed to the operating system in
     one piece: a killed process loses only the current chunk (a power failure may lose more). A bag
     is complete, including its summary, once it is closed; use the writer as a context manager. Only
-    one thread at a time may use it.
+    one thread at a time may use a writer.
 
     If writing a chunk fails, the chunk is lost, and this and all later calls that add data raise
     RecordingError. Closing still completes the file if there is space.
@@ -44,9 +44,9 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     chunk_size
         Uncompressed chunk size, bytes.
     overwrite
-        Whether an existing file is replaced unless it is being written.
+        Whether to replace an existing file, unless it is being written.
     next_free
-        Whether to use the next free name if the name exists: ``NAME-1.mcap``,
+        Whether to use the next free name if the name is already used: ``NAME-1.mcap``,
         ``NAME-2.mcap``, ...
     max_size
         File size, in bytes, at which a new file is started; 0: unlimited. If the bag may be split,
@@ -83,12 +83,13 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         """Number of files started after the first one."""
         self._earlier_counts: Counter[int] = Counter()
         self._repeated: list[Callable[[McapFile], None]] = []
-        """One function per attachment or metadata record, which adds it to a file."""
+        """One function per attachment or metadata record; it adds the attachment or record to a
+        file."""
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
         self._schema_ids: dict[str, int] = {}
         self._channel_ids: set[int] = set()
         self._refusal: str | None = None
-        """Why nothing more can be written; None: writing is possible."""
+        """Why nothing more can be written; None if writing is possible."""
         self._closed = False
         self._file = self._open_first_file()
         try:
@@ -112,12 +113,12 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     @property
     def bytes_written(self) -> int:
-        """Size of the current file after compression, bytes."""
+        """Size of the current file after compression, in bytes."""
         return self._file.size
 
     @property
     def bytes_waiting(self) -> int:
-        """Size of the current chunk, which is not in the file yet, bytes."""
+        """Size, in bytes, of the current chunk, which is not yet in the file."""
         return self._file.bytes_waiting
 
     @property
@@ -180,7 +181,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         Raises
         ------
         RecordingError
-            Writing failed, now or earlier, the channel is unknown, or a time is negative.
+            Writing fails or has failed earlier, the channel is unknown, or a time is negative.
         """
         if self._refusal is not None or channel_id not in self._channel_ids:
             raise RecordingError(
@@ -224,12 +225,13 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def close(self) -> None:
         """Write pending messages and the summary, and close the file; further calls do nothing.
 
-        After a failure the file is closed incomplete: `spacerobot salvage` completes it.
+        After a failure, the file is closed although it is incomplete: `spacerobot salvage`
+        completes it.
 
         Raises
         ------
         RecordingError
-            Writing fails now.
+            A write during this call fails.
         """
         if self._closed:
             return
@@ -288,7 +290,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         Raises
         ------
         RecordingError
-            The file is gone or shorter; nothing more is written.
+            The file is missing or is shorter than expected; nothing more is written.
         """
         with self._adding():
             self._file.check()

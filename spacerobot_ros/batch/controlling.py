@@ -1,4 +1,5 @@
-"""A controller for flight batches: one flight at a time, or as one function for SIMD lanes."""
+"""A controller for flight batches, evaluated for one flight at a time, or as one function for SIMD
+lanes."""
 
 from __future__ import annotations
 
@@ -29,14 +30,14 @@ from spacerobot_ros.times import SECOND
 
 
 class BatchController:
-    """One controller for all flights in a batch, with their goals and gains.
+    """One controller for all flights in a batch, with the goals and gains of each flight.
 
     Parameters
     ----------
     program
         Goals and gains of the flights.
     controller
-        See :func:`.build_controller`; its gains and goals are replaced.
+        See :func:`.build_controller`; the gains and goals in the configuration are replaced.
     """
 
     def __init__(self, program: ControlledGoals, controller: CoordinatedController) -> None:
@@ -84,7 +85,7 @@ class BatchController:
         Raises
         ------
         PlanningError
-            A goal is refused.
+            A goal is rejected.
         """
         program, controller = self.program, self.controller
         controller.reset()
@@ -99,17 +100,17 @@ class BatchController:
         return profile, controller.error_bounds(self._config.error_margin.as_errors())
 
     def time_of_tick(self, tick: int) -> float:
-        """Return a tick's time as computed by controllers, s."""
+        """Return the time of a tick, s, as computed by controllers."""
         return tick * self._period_ns / SECOND
 
     # -- lanes --------------------------------------------------------------------------------
 
     def profile_argument(self, profile: ReferenceProfile) -> Array:
-        """Return argument ``profile`` of :meth:`function`."""
+        """Return the ``profile`` argument of :meth:`function`."""
         return profile_numbers(profile, *self._groups)
 
     def gains_argument(self, rows: Sequence[int]) -> Array:
-        """Return argument ``gains``, Kp over Kd, for flights: (flights, 2 m)."""
+        """Return the ``gains`` argument for flights, Kp and Kd side by side: (flights, 2 m)."""
         each = (self.law.gain_arguments(self._gains(row)) for row in rows)
         return np.array([np.concatenate(pair) for pair in each])
 
@@ -127,7 +128,7 @@ class BatchController:
         return np.concatenate([realised.tau, realised.wrench_B])
 
     def function(self) -> ca.Function:
-        """Return the function of a controller's tick. Its arguments and results:
+        """Return the function that computes a controller tick. Its arguments and results:
 
         ``state``, ``pose``, ``twist``
             Plant state, base pose and base twist.
@@ -147,7 +148,7 @@ class BatchController:
         Raises
         ------
         ParameterError
-            The law's command is not a single function.
+            The law cannot be expressed as a single function.
         """
         if any(
             gains.integral_diagonal(self.law.outputs.selection).any()

@@ -53,9 +53,10 @@ class InitialStates:
     q: Array
     """(N, n) joint positions, m or rad."""
     qdot: Array
-    """(N, n) joint rates, per second."""
+    """(N, n) joint rates, m/s or rad/s."""
     momenta: Array
-    """(N, 6) total linear (kg m/s) over angular momentum about the centre of mass (kg m^2/s), W."""
+    """(N, 6) total momenta in W: linear (kg m/s), then angular about the centre of mass (kg
+    m^2/s)."""
     position_is_of_center_of_mass: npt.NDArray[np.bool_]
     """(N,) whether ``position`` is the position of the centre of mass."""
 
@@ -117,17 +118,17 @@ class InitialStates:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Errors of sensors, one row per flight; see :class:`.SensorConfig`."""
+    """Sensor errors, one row per flight; see :class:`.SensorConfig`."""
 
     noise: Array
     """(N, 6) 1 sigma by group: position (m), attitude (rad), velocity (m/s), angular velocity
     (rad/s), joints (m or rad), joint rates."""
     pose_bias: Array
-    """(N, 6) biases of the position in W (m) over a rotation vector in B (rad)."""
+    """(N, 6) pose biases: position in W (m), then rotation vector in B (rad)."""
     joint_bias: Array
-    """(N, n) biases of the joint positions, m or rad."""
+    """(N, n) joint position biases, m or rad."""
     seeds: Counts
-    """(N,) seeds of the noise, which equals that of :class:`.Sensors` with the same seed."""
+    """(N,) noise seeds; :class:`.Sensors` draws the same noise from the same seed."""
 
     @classmethod
     def of(cls, robot: SpaceRobot, each: Sequence[SensorConfig]) -> SensorErrors:
@@ -181,7 +182,7 @@ class SensorErrors:
 
     @property
     def is_active(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether measurements differ from the truth; only then noise is drawn."""
+        """(N,) whether measurements differ from the true values; noise is drawn only if they do."""
         return np.asarray(
             self.noise.any(axis=1) | self.pose_bias.any(axis=1) | self.joint_bias.any(axis=1)
         )
@@ -191,7 +192,7 @@ R = TypeVar("R", InitialStates, SensorErrors, InertialParameters)
 
 
 def joined_rows(each: Sequence[R]) -> R:
-    """Return the rows of several as one."""
+    """Return one object with the rows of several objects."""
     names = [part.name for part in fields(each[0])]
     parts = (np.concatenate([getattr(one, name) for one in each]) for name in names)
     return type(each[0])(*parts)
@@ -208,7 +209,7 @@ class FollowedSchedule:
     """Velocity commands of the planner's :class:`.ScheduleFollower` along a schedule."""
 
     positions: Array
-    """(T + 1, n) shapes at the ticks, or (N, T + 1, n) for each flight; the last is held."""
+    """(T + 1, n) shapes at the ticks, or (N, T + 1, n) for each flight; the last shape is held."""
     shape_gain: float = 0.0
     """Feedback from measured shape errors to velocities, 1/s; 0: open loop."""
     deadband: float = 0.0
@@ -217,7 +218,7 @@ class FollowedSchedule:
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Commands by tick, independent of measurements."""
+    """Given commands for each tick, independent of measurements."""
 
     table: Array
     """(T, command_size) or (N, T, command_size); see :attr:`Flights.command_size`. Zero after the
@@ -226,24 +227,23 @@ class HeldCommands:
 
 @dataclass(frozen=True)
 class ControlledGoals:
-    """Commands of a :class:`.CoordinatedController` to goals that are set at the first state."""
+    """Commands of a :class:`.CoordinatedController` whose goals are set at the first state."""
 
     config: ControllerConfig
-    """Parameters of the controller, the same for all flights; its gains apply if ``gains`` is
-    empty."""
+    """Controller parameters, shared by all flights; their gains apply if ``gains`` is empty."""
     base: Array | None = None
     """Goals in W, (7,) or (N, 7): position (m) and quaternion; None: the initial pose is held."""
     end_effector: Array | None = None
-    """Goals of the end-effector, as of the base."""
+    """End-effector goals, in the same form as the base goals."""
     joints: Array | None = None
     """Goal shapes, (n,) or (N, n); None: the initial shapes."""
     gains: tuple[Gains, ...] = ()
-    """Gains of each flight; empty: the configuration's."""
+    """Gains of each flight; empty: the gains in ``config``."""
     robot: SpaceRobot | None = None
-    """The controller's model of the robot; None: the nominal robot of the flights."""
+    """Robot model used by the controller; None: the nominal robot of the flights."""
     ends_when_decided: bool = False
-    """Whether a flight ends with the decision about its goal: one tick later, after the command for
-    that state. Otherwise it continues and holds the goal."""
+    """Whether a flight ends when its goal is decided: one tick later, after the command for that
+    state. Otherwise the flight continues and holds the goal."""
 
 
 FlightProgram = FollowedSchedule | HeldCommands | ControlledGoals
@@ -270,13 +270,13 @@ class Flights:
     ticks: int
     """Ticks of each flight."""
     initial_states: InitialStates
-    """Initial states; the rows are the flights."""
+    """Initial states, one row per flight."""
     program: FlightProgram
     """Source of the commands."""
     inertial: InertialParameters | None = None
-    """Masses, centres and inertias, (N, ...); None: the robot's."""
+    """Masses, centres of mass and inertias, (N, ...); None: those of ``robot``."""
     sensors: SensorErrors | None = None
-    """Errors of sensors; None: none."""
+    """Sensor errors; None: none."""
     integration_step: float = 0.0
     """Longest Runge-Kutta step, s; 0: the default of the actuation."""
     report_ticks: tuple[int, ...] = field(default=())
@@ -296,15 +296,15 @@ class Flights:
             if not last < instant <= self.ticks:
                 raise ParameterError(
                     f"The instants {self.report_ticks} are not ascending ticks of a flight of "
-                    f"{self.ticks}."
+                    f"{self.ticks} ticks."
                 )
             last = instant
         if self.inertial is not None:
             bodies = robot.description.bodies
             if self.inertial.masses.shape != (count, len(bodies)):
                 raise ParameterError(
-                    f"The masses are {self.inertial.masses.shape}, not {count} flights of "
-                    f"{len(bodies)} bodies."
+                    f"The masses have shape {self.inertial.masses.shape}, not "
+                    f"({count}, {len(bodies)})."
                 )
             self.inertial.require_physical([body.name for body in bodies])
         if self.sensors is not None and len(self.sensors) != count:
@@ -339,19 +339,20 @@ class Flights:
 
     @property
     def command_size(self) -> int:
-        """Numbers of a command: n joint velocities, or n efforts and a wrench (6) on the base,
-        force (N) over torque (N m), base components."""
+        """Size of a command: n joint velocities, or n efforts and a wrench (6) on the base: force
+        (N), then torque (N m), in base components."""
         return self.robot.n + (6 if PLANTS[self.actuation].wrench else 0)
 
     @property
     def substeps(self) -> int:
-        """Runge-Kutta steps in a tick."""
+        """Number of Runge-Kutta steps in a tick."""
         step = self.integration_step or PLANTS[self.actuation].integration_step
         return count_steps(self.control_period, step)
 
     @property
     def table(self) -> Array:
-        """Commands or shapes (ticks, width), or (N, ticks, width); zeros under a controller."""
+        """Commands or shapes (ticks, width) or (N, ticks, width); zeros if a controller computes
+        the commands."""
         match self.program:
             case FollowedSchedule(positions=table) | HeldCommands(table=table):
                 return table
@@ -371,7 +372,7 @@ class Flights:
 
 def _require_rows(name: str, array: Array, count: int, width: int) -> None:
     if array.ndim not in (2, 3) or array.shape[-1] != width or array.shape[-2] < 1:
-        raise ParameterError(f"The {name} are {array.shape}, not (ticks, {width}).")
+        raise ParameterError(f"The {name} have shape {array.shape}, not (ticks, {width}).")
     if array.ndim == 3 and len(array) != count:
         raise ParameterError(f"There are {name} for {len(array)} flights, not {count}.")
     if not np.all(np.isfinite(array)):
@@ -379,12 +380,12 @@ def _require_rows(name: str, array: Array, count: int, width: int) -> None:
 
 
 def state_size(n: int) -> int:
-    """Return the numbers of a state of a robot with n joints."""
+    """Return the size of a state of a robot with n joints."""
     return 2 * n + 20
 
 
 def state_parts(states: Array, n: int) -> dict[str, Array]:
-    """Return the parts of states (..., 2 n + 20) as views: q, qdot, pose, twist and momentum."""
+    """Return the components of states (..., 2 n + 20) as views: q, qdot, pose, twist, momentum."""
     names = ("q", "qdot", "pose", "twist", "momentum")
     ends = np.cumsum([n, n, 7, 6, 7])
     return dict(zip(names, np.split(states, ends, axis=-1), strict=False))
@@ -420,14 +421,14 @@ def state_of(plant: Plant) -> Array:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Results of N flights, at I instants."""
+    """Results of N flights at I reported instants."""
 
     engine: str
     """Name of the engine that flew the flights."""
     time: Array
     """(I,) s."""
     states: Array
-    """(N, I, 2 n + 20) all of the following up to ``momentum``, in the order of
+    """(N, I, 2 n + 20) all of the following arrays up to ``momentum``, in the order of
     :func:`state_parts`."""
     pose: Array
     """(N, I, 7) position ``r_WB`` (m) and quaternion ``R_WB`` of the base."""
@@ -440,22 +441,21 @@ class BatchResult:
     momentum: Array
     """(N, I, 7) linear and angular momentum in W, kinetic energy."""
     measured_pose: Array
-    """(N, I, 7) measurements of ``pose`` by the sensors."""
+    """(N, I, 7) ``pose`` as measured by the sensors."""
     measured_q: Array
-    """(N, I, n) measurements of ``q`` by the sensors."""
+    """(N, I, n) ``q`` as measured by the sensors."""
     peak_rate: Array
     """(N, n) largest joint rate at the end of a tick, m/s or rad/s."""
     peak_effort: Array
-    """(N, n) largest effort of a joint in a tick, N or N m."""
+    """(N, n) largest joint effort in a tick, N or N m."""
     peak_wrench: Array
     """(N, 2) largest force (N) and torque (N m) commanded on the base."""
     impulse: Array
-    """(N, 2) time integrals of the norms of force and torque, N s and N m s."""
+    """(N, 2) time integrals of the force and torque norms, N s and N m s."""
     limited_ticks: Mapping[str, Counts]
-    """(N, n) numbers of ticks in which each joint was limited, by kind of limit, as in the
-    plant."""
+    """(N, n) numbers of ticks in which each joint was limited, by limit type, as in the plant."""
     fallback_ticks: Counts
-    """(N,) numbers of ticks with a step outside the lanes."""
+    """(N,) numbers of ticks in which a step was computed outside the lanes."""
     lowest: Array
     """(N, n) smallest joint positions over all ticks."""
     highest: Array
@@ -463,7 +463,7 @@ class BatchResult:
     decision: Counts
     """(N,) first :class:`.Decision` about the goal of a controller."""
     decision_tick: Counts
-    """(N,) tick of the state of that decision; -1: there was none."""
+    """(N,) tick of the state at that decision; -1: no decision."""
     decision_distance: Array
     """(N, 3) the :class:`.OutputDistance` to the goal at that state; NaN without a decision."""
     end_tick: Counts
@@ -471,10 +471,10 @@ class BatchResult:
     end_state: Array
     """(N, 2 n + 20) the last state: q, qdot, pose, twist and momentum; NaN without a controller."""
     momentum_drift: Array
-    """(N, 2) largest change of linear and angular momentum that thrust does not explain; NaN
+    """(N, 2) largest change in linear and angular momentum not explained by thrust; NaN
     without a controller."""
     failures: dict[int, str]
-    """Messages of failed flights, by row; the later numbers of these flights are NaN."""
+    """Error messages of failed flights, by row; the later values of these flights are NaN."""
 
     @classmethod
     def empty(cls, flights: Flights) -> BatchResult:
@@ -508,8 +508,8 @@ class BatchResult:
         )
 
     def errors(self, position: Array, quaternion: Array) -> tuple[Array, Array]:
-        """Return distance (N, I) in m and angle (N, I) in rad to a pose (3,) and (4,), or to one
-        pose per flight, (N, 3) and (N, 4).
+        """Return distance (N, I) in m and angle (N, I) in rad to a pose, position (3,) and
+        quaternion (4,), or to one pose per flight, (N, 3) and (N, 4).
         """
         wanted = np.broadcast_to(position, (len(self.pose), 3))[:, None]
         attitude = np.broadcast_to(quaternion, (len(self.pose), 4))[:, None]

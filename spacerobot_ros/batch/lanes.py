@@ -1,8 +1,8 @@
 """Blocks of flights: in the lanes of vector registers, or one flight per device thread.
 
 A block's memory is one array (groups, rows, lanes); a row contains one value for each flight in a
-group. All threads are in one group. ``driver.hpp`` loops over the ticks and returns commands that
-lanes cannot compute.
+group. On a device, all threads belong to one group. ``driver.hpp`` loops over the ticks and returns
+commands that lanes cannot compute.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _MAX_BLOCK_GROUPS = 64
 """Largest number of lane groups in a block; more would not be faster."""
 
 _CHUNK_TICKS = 2000
-"""Number of ticks, with their noise, between checks for signals."""
+"""Number of ticks for which noise is drawn at once, and also between checks for signals."""
 
 _PROGRAMS = {
     HeldCommands: Program.HELD,
@@ -82,7 +82,8 @@ def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
 
 
 def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
-    """Return the robot model and its arguments ``p`` (N, ...), the masses in the flights."""
+    """Return the robot model and its arguments ``p`` (N, ...), which are the masses in the
+    flights."""
     inertial = flights.inertial
     if inertial is None:
         inertial = flights.robot.inertial.scaled(np.ones((len(flights), 1)))
@@ -90,7 +91,7 @@ def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
 
 
 def starts_accepted_by_plant(flights: Flights) -> Flags:
-    """Return which flights (N,) start in a state accepted by the plant."""
+    """Return whether the plant accepts the start state of each flight, (N,)."""
     starts, robot = flights.initial_states, flights.robot
     fit = np.isfinite(starts.position).all(axis=1) & np.isfinite(starts.momenta).all(axis=1)
     fit &= np.isfinite(starts.qdot).all(axis=1)
@@ -118,7 +119,7 @@ def _block_size(flights: Flights, tick: CompiledTick) -> int:
 class LaneBlock:
     """Memory of the flights that occupy the lanes at the same time; surplus lanes are idle.
 
-    ``result`` gets the results of the flights and the messages of those that fail.
+    The results of the flights and the messages of failed flights are written to ``result``.
     """
 
     def __init__(
@@ -361,7 +362,7 @@ class LaneBlock:
 
 
 class SensorNoise:
-    """Sensor random numbers for the flights in a block, drawn as in :class:`.Sensors`."""
+    """Random numbers for the sensors in a block of flights, drawn as in :class:`.Sensors`."""
 
     def __init__(self, flights: Flights, rows: Counts) -> None:
         self._errors: SensorErrors | None = flights.sensors
@@ -380,7 +381,8 @@ class SensorNoise:
 
     @property
     def is_fed_back(self) -> bool:
-        """Whether commands depend on sensor errors; along schedules, only on joint errors."""
+        """Whether commands depend on sensor errors; commands along schedules depend only on joint
+        errors."""
         errors = self._errors
         if errors is None:
             return False

@@ -1,8 +1,9 @@
 """The tick of a plant and its commander, compiled for SIMD lanes, one flight per lane.
 
-CasADi functions become C++ in which every number is a vector register; ``driver.hpp`` loops over
-ticks and groups of lanes. Everything shared by Python and C++ is declared once, here, and generated
-as C++: the rows of a group's memory (:class:`RowLayout`), the enumerations, and :class:`Job`.
+CasADi functions become C++ in which a vector register takes the place of every number;
+``driver.hpp`` loops over ticks and groups of lanes. Everything shared by Python and C++ is declared
+once, here, and generated as C++: the rows of a group's memory (:class:`RowLayout`), the
+enumerations, and :class:`Job`.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ _JOB_MEMBERS = (
     ("long long", "period_ns", ""),
     ("long long", "program", "Program"),
     ("const double *", "table", "(ticks, COMMANDS); each_table: (groups, ticks, COMMANDS, LANES)"),
-    ("long long", "table_ticks", "FOLLOWED: the table has joint positions, one more than ticks"),
+    ("long long", "table_ticks", "FOLLOWED: joint positions, one row more than ticks"),
     ("long long", "each_table", ""),
     ("long long", "noisy", "whether commands depend on measurement errors"),
     ("const double *", "normals", "(groups, ticks from normals_from on, normals_width, LANES)"),
@@ -99,13 +100,14 @@ class RowLayout:
         return int(rows.stop - rows.start)
 
     def copy_range(self, source: str, target: str) -> tuple[int, int, int]:
-        """Return the first rows of two names with the same size, and that size."""
+        """Return the first row of ``source``, the first row of ``target``, and their number of
+        rows, which is the same."""
         return self.first_row(source), self.first_row(target), self.row_count(source)
 
 
 @dataclass(frozen=True)
 class CompiledTick:
-    """The compiled tick of flights that differ only in numbers, and the rows of its memory."""
+    """The compiled tick for flights that differ only in numerical values, and its memory layout."""
 
     library: Any
     """The functions of ``driver.hpp``, which take a :class:`Job`."""
@@ -122,16 +124,16 @@ class CompiledTick:
     def of(
         cls, flights: Flights, model: ModelFunctions, target: Target, link: str = ""
     ) -> CompiledTick:
-        """Compile the tick of flights, or return an earlier compilation.
+        """Compile the tick for flights, or return it from an earlier compilation.
 
-        With ``link``, reports end with the position (3) in B of that link, m.
+        If ``link`` is given, reports end with the position (3) of that link in B, m.
 
         Raises
         ------
         NoLibraryError
-            The tick cannot be compiled here.
+            The tick cannot be compiled on this machine.
         ParameterError
-            The law cannot drive the selected outputs, or lanes do not support it.
+            The law cannot control the selected outputs, or lanes do not support it.
         """
         key: tuple[Any, ...] = (cls, flights.actuation, flights.substeps)
         key = (*key, link, target, compilation_settings())

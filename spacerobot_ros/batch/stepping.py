@@ -1,4 +1,4 @@
-"""Flights advanced tick by tick by the caller, each with its own start, time and end.
+"""Flights that the caller advances tick by tick, each with its own start, time and end.
 
 :class:`SteppedFlights` is the plant for many simultaneous flights: a policy, or any other command
 source, reads the states and provides the next commands. Steps are the same as in the plant,
@@ -49,12 +49,12 @@ class SteppedFlights:
     Parameters
     ----------
     robot, actuation, control_period, starts, inertial, integration_step
-        See :class:`.Flights`; all flights begin in their start states.
+        See :class:`.Flights`; all flights begin at their start states.
     link
         Link whose position is computed; empty: none.
     in_lanes
-        Whether the flights are in SIMD lanes; if not, or if lanes cannot be compiled, each flight
-        has its own plant. Both compute the same states up to rounding.
+        Whether the flights run in SIMD lanes; if not, or if lanes cannot be compiled, each flight
+        has its own plant. Lanes and plants compute the same states up to rounding.
     plants
         Plant configuration for each flight, with thrusters, faults or external loads, which lanes
         do not support; a reset builds a plant from the current configuration in the list.
@@ -77,12 +77,12 @@ class SteppedFlights:
     q: Array
     """(N, n) joint positions, m or rad."""
     qdot: Array
-    """(N, n) joint velocities, per second."""
+    """(N, n) joint velocities, m/s or rad/s."""
     momentum: Array
     """(N, 7) linear (kg m/s) and angular momentum about the centre of mass (kg m^2/s), both in W,
     and kinetic energy (J)."""
     link_r: Array
-    """(N, 3) position in B of the link ``link``, m; (N, 0) without one."""
+    """(N, 3) position of the link ``link`` in B, m; (N, 0) without one."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class SteppedFlights:
     ) -> None:
         if link and link not in robot.link_names:
             raise ParameterError(
-                f"Robot '{robot.description.name}' has no link '{link}'; it has: "
+                f"Robot '{robot.description.name}' has no link '{link}'; its links are: "
                 f"{', '.join(robot.link_names)}."
             )
         count = len(starts)
@@ -166,7 +166,7 @@ class SteppedFlights:
             inertial is not None and len(inertial.masses) != len(chosen)
         ):
             raise ParameterError(
-                f"{len(chosen)} flights are reset to {len(starts)} starts"
+                f"{len(chosen)} flights are reset to {len(starts)} start state(s)"
                 + ("." if inertial is None else f" with {len(inertial.masses)} rows of masses.")
             )
         # Checked as rows of their own: a refusal changes no flight.
@@ -202,22 +202,22 @@ class SteppedFlights:
         Parameters
         ----------
         commands
-            (N, command_size) joint velocities, or efforts and a base wrench: force (N) over torque
-            (N m) at the base link origin, in base components. Commands are clipped to
-            the limits.
+            (N, command_size) joint velocities, or efforts and a base wrench: force (N), then torque
+            (N m) at the base link origin, in base components. Commands are clipped to the limits.
         ticks
             Number of ticks.
 
         Raises
         ------
         ParameterError
-            The command array has the wrong shape, or there are no ticks.
+            The command array has the wrong shape, or ``ticks`` is less than 1.
         CommandError
             A command for a flight in progress is not finite; no flight is stepped.
         """
         if np.shape(commands) != (len(self), self.command_size):
             raise ParameterError(
-                f"The commands are {np.shape(commands)}, not ({len(self)}, {self.command_size})."
+                f"The commands have shape {np.shape(commands)}, not "
+                f"({len(self)}, {self.command_size})."
             )
         if ticks < 1:
             raise ParameterError(f"A step of {ticks} ticks is too short: use at least 1.")
@@ -263,7 +263,8 @@ class _SteppedLanes(LaneBlock):
         self._memory[:, self._rows["h"]] = flights.control_period
 
     def start(self, rows: Counts) -> Array:
-        """Begin flights at the starts of their rows, and return their reports (rows, width)."""
+        """Begin flights at the start states in their rows, and return their reports (rows,
+        width)."""
         flights = self._flights
         assert flights.inertial is not None
         model, p = flights.robot.symbolic_model(flights.inertial[rows])
@@ -289,7 +290,7 @@ class _SteppedLanes(LaneBlock):
         return self._reported()[rows, 0]
 
     def step(self, commands: Array, ticks: int, under_way: Flags) -> Array:
-        """Step the flights that are under way under held commands, and return all reports."""
+        """Step the flights in progress under held commands, and return all reports."""
         self._write_rows("alive", under_way[:, np.newaxis])
         self._write_rows("command", commands)
         self._at[:], self._instants[0] = 0, ticks

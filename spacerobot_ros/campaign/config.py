@@ -30,7 +30,8 @@ from spacerobot_ros.resources import suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario, scenario_or_robot
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
-"""Sampler names; saltelli (for sensitivity indices) is from SALib, the others are from scipy."""
+"""Sampler names; saltelli (for sensitivity indices) is provided by SALib, and the others by
+scipy."""
 
 FIXED_SIZE_SAMPLERS = ("latin_hypercube", "saltelli")
 """Samplers whose draws depend on the number of flights."""
@@ -107,7 +108,8 @@ class Campaign:
 
     @property
     def correlation_factor(self) -> Array | None:
-        """(D, D) factor that correlates independent standard normals; None: no correlations."""
+        """(D, D) factor by which independent standard normal variables are correlated; None: no
+        correlations."""
         if not any(each.weights for each in self.dispersions):
             return None
         rows = (each.weights or {each.name: 1.0} for each in self.dispersions)
@@ -115,7 +117,7 @@ class Campaign:
 
     @property
     def description_lines(self) -> list[str]:
-        """Terminal output lines: ranges of drawn values, grouped by range."""
+        """Terminal output lines: the ranges of the drawn values, grouped by identical range."""
         together: dict[str, list[str]] = {}
         for each in self.dispersions:
             if not each.distribution.choices:
@@ -135,7 +137,7 @@ class Campaign:
 
     @property
     def own_metrics(self) -> list[str]:
-        """User-defined metrics that are named."""
+        """User-defined metrics named by a criterion or in ``metrics``."""
         return [name for name in self.named_metrics if name in OWN_METRICS]
 
     @property
@@ -161,12 +163,12 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 
 
 def load_campaign(path: Path, flights: int | None = None) -> Campaign:
-    """Read a campaign file; ``flights`` overrides its number of flights.
+    """Read a campaign file; ``flights`` overrides the number of flights in the file.
 
     Raises
     ------
     ParameterError
-        The file cannot be read, or contains an invalid value; the message states where.
+        The file cannot be read, or contains an invalid value; the message states its location.
     """
     try:
         content = load_yaml(path.read_text("utf-8"), _UniqueKeyLoader)
@@ -197,9 +199,10 @@ def parse_campaign(
     section
         Content of ``campaign:``.
     folder
-        Folder in which the scenario file is searched for.
+        Folder in which to search for the scenario file.
     scenario
-        Scenario, including the parameters under ``set``; None: the scenario named in the section.
+        Scenario, including the parameters under ``set``; by default, the scenario that the section
+        names.
 
     Raises
     ------
@@ -249,7 +252,7 @@ def parse_campaign(
 def _require_known(kind: str, name: Any, known: Sequence[str]) -> None:
     if name not in known:
         raise ParameterError(
-            f"there is no {kind} '{name}'; there are {', '.join(known)}."
+            f"there is no {kind} '{name}'; available: {', '.join(known)}."
             f"{suggestion(str(name), known)}"
         )
 
@@ -264,7 +267,8 @@ def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
 
 
 def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scenario:
-    """Return a scenario with the parameters under ``set`` and the ``method`` of a section.
+    """Return a scenario with the parameters under ``set`` in a section, and with the section's
+    ``method``.
 
     Raises
     ------
@@ -285,7 +289,7 @@ def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scena
     for node in ("plant", *scenario.commanders):
         scenario.config(node)  # Invalid parameters are refused before the first flight.
     if not scenario.lockstep:
-        raise ParameterError("campaigns run in lockstep: omit plant.time_mode.")
+        raise ParameterError("campaigns are flown in lockstep: omit plant.time_mode.")
     return scenario
 
 
@@ -316,11 +320,11 @@ def _read_criteria(section: Mapping[str, Any], scenario: Scenario) -> tuple[Crit
     for name, given in section.items():
         _require_metric(str(name), scenario)
         if not isinstance(given, dict) or not given or set(given) - {"min", "max"}:
-            raise ParameterError(f"the criterion of '{name}' must have 'min', 'max' or both.")
+            raise ParameterError(f"the criterion for '{name}' must have 'min', 'max' or both.")
         least = read_real_number(f"{name}: min", given["min"]) if "min" in given else -math.inf
         most = read_real_number(f"{name}: max", given["max"]) if "max" in given else math.inf
         if least > most:
-            raise ParameterError(f"the criterion of '{name}' has min {least} above max {most}.")
+            raise ParameterError(f"the criterion for '{name}' has min {least} above max {most}.")
         found.append(Criterion(str(name), least, most))
     return tuple(found)
 
@@ -338,7 +342,7 @@ def _require_metric(name: str, scenario: Scenario) -> None:
     known = [*metric_names(description_of(scenario).joint_names), *OWN_METRICS]
     if name not in known:
         raise ParameterError(
-            f"there is no metric '{name}'; there are {', '.join([*METRICS, *OWN_METRICS])}, joint "
+            f"there is no metric '{name}'; available: {', '.join([*METRICS, *OWN_METRICS])}, joint "
             f"metrics of a single joint, and metrics from --plugin.{suggestion(name, known)}"
         )
 

@@ -1,4 +1,4 @@
-"""Campaign dataset: its files, and a Parquet row for each finished flight."""
+"""Campaign dataset: its files, with one Parquet row for each finished flight."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ from spacerobot_ros.simulation.capture import load_target, target_parameters
 from spacerobot_ros.version import __version__, source_hash
 
 DRAW_PREFIX = "draw."
-"""Prefix of columns of drawn quantities."""
+"""Prefix of the columns for drawn quantities."""
 
 _ABOUT_FILE, _CAMPAIGN_FILE, _SCENARIO_FILE = "about.json", "campaign.yaml", "scenario.yaml"
 _FLIGHTS_FOLDER = "flights"
 
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
-"""Wall time (s) and number of rows after which rows are written; a kill loses at most these."""
+"""Wall time (s) and number of rows after which rows are written; if the process is killed, no more
+than this is lost."""
 
 
 @lru_cache(maxsize=1)
@@ -135,7 +136,7 @@ class Dataset:
         if flown_by != versions_json():
             warn_once(
                 f"The flights in {self.folder} were flown with different software ({flown_by}): "
-                "further flights may differ."
+                "the results of further flights may differ."
             )
 
     def _require_no_other_files(self) -> None:
@@ -147,7 +148,8 @@ class Dataset:
         others = [path for path in self.folder.iterdir() if path.name.lstrip(".") not in own]
         if others or self._row_files():
             raise ParameterError(
-                f"The folder {self.folder} is not empty and contains no campaign: use another one."
+                f"The folder {self.folder} is not empty and contains no campaign: use another "
+                "folder."
             )
 
     def _write_description(self, campaign: Campaign, flights: int) -> None:
@@ -276,7 +278,8 @@ class Dataset:
         """Return the rows as a pyarrow table, one row per flight, ordered by flight number.
 
         If a flight has several rows because a file was copied into the folder, the first row is
-        used, with a warning. Only ``columns`` are read; columns that are in no file are omitted.
+        used and a warning is logged. Only ``columns`` are read; a column that no file contains is
+        omitted.
 
         Raises
         ------
@@ -317,7 +320,7 @@ def _read_row_file(part: Path, columns: Collection[str] | None = None) -> Any:
     except (OSError, arrow.ArrowException) as error:
         reason = str(error).splitlines()[0].rstrip(".")
         raise ParameterError(
-            f"The file {part} is damaged ({reason}): remove it to fly its flights again."
+            f"The file {part} is damaged ({reason}): remove the file to fly its flights again."
         ) from error
 
 
@@ -386,11 +389,11 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
 
 
 def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with robot descriptions embedded instead of files, for use on other
+    """Return the campaign with embedded robot descriptions instead of file names, for use on other
     machines.
 
-    Descriptions are canonical XML: files that differ only in layout, comments or attribute order
-    describe the same robot.
+    Descriptions are canonical XML: files that differ only in white space, comments or attribute
+    order yield the same description.
     """
     scenario = campaign.scenario
     for node in ("plant", *scenario.commanders):

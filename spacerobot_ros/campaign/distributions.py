@@ -1,4 +1,4 @@
-"""Distributions of drawn values: from scipy, choices, covariances, and table rows."""
+"""Distributions of drawn values: those of scipy, choices, covariances, and table rows."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TABLE, _CORRELATED = "table", "multivariate_normal"
 
 @dataclass(frozen=True)
 class Distribution:
-    """Probability distribution of a value: from scipy.stats, a choice, or table rows.
+    """Probability distribution of a value: one of scipy.stats, a choice, or table rows.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Distribution:
     choices: tuple[Any, ...] = ()
 
     def values(self, flights: Sequence[int], shares: Array) -> list[Any]:
-        """Return the values (N,) for flights with given numbers and cumulative probabilities
+        """Return the values (N,) for flights with the given numbers and cumulative probabilities
         (N,)."""
         if self.name == _TABLE:
             # Draws are made in blocks, whose last one reaches beyond the table.
@@ -71,9 +71,9 @@ class Distribution:
 class Dispersion:
     """A quantity that varies between flights, and its distribution.
 
-    For a correlated quantity, ``weights`` are the weights of independent standard normals, by
-    dispersion name; the weighted sum is the quantity's standard normal. Empty: the quantity is
-    independent.
+    For a correlated quantity, ``weights`` are the weights of independent standard normal variables,
+    by dispersion name; the weighted sum of these variables is the standard normal variable of the
+    quantity. Empty if the quantity is independent.
     """
 
     target: DispersionTarget
@@ -193,7 +193,7 @@ def read_table(text: str, scenario: Scenario) -> list[Dispersion]:
     """
     names, *rows = [row for row in csv.reader(text.splitlines(), skipinitialspace=True) if row]
     if not rows:
-        raise ParameterError("the table must have one line of names and one line per flight.")
+        raise ParameterError("the table must consist of one line of names and one line per flight.")
     for number, row in enumerate(rows, 1):
         if len(row) != len(names):
             raise ParameterError(
@@ -203,7 +203,9 @@ def read_table(text: str, scenario: Scenario) -> list[Dispersion]:
     for name, column in zip(names, zip(*rows, strict=True), strict=True):
         targets = targets_of(name.strip(), scenario)
         if len(targets) > 1:
-            raise ParameterError(f"'{name}' in the table names {len(targets)} values: name one.")
+            raise ParameterError(
+                f"'{name}' in the table refers to {len(targets)} values: name one of them."
+            )
         values = tuple(_read_choice(targets[0], each.strip(), _TABLE) for each in column)
         for text in set(values) if targets[0].is_text else ():
             _require_node_accepts(targets[0], text, scenario)
@@ -235,8 +237,9 @@ def checked_dispersions(drawn: Sequence[Dispersion]) -> tuple[Dispersion, ...]:
 _SCIPY_NAMES = {"normal": "norm", "gauss": "norm", "gaussian": "norm", "exponential": "expon"}
 
 _ARGUMENT_HELP = {
-    "norm": "loc is the mean and scale the standard deviation",
-    "uniform": "loc is the smallest value and scale the width; [a, b] is from a to b",
+    "norm": "loc is the mean and scale is the standard deviation",
+    "uniform": "loc is the smallest value and scale is the width of the range; [a, b] ranges from "
+    "a to b",
 }
 
 
@@ -263,7 +266,8 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
             least, most = (read_real_number(f"{name}: uniform", each) for each in arguments)
             if not least < most:
                 raise ParameterError(
-                    f"'{name}': uniform is from {least:g} to {most:g}; the first must be smaller."
+                    f"'{name}': uniform ranges from {least:g} to {most:g}; the first number must "
+                    "be smaller."
                 )
             arguments = [least, most - least]
         if len(arguments) <= len(words):

@@ -1,6 +1,6 @@
 """Campaign draws: the random values of each flight.
 
-A draw is determined by its number: it depends neither on the number of workers nor on the order in
+A draw is determined by its number; it depends neither on the number of workers nor on the order in
 which flights finish. With the samplers ``random``, ``sobol`` and ``halton``, it does not depend on
 the number of flights either.
 """
@@ -22,14 +22,14 @@ from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array
 
 _MIN_PROBABILITY = 1e-12
-"""Smallest distance of cumulative probabilities from 0 and 1, where many distributions are
+"""Smallest distance of cumulative probabilities from 0 and 1, at which many quantiles are
 infinite."""
 
 _BLOCK_SIZE = 256
 """Number of draws computed together."""
 
 _SEED = "plant.sensors.seed"
-"""Name of the flight seed, which campaigns may disperse like other parameters."""
+"""Name of the flight seed, which campaigns can disperse in the same way as other parameters."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Draws:
     Raises
     ------
     ParameterError
-        The sampler requires more flights.
+        The sampler requires more flights than the campaign has.
     """
 
     def __init__(self, campaign: Campaign) -> None:
@@ -65,8 +65,8 @@ class Draws:
         self._block, self._made = -1, list[Draw]()
         """The last computed block of draws."""
         self.shares = self._sampler_shares()
-        """(N, D) cumulative probabilities of the values; None with the sampler ``random``, which
-        uses a separate generator for each flight."""
+        """(N, D) cumulative probabilities of the values; None for the sampler ``random``, which
+        uses a separate random generator for each flight."""
 
     def __len__(self) -> int:
         return self._campaign.flights if self.shares is None else len(self.shares)
@@ -74,7 +74,7 @@ class Draws:
     def __getitem__(self, number: int) -> Draw:
         """Return a draw by its number."""
         if not 0 <= number < len(self):
-            raise IndexError(f"There is no draw {number} of {len(self)}.")
+            raise IndexError(f"There is no draw {number}: there are only {len(self)}.")
         block, place = divmod(number, _BLOCK_SIZE)
         if block != self._block:
             self._made, self._block = self._draw_block(block * _BLOCK_SIZE), block

@@ -1,4 +1,4 @@
-"""Engines by name; each flies the same flight for the same draw."""
+"""Engines by name; all engines fly the same flight for the same draw."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def select_engine(campaign: Campaign, engine_name: str) -> Engine:
 
 @cache
 def engine_by_name(name: str) -> Engine:
-    """Return an engine by name, one instance per process, which reuses its models."""
+    """Return an engine by name: one instance per process, so that its models are reused."""
     return ENGINE_FACTORIES[name]()
 
 

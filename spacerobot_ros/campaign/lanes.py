@@ -1,8 +1,9 @@
-"""Campaign draws in SIMD lanes, along planned schedules or under control.
+"""Flies campaign draws in SIMD lanes, along planned schedules or under coordinated control.
 
-A lane can follow one schedule to its end and evaluate the goal, or fly under coordinated control
-until the outcome is known. A draw that requires more (a correction, a joint at a limit, a loss of
-control) becomes a :class:`.Fallback` for the engine ``flights``; the rows are the same.
+A lane can follow one schedule to the end of the schedule and evaluate the goal, or fly under
+coordinated control until the outcome is known. A draw that requires more (a correction, a joint at
+a limit, a loss of control) becomes a :class:`.Fallback` for the engine ``flights``; the resulting
+rows of the dataset are the same.
 """
 
 from __future__ import annotations
@@ -53,13 +54,13 @@ from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
 
 _STATES_PER_FLIGHT = 40
-"""Largest number of states evaluated along a flight's schedule, before its last state."""
+"""Largest number of states evaluated along a flight's schedule, in addition to the last state."""
 
 _MAX_BATCH_TICKS = 4_000_000
-"""Largest number of ticks in one batch, whose schedules are in memory."""
+"""Largest number of ticks in one batch; all its schedules are in memory."""
 
 _MAX_BATCH_PREPARATION_TIME = 4.0
-"""Wall time, s, after which a batch is flown with the draws that are ready; it limits the loss if
+"""Wall time, s, after which a batch is flown with the draws that are ready; this limits the loss if
 the campaign is interrupted."""
 
 _END_POSITION_TOLERANCE = 1e-6
@@ -147,7 +148,7 @@ class LanesEngine:
         if plant.target.given:
             return "it has a target"
         if plant.engine != "exact":
-            return f"its plant uses engine '{plant.engine}'; use engine 'flights'"
+            return f"its plant uses the engine '{plant.engine}'; use engine 'flights'"
         loads = plant.disturbances, plant.orbit, plant.table
         dispersed = any(
             each.name.startswith(_EXTERNAL_LOAD_PREFIXES) for each in campaign.dispersions
@@ -158,7 +159,8 @@ class LanesEngine:
             return "it uses the metric clearance_m, and lanes measure no distances between links"
         if campaign.own_metrics:
             return (
-                f"the metric '{campaign.own_metrics[0]}' needs whole flights; use engine 'flights'"
+                f"the metric '{campaign.own_metrics[0]}' requires whole flights; use engine "
+                "'flights'"
             )
         match scenario.commanders, plant.actuation:
             case ("planner",), "velocity":
@@ -233,7 +235,7 @@ class _ScheduledLanes:
         self._planned_values: _PlannedValues | None = None
         """The values that determine plans for the last scenario, common to many draws."""
         self._last_plan: tuple[Any, _Plan | None] | None = None
-        """The last plan from a noise-free state, and the values that determine it."""
+        """The last plan made from a noise-free state, and the values that determine this plan."""
 
     def refusal(self, campaign: Campaign) -> str:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
@@ -241,7 +243,7 @@ class _ScheduledLanes:
         if planner.averaging > 1 or planner.drift_position or planner.drift_attitude:
             return "the planner averages states, or monitors the path"
         if campaign.scenario.goal.end_effectors:
-            return "the goal is for end-effectors"
+            return "the goal specifies end-effector poses"
         if planner.replanning or planner.output != "commands":
             return "the planner replans during the motion"
         dispersed = [each.name for each in campaign.dispersions]
@@ -259,9 +261,9 @@ class _ScheduledLanes:
         began = time.perf_counter()
         plan, goal = self._plan_first_state(flight), flight.scenario.goal
         if plan is None:
-            return Fallback(draw, "had no schedule at the first state")
+            return Fallback(draw, "had no schedule in its first state")
         if plan.schedule.controls & (POSE - goal.asked):
-            return Fallback(draw, "keeps part of the pose that its goal does not specify")
+            return Fallback(draw, "maintains a part of the pose that its goal does not specify")
         return _PreparedDraw(draw, flight, plan, time.perf_counter() - began)
 
     def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
@@ -370,7 +372,7 @@ class _ControlledLanes:
         scenario = campaign.scenario
         plant = scenario.plant
         if scenario.goal.end_effectors:
-            return "the goal is for end-effectors"
+            return "the goal specifies end-effector poses"
         if scenario.goal.asked != POSE:
             return "the goal specifies only part of the base pose"
         if plant.thrusters:
@@ -383,7 +385,7 @@ class _ControlledLanes:
         if robots.controller.description.wheel_names:
             return "the robot has reaction wheels; use engine 'flights'"
         if scenario.controller.profile == PlannedReference.name:
-            return "its references are planned; use engine 'flights'"
+            return "its controller tracks planned references; use engine 'flights'"
         if scenario.controller.tasks:
             return "its controller performs tasks before goals; use engine 'flights'"
         for dispersion in campaign.dispersions:
@@ -414,7 +416,8 @@ class _ControlledLanes:
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | Fallback:
-        """Check that a draw can be in a batch, because an error would end the other flights."""
+        """Check that a draw can be flown in a batch, because an error would also end the other
+        flights of the batch."""
         ready = _PreparedDraw(draw, flight)
         try:
             self.flights(campaign, [ready])

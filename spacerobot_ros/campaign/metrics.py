@@ -1,4 +1,4 @@
-"""Campaign metrics by name, built-in and user-defined."""
+"""Built-in and user-defined campaign metrics, by name."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 class FlightMetric(ABC):
     """A user-defined metric, computed for each flight in campaigns that name it.
 
-    Derived classes are registered like control laws: with ``--plugin``, an entry point
-    ``spacerobot_ros.metrics``, or :meth:`.Registry.register` of ``OWN_METRICS``.
+    Derived classes are registered like control laws: with ``--plugin``, with an entry point
+    ``spacerobot_ros.metrics``, or with :meth:`.Registry.register` of ``OWN_METRICS``.
     """
 
     name: ClassVar[str]
@@ -32,7 +32,7 @@ class FlightMetric(ABC):
 
     @abstractmethod
     def evaluate(self, flight: Flight) -> float:
-        """Return the value for a flight; NaN if there is none."""
+        """Return the value for a flight; NaN if the metric has no value for the flight."""
 
 
 OWN_METRICS: Registry[FlightMetric] = Registry(

@@ -24,7 +24,7 @@ from spacerobot_ros.scenario import Scenario
 
 
 class FlightsEngine:
-    """Engine that flies draws one by one; an invalid draw does not affect the others."""
+    """Engine that flies draws one by one; an invalid draw does not affect the other draws."""
 
     name = "flights"
     efficient_flights = 1
@@ -66,7 +66,7 @@ class FlightsEngine:
 
 
 def robots_of(flight: DrawnFlight) -> Robots:
-    """Return the models for a flight; draws that differ only in masses share them."""
+    """Return the models for a flight; draws that differ only in masses share the models."""
     scenario = flight.scenario
     robots = nominal_robots(scenario)
     if "planner" in scenario.commanders:
@@ -83,7 +83,8 @@ def robots_of(flight: DrawnFlight) -> Robots:
 
 
 def nominal_robots(scenario: Scenario) -> Robots:
-    """Return the models for a scenario without mass dispersions, always as the same objects."""
+    """Return the models for a scenario without mass dispersions; every call returns the same
+    objects."""
     plant = description_of(scenario).urdf
 
     def build(node: str, config: RobotConfig) -> SpaceRobot | None:
@@ -99,8 +100,8 @@ def nominal_robots(scenario: Scenario) -> Robots:
 
 
 _last_planner_method: tuple[SpaceRobot, PlannerConfig, GaitMethod] | None = None
-"""Robot, configuration and gait method of the last planner; all flights share the method's solvers,
-and no plan depends on another."""
+"""Robot, configuration and gait method of the last planner; all flights share the solvers of the
+method, but no plan depends on another plan."""
 
 
 def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:

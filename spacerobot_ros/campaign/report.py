@@ -54,7 +54,7 @@ _NO_INFLUENCES = "no correlation is significant (p < 0.05, corrected for multipl
 _QUANTILES_SHOWN = (0.01, 0.5, 0.99)
 _MAX_CURVE_STEPS = 2000
 _PART_OF_METRIC = {"position_error_m": "position", "attitude_error_rad": "attitude"}
-"""Base goal component whose error is the metric."""
+"""Base goal component, by the metric for its error."""
 
 
 def write_campaign_report(folder: Path, path: Path) -> list[str]:
@@ -110,7 +110,7 @@ def _figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Fig
 
 
 def metric_label(metric: str, not_controlled: Sequence[str] = ()) -> str:
-    """Return the name of a metric, with its unit unless the name includes it; errors of
+    """Return the name of a metric, with its unit unless the name includes the unit; errors of
     uncontrolled goal components are marked.
     """
     unit = metric_of(metric).unit
@@ -259,15 +259,15 @@ def _histograms_section(results: Results) -> str:
         shares.set_ylim(0.0, 1.02)
         shares.set_ylabel("cumulative share")
     caption = (
-        "Distributions of the metrics; dotted: percentiles 5, 50 and 95; orange: requirements; "
-        "black: cumulative share of flights."
+        "Distributions of the metrics. Dotted lines: percentiles 5, 50 and 95; orange: "
+        "requirements; black: cumulative share of flights."
     )
     return _picture_part(figure, "distributions", caption)
 
 
 def _sensitivity_section(found: Sequence[Influence]) -> str:
     if not found:
-        return '<p class="missing">No drawn value varies together with a metric.</p>'
+        return '<p class="missing">No drawn value is correlated with a metric.</p>'
     sobol = any(each.total_order_index is not None for each in found)
     rows = []
     for each in _sort_passing_first(found)[:15]:
@@ -279,9 +279,10 @@ def _sensitivity_section(found: Sequence[Influence]) -> str:
         rows.append(cells)
     head = ["drawn", "metric", "rank correlation", "p", "of its distance from the median", "p"]
     head += ["Sobol, first order", "Sobol, total"] if sobol else []
-    note = "Spearman's rank correlations, first for passing, then in order of strength; p: p-value "
-    note += "corrected for multiple tests (Benjamini-Hochberg). A metric that grows on both sides "
-    note += "of the median correlates with the distance between the draw and the median."
+    note = "Spearman's rank correlations: first those with passing, then the others in order of "
+    note += "strength; p: p-value corrected for multiple tests (Benjamini-Hochberg). A metric that "
+    note += "increases on both sides of the median correlates with the distance between the draw "
+    note += "and the median."
     if not sobol:
         note += " Sampler 'saltelli' adds Sobol indices."
     if not any(each.is_significant for each in found):
@@ -369,7 +370,7 @@ def _convergence_section(results: Results) -> list[str]:
         final = percentiles(values)[PERCENTILES.index(95.0)] or 1.0
         line = [percentiles(values[:k])[PERCENTILES.index(95.0)] / final for k in at]
         axes[1].plot(at, line, color=PALETTE[i], label=name)
-    axes[1].set_ylabel("95th percentile relative to its final value")
+    axes[1].set_ylabel("95th percentile, relative to the final value")
     if results.distributed_metrics:
         axes[1].legend(fontsize=7, frameon=False)
     for panel in axes:
@@ -393,7 +394,7 @@ def _dispersions_section(campaign: Campaign) -> str:
             ]
         rows.append([each.name, str(each), each.target.unit or "", *numbers])
     if not rows:
-        return '<p class="missing">No dispersions: flights differ only in noise.</p>'
+        return '<p class="missing">There are no dispersions: the flights differ only in noise.</p>'
     head = [
         "parameter",
         "distribution",

@@ -37,7 +37,8 @@ PASSING = "passing"
 _WORST_FLIGHTS_SHOWN = 10
 _MESSAGES_SHOWN = 4
 _MAX_BOUND_DISTANCE = 100.0
-"""Distance from a bound, in standard deviations, at which the flight order saturates."""
+"""Distance from a bound, in standard deviations, beyond which flights are considered equal in this
+order."""
 
 _REASON = "reason"
 _TEXT_COLUMNS = ("outcome", _REASON, "engine", "fallback")
@@ -53,7 +54,7 @@ _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
 
 
 class Columns(Mapping[str, Any]):
-    """Dataset columns by name, in flight order, read on demand.
+    """Dataset columns by name, with values in flight order; columns are read on demand.
 
     Numbers are arrays (N,) with NaN for missing values; strings are lists with None for missing
     values.
@@ -169,7 +170,7 @@ class Results:
             return ""
         draws = "1 draw is" if missing == 1 else f"{missing} draws are"
         return (
-            f"{draws} not flown yet although later ones have been, usually because they take "
+            f"{draws} not flown yet although later draws have been, usually because they take "
             "longer: shares and distributions may change."
         )
 
@@ -191,7 +192,8 @@ class Results:
 
     @property
     def shown_metrics(self) -> list[str]:
-        """Report metrics that have values: named metrics and the main metrics."""
+        """Report metrics that have values: the metrics named in the campaign, and the main
+        metrics."""
         names = self.campaign.named_metrics
         names += [name for name in _MAIN_METRICS if name not in names]
         return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
@@ -203,8 +205,8 @@ class Results:
 
     @cached_property
     def messages(self) -> tuple[list[str], dict[str, str]]:
-        """Each flight's message without numbers, and for each such message the version with
-        numbers, if it is the same for all flights.
+        """Each flight's message without numbers; and, for each such message, the message with
+        numbers if the numbers are the same in all flights.
         """
         found: list[str] = []
         forms: dict[str, str] = {}
@@ -226,12 +228,12 @@ class Results:
 
     @property
     def distributed_metrics(self) -> list[str]:
-        """Report metrics other than yes-or-no metrics."""
+        """Report metrics, except for flags (yes or no)."""
         return [name for name in self.shown_metrics if not metric_of(name).yes_or_no]
 
     @property
     def sampler_shares(self) -> dict[str, Share]:
-        """Shares of flights with a yes, by metric name."""
+        """Shares of flights for which a flag (yes or no) is true, by metric name."""
         found = {}
         for name, metric in METRICS.items():
             values = self.columns.get(name)
@@ -267,19 +269,22 @@ class Results:
         return sorted(found, key=lambda each: -each.strength)
 
     def drawn_by_influence(self, found: Sequence[Influence]) -> list[str]:
-        """Return the names of drawn values: strings first, then numbers by influence on passing."""
+        """Return the names of drawn values: strings first, then numbers in order of influence on
+        passing."""
         causes = [each.cause for each in found if each.metric == PASSING]
         return [*(name for name in self.campaign.names if name not in self.drawn_numbers), *causes]
 
     def success_by_bins(self, name: str) -> list[Bin]:
-        """Return the shares of flights that passed, over the drawn values with a given name."""
+        """Return the shares of flights that passed as a function of the drawn values with a given
+        name."""
         return success_by_bins(np.asarray(self.columns[f"{DRAW_PREFIX}{name}"]), self.passed)
 
     def worst_rows(self) -> list[int]:
         """Return the rows of the worst flights: first failed flights, then flights that missed a
         criterion.
 
-        Passed flights are ordered by distance from a bound, in standard deviations.
+        Flights that passed are ordered by distance from the nearest bound of a criterion, in
+        standard deviations.
         """
         badness = np.full(len(self), -_MAX_BOUND_DISTANCE)
         for criterion in self.campaign.criteria:
@@ -304,9 +309,9 @@ class Results:
 
 
 def messages_of(results: Results) -> list[tuple[str, int, str]]:
-    """Return outcomes with their most frequent messages and flight counts.
+    """Return the outcomes, each with its most frequent message and number of flights.
 
-    Messages that differ only in numbers are merged, without the numbers.
+    Messages that differ only in numbers are merged, and the numbers are omitted.
     """
     messages, forms = results.messages
     kinds: dict[str, Counter[str]] = {}

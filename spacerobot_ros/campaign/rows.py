@@ -21,7 +21,7 @@ LANES = "lanes"
 """Name of the engine that flies many draws at once in SIMD lanes."""
 
 FLIGHTS = "flights"
-"""Name of the engine that flies draws one by one, the fallback of other engines."""
+"""Name of the engine that flies draws one by one, the fallback for other engines."""
 
 ERROR = "error"
 """Outcome of a draw that could not be flown."""
@@ -44,9 +44,10 @@ class Row:
     engine
         Name of the engine used.
     fallback
-        Reason why engine ``flights`` was used instead of the campaign's engine; empty: it was not.
+        Reason why engine ``flights`` was used instead of the campaign's engine; empty if the
+        campaign's engine was used.
     wall_time, plan_time
-        Wall time of the flight and of its planning, s.
+        Wall time of the flight, and wall time of its planning, s.
     """
 
     draw: Draw
@@ -104,7 +105,8 @@ class Row:
 class Fallback:
     """A draw that an engine passes on to engine ``flights``.
 
-    ``reason`` completes "the flight ..." ("needed corrections"), or is an error message.
+    ``reason`` completes "the flight ..." (for example "needed corrections"), or is an error
+    message.
     """
 
     draw: Draw
@@ -112,7 +114,8 @@ class Fallback:
 
 
 class Engine(Protocol):
-    """Flies campaign draws; fewer than ``efficient_flights`` flights take just as long."""
+    """Flies campaign draws; batches of fewer than ``efficient_flights`` draws take as long as
+    batches of that size."""
 
     name: str
     efficient_flights: int

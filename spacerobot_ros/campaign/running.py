@@ -1,4 +1,4 @@
-"""Flies campaigns into datasets, and repeats single flights with a bag.
+"""Flies campaigns and stores the results in datasets; repeats single flights and records a bag.
 
 :func:`sweep` runs a small campaign from Python, with the arguments of ``fly``.
 """
@@ -52,8 +52,8 @@ class Progress:
     seconds
         Wall time so far.
     unflown
-        Number of flights in the dataset whose draw or goal was refused or that ended with an error,
-        counted at the end.
+        Number of flights in the dataset whose draw or goal was refused or that ended with an error;
+        counted at the end of the campaign.
     """
 
     flown: int
@@ -64,7 +64,7 @@ class Progress:
 
     @property
     def seconds_left(self) -> float:
-        """Estimated remaining wall time, s; infinite before the first flight."""
+        """Estimated remaining wall time, s; infinite until the first flight has finished."""
         return (
             (self.total - self.flown) / self.flights_per_second
             if self.flights_per_second
@@ -81,7 +81,7 @@ def run_campaign(
     show: Callable[[Progress], None] = lambda progress: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Progress:
-    """Fly all campaign draws that do not have a row in the folder yet.
+    """Fly all draws of a campaign that have no row in the folder yet.
 
     Parameters
     ----------
@@ -94,9 +94,10 @@ def run_campaign(
     cluster
         The workers that fly.
     show
-        Called with the progress after each task and a few times per second.
+        Function that is called with the progress after each task and a few times per second.
     stopped
-        Returns whether to stop; called a few times per second. Finished flights are kept.
+        Function that returns whether to stop; it is called a few times per second. Finished flights
+        are kept.
 
     Returns
     -------
@@ -159,7 +160,8 @@ def _fly_rows(
 
 
 RERUN_TOLERANCE = 1e-9
-"""Largest deviation between equal flights, absolute below 1 (SI units) and relative above."""
+"""Largest deviation between identical flights: absolute for values below 1 (SI units), relative for
+larger values."""
 
 
 @dataclass(frozen=True)
@@ -171,15 +173,15 @@ class Rerun:
     row
         Row of the repeated flight.
     deviation
-        Largest deviation of a metric; None: the flight is not in the dataset.
+        Largest deviation of a metric; None if the flight is not in the dataset.
     worst_metric
         Name of that metric.
     outcome
-        Outcome in the dataset; empty: the flight is not in the dataset.
+        Outcome in the dataset; empty if the flight is not in the dataset.
     bag
         Path of the bag.
     note
-        Reason why the metrics may differ from those in the dataset; empty: they must agree.
+        Reason why the metrics may differ from those in the dataset; empty if both must agree.
     """
 
     row: Row
@@ -256,7 +258,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
 
 
 def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, float]] | None:
-    """Return the outcome, engine and metrics of a flight in a dataset; None: not in the dataset."""
+    """Return the outcome, engine and metrics of a flight; None if it is not in the dataset."""
     if number not in dataset.flown_numbers():
         return None
     record = next(row for row in dataset.table().to_pylist() if row["flight"] == number)
@@ -271,7 +273,8 @@ def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, fl
 def largest_deviation(
     expected: Mapping[str, float], found: Mapping[str, float]
 ) -> tuple[float, str]:
-    """Return the largest deviation of a metric (relative above 1) and the metric's name."""
+    """Return the largest deviation of a metric (relative for values above 1), and the name of the
+    metric."""
     largest, at = 0.0, ""
     for name, value in expected.items():
         other = found.get(name, math.nan)
@@ -306,7 +309,8 @@ def sweep(
 ) -> Any:
     """Fly a small campaign, and return one row per flight.
 
-    ``sweep("coordinated_control", {"plant.sensors.position_noise": {"uniform": [0, 0.01]}})``.
+    For example: ``sweep("coordinated_control", {"plant.sensors.position_noise": {"uniform": [0,
+    0.01]}})``.
 
     Parameters
     ----------
@@ -319,7 +323,7 @@ def sweep(
     seed, flights
         Seed and number of draws.
     folder
-        Dataset folder, which a later call resumes; None: no folder.
+        Dataset folder, from which a later call resumes; by default, no dataset is written.
     section
         Other campaign file keys: ``sampler``, ``criteria``, ``engine``, ``longest``;
         ``set`` is equivalent to ``parameters``.

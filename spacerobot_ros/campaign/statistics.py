@@ -20,7 +20,7 @@ CONFIDENCE = 0.95
 PERCENTILES = (5.0, 50.0, 95.0, 99.0)
 
 _MAX_PERMUTED_VALUES = 8
-"""Largest number of samples for which permutations are counted."""
+"""Largest number of samples for which all permutations are counted."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Share:
 
 
 def share(count: int, total: int) -> Share:
-    """Return a share with its intervals; without flights, these are 0 to 1."""
+    """Return a share with its intervals; if there are no flights, both intervals are 0 to 1."""
     if not total:
         return Share(0, 0, 0.0, 1.0, (0.0, 1.0))
     from scipy.stats import binomtest
@@ -79,8 +79,8 @@ class Bin:
 def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
     """Return the shares of flights that passed, (N,), in bins of the drawn values (N,).
 
-    Each string, or each number if there are few, has its own bin; many numbers are binned with
-    about the same number of flights per bin.
+    Each string has its own bin, and so does each number if there are few different numbers; many
+    numbers are binned with approximately the same number of flights per bin.
     """
     if drawn.dtype.kind == "f":
         finite = np.isfinite(drawn)
@@ -117,10 +117,10 @@ class Influence:
     p_value
         Probability that a correlation at least this large occurs by chance.
     distance_correlation, distance_p_value
-        The same for the distance between the drawn value and its median, which reveals metrics that
-        grow on both sides.
+        Correlation and p-value for the distance between the drawn value and its median; they reveal
+        metrics that increase on both sides of the median.
     first_order_index, total_order_index
-        Sobol indices and the half widths of their intervals, if provided by the sampler.
+        Sobol indices and the half-widths of their intervals, if the sampler provides them.
     """
 
     cause: str
@@ -134,7 +134,7 @@ class Influence:
 
     @property
     def is_significant(self) -> bool:
-        """Whether the total index, or else the larger correlation, is significant."""
+        """Whether the total index is significant or, if there is none, the larger correlation."""
         if self.total_order_index is not None:
             return self.total_order_index[0] > self.total_order_index[1]
         p = (
@@ -146,7 +146,7 @@ class Influence:
 
     @property
     def strength(self) -> float:
-        """Sorting key: the total index, or else the larger correlation."""
+        """Sorting key: the total index or, if there is none, the larger correlation."""
         if self.total_order_index is not None:
             return self.total_order_index[0]
         return max(abs(self.correlation), abs(self.distance_correlation))
@@ -163,7 +163,7 @@ class Influence:
 def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> list[Influence]:
     """Return the sensitivity of each metric (N,) to each dispersion (N,).
 
-    Flights without the metric and pairs without variation are omitted.
+    Flights without the metric are omitted, and so are pairs without variation.
     """
     found = []
     for metric, values in metrics.items():
@@ -187,8 +187,9 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
 def rank_correlation(x: Array, y: Array) -> tuple[float, float]:
     """Return Spearman's correlation of varying samples (N,), and its p-value.
 
-    For few samples, the p-value is computed by counting permutations: the Student's t approximation
-    used for many samples gives zero instead of one third for three perfectly ordered samples.
+    For few samples, the p-value is computed by counting permutations. For three perfectly ordered
+    samples, it is one third; the Student's t approximation used for many samples would yield a
+    p-value of zero.
     """
     from scipy.stats import permutation_test, rankdata, spearmanr
 
@@ -208,8 +209,9 @@ def rank_correlation(x: Array, y: Array) -> tuple[float, float]:
 def corrected_for_multiple_tests(found: Sequence[Influence]) -> list[Influence]:
     """Return sensitivities with p-values corrected for multiple tests.
 
-    Both kinds are corrected together by the Benjamini-Hochberg procedure: among p-values of at most
-    p, a share of at most p is expected by chance.
+    Both kinds of p-values are corrected together by the Benjamini-Hochberg procedure: of the tests
+    with a corrected p-value of at most p, at most a fraction p is expected to be significant only
+    by chance.
     """
     if not found:
         return []
@@ -293,8 +295,8 @@ def paired_difference(metric: str, first: Array, second: Array) -> PairedDiffere
 
 
 def paired_success(first: Flags, second: Flags) -> tuple[int, int, float]:
-    """Return the numbers of draws passed only by the first and only by the second campaign, and
-    McNemar's exact p."""
+    """Return the number of draws that passed only in the first campaign, the number that passed
+    only in the second, and McNemar's exact p."""
     from scipy.stats import binomtest
 
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())

@@ -1,4 +1,4 @@
-"""Quantities that a campaign can disperse, by name, and their effect on a flight."""
+"""Quantities that a campaign can disperse, by name, and the effect of each quantity on a flight."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ _FACTORS = ("mass", "inertia", "com")
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
 TARGET_KINDS = (
-    ("NODE.PARAMETER", "a parameter of a node; NODE.PARAMETER[i] or [JOINT]: one list element"),
-    ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies, one body, each body"),
+    ("NODE.PARAMETER", "a node parameter; with [i] or [JOINT] appended, one element of a list"),
+    ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies, of one body or of each"),
     ("inertia, inertia.BODY, inertia.*", "factor on the inertia, in the same way"),
     ("com.BODY.AXIS, com.*", "offset of a centre of mass in its body frame, m"),
-    ("target.mass, target.inertia", "factor on the target's mass and inertia, on its inertia"),
-    ("target.com.AXIS", "offset of its centre of mass in its root link frame, m"),
+    ("target.mass, target.inertia", "factor on the target's mass and inertia, or its inertia only"),
+    ("target.com.AXIS", "offset of the target's centre of mass in its root link frame, m"),
     ("goal.position.AXIS, goal.rotvec.AXIS", "goal offset, m; rotation in the goal frame, rad"),
-    ("end_effector_goal. ...", "the same for the end-effector"),
+    ("end_effector_goal. ...", "the same for the end-effector goal"),
     ("initial.position.AXIS, initial.rotvec.AXIS", "the same for the initial base pose"),
     ("initial.joints.JOINT", "offset of an initial joint position, m or rad"),
-    ("faults[i].at, .until, .value, .kind, .target", "of the i-th fault in plant.faults"),
+    ("faults[i].at, .until, .value, .kind, .target", "component of the i-th fault in plant.faults"),
     ("faults[i].present", "1 or 0: whether the fault occurs"),
 )  # fmt: skip
 """Kinds of names, with descriptions for users."""
@@ -97,7 +97,7 @@ class DispersionTarget:
 
 @dataclass(frozen=True)
 class DrawnFlight:
-    """One campaign flight, or several that share a scenario and differ in masses.
+    """One campaign flight, or several flights that share a scenario and differ in masses.
 
     Leading dimensions (...) index flights: none for one flight, (N,) for N flights.
 
@@ -110,8 +110,8 @@ class DrawnFlight:
     nominal
         The robot without dispersions.
     mass, inertia
-        (..., B) body factors; the inertia scales with the mass and additionally with its own
-        factor.
+        (..., B) factors for each body; the inertia is multiplied by the mass factor and by the
+        inertia factor.
     com
         (..., B, 3) centre of mass offsets, m.
     parameters
@@ -119,7 +119,7 @@ class DrawnFlight:
     has_target_masses
         Whether the target's mass properties are drawn.
     seed
-        Seed of sensor and actuator noise; None: the scenario's.
+        Seed of sensor and actuator noise; None selects the seed in the scenario.
     """
 
     scenario: Scenario
@@ -160,7 +160,7 @@ class DrawnFlight:
 
     @cached_property
     def inertial(self) -> InertialParameters | None:
-        """Body masses, centres of mass and inertias; None: as in the robot description."""
+        """Body masses, centres of mass and inertias; by default, those of the robot."""
         return self._scaled_parameters if self._has_other_masses.any() else None
 
     @property
@@ -209,9 +209,10 @@ class DrawnFlight:
             self.inertial.require_physical([body.name for body in self.nominal.bodies])
 
     def with_draws_in_scenario(self) -> DrawnFlight:
-        """Return the flight with its seed in the scenario and its masses in the plant's URDF.
+        """Return the flight with the seed included in the scenario and the masses included in the
+        plant's URDF.
 
-        Commanders keep the nominal robot unless they have their own.
+        Commanders keep the nominal robot unless a separate robot is configured for them.
 
         Building such a robot takes milliseconds, so engines without ROS use :attr:`inertial`
         directly.
@@ -254,7 +255,7 @@ def _load_description(robot: str, text: str, world: str) -> RobotDescription:
 
 
 def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
-    """Return the targets with a name: one, or one per body.
+    """Return the targets with the given name: one target, or one target per body.
 
     Raises
     ------
@@ -287,7 +288,7 @@ def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
 def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> DispersionTarget:
     if node not in ("plant", *scenario.commanders):
         raise ParameterError(
-            f"'{name}' belongs to a node that does not fly: the scenario '{scenario.name}' flies "
+            f"'{name}' belongs to a node that is not in use: the scenario '{scenario.name}' flies "
             f"with {' and '.join(scenario.commanders)}."
         )
     match = _INDEXED_NAME_PATTERN.fullmatch(rest)
@@ -355,7 +356,8 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
     assert isinstance(values, tuple)
     if any(isinstance(each, str) for each in values):
         raise ParameterError(
-            f"'{name}': the list has strings NAME:VALUE; set a number for each joint under 'set'."
+            f"'{name}': the list consists of strings NAME:VALUE; set a number for each joint "
+            "under 'set'."
         )
     if values:
         return [float(x) for x in values]
@@ -363,7 +365,8 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
         start = _start_positions(scenario)
         return start if "positions" in name else [0.0] * len(start)
     raise ParameterError(
-        f"'{name}': the list is empty, which has a special meaning: set the whole list under 'set'."
+        f"'{name}': the list is empty, and an empty list has a special meaning: set the whole "
+        "list under 'set'."
     )
 
 
@@ -441,7 +444,7 @@ def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarg
     known = ["mass", "inertia", *(f"com.{axis}" for axis in AXES)]
     if part not in known:
         names = [f"target.{each}" for each in known]
-        raise ParameterError(f"'{name}' is none of {', '.join(names)}.{suggestion(name, names)}")
+        raise ParameterError(f"'{name}' is not one of {', '.join(names)}.{suggestion(name, names)}")
     column = AXES.index(part[-1]) if part.startswith("com") else -1
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
@@ -467,7 +470,7 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Dispers
         known = [f"{kind}.{p}.{a}" for p in ("position", "rotvec") for a in AXES]
         if kind == "initial":
             known += [f"initial.joints.{joint}" for joint in description_of(scenario).joint_names]
-        raise ParameterError(f"'{name}' is none of {', '.join(known)}.{suggestion(name, known)}")
+        raise ParameterError(f"'{name}' is not one of {', '.join(known)}.{suggestion(name, known)}")
     if kind == "end_effector_goal" and scenario.end_effector_goal is None:
         raise ParameterError(f"'{name}': the scenario has no goal for the end-effector.")
     column = AXES.index(axis)
@@ -567,8 +570,8 @@ def _require_fault(line: str, scenario: Scenario) -> Fault:
 def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
     """Return a robot's URDF with different masses, centres of mass and inertias.
 
-    The first link of each body carries the body's inertia; links attached by fixed joints have
-    none.
+    The first link of each body carries the body's inertia; links attached by fixed joints have no
+    inertia.
     """
     root = ET.fromstring(robot.urdf)
     weights: Iterable[Any] = zip(

@@ -1,7 +1,7 @@
 """Campaign workers: local processes, or a dask.distributed cluster.
 
 :meth:`TaskDistributor.rows` distributes the draws in tasks of about :data:`TARGET_TASK_TIME`, and
-yields the rows as tasks finish.
+yields the rows of each task when it finishes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from spacerobot_ros.termination import end_with_parent
 from spacerobot_ros.version import __version__, source_hash
 
 TARGET_TASK_TIME = 2.0
-"""Desired wall time of a task, s, which keeps the distribution overhead small."""
+"""Desired wall time of a task, s; it is long enough to keep the distribution overhead small."""
 
 _MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
 """Smallest number of flights in the first tasks, and largest number in any task."""
@@ -71,9 +71,9 @@ class Cluster:
     Attributes
     ----------
     workers
-        Number of processes on this machine; 0: only this process.
+        Number of processes on this machine; if 0, only this process is used.
     scheduler
-        Address of the dask.distributed scheduler; empty: this machine.
+        Address of the dask.distributed scheduler; if empty, processes on this machine are used.
     """
 
     workers: int = 0
@@ -114,7 +114,7 @@ def fly_task(
     draws, engine
         Draws, and engine name.
     include_fallbacks
-        Whether this task also flies the engine's fallbacks.
+        Whether this task also flies the fallbacks of the engine.
 
     Raises
     ------
@@ -123,8 +123,8 @@ def fly_task(
     """
     if code != this_code():
         raise SpaceRobotError(
-            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process has {code}: all must "
-            "have the same code."
+            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process has {code}: all "
+            "processes must run the same code."
         )
     flying, campaign = engine_by_name(engine), _deserialise_campaign(packed)
     fly = partial(fly_all, flying) if include_fallbacks else flying.fly
@@ -218,8 +218,8 @@ def _end_with_campaign() -> None:
 class DaskWorkers:
     """Workers of a dask.distributed scheduler.
 
-    A scheduler runs code from anyone who can reach its port: protect it with a private network or
-    TLS.
+    A scheduler runs code from anyone who can reach its port: protect the scheduler by a private
+    network or TLS.
 
     Parameters
     ----------
@@ -233,7 +233,8 @@ class DaskWorkers:
         self._client = client
         self._checked: set[str] = set()
         self._empty_since = math.inf
-        """Monotonic time since which the scheduler has had no worker; infinite if it has one."""
+        """Monotonic time at which the scheduler lost its last worker; infinite if it has a
+        worker."""
 
     def count(self) -> int:
         """Return the number of workers, at least 1 because workers may join later.
@@ -241,7 +242,7 @@ class DaskWorkers:
         Raises
         ------
         SpaceRobotError
-            The scheduler is gone, or a worker does not have this package.
+            The scheduler is no longer available, or a worker does not have this package.
         """
         try:
             if self._client.status != "running":
@@ -254,7 +255,7 @@ class DaskWorkers:
         now = time.monotonic()
         self._empty_since = math.inf if workers else min(self._empty_since, now)
         if now - self._empty_since > _NO_WORKER_WARNING_DELAY:
-            warn_once("The scheduler has no workers: flights are waiting for one.")
+            warn_once("The scheduler has no workers: the flights are waiting for a worker.")
         return max(1, workers)
 
     def submit(self, *arguments: Any) -> Any:
@@ -262,7 +263,7 @@ class DaskWorkers:
         return self._client.submit(fly_task, *arguments, pure=False, retries=0)
 
     def ended(self, tasks: list[Any]) -> list[Any]:
-        """Return the finished tasks, or an empty list if none finishes for a while."""
+        """Return the finished tasks, or an empty list if no task finishes for some time."""
         import distributed
 
         try:
@@ -281,7 +282,7 @@ class DaskWorkers:
         WorkerDeath
             The worker died.
         SpaceRobotError
-            The scheduler is gone, or cannot load the task.
+            The scheduler is no longer available, or cannot load the task.
         """
         from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
@@ -298,7 +299,8 @@ class DaskWorkers:
                 raise
             raise SpaceRobotError(
                 "The scheduler or a worker cannot load the task "
-                f"({str(error).splitlines()[0]}): all of them require {_PACKAGE_NAME}[campaign] "
+                f"({str(error).splitlines()[0]}): the scheduler and all workers require "
+                f"{_PACKAGE_NAME}[campaign] "
                 f"{__version__}."
             ) from error
         return made
@@ -388,7 +390,7 @@ class _SubmittedTask:
 class TaskDistributor:
     """Distributes draws to workers.
 
-    An engine's fallbacks are redistributed to engine ``flights``, in tasks with fewer flights.
+    The fallbacks of an engine are passed to engine ``flights``, in tasks with fewer flights.
 
     If a worker dies, each flight in the tasks that it takes along is repeated alone, with nothing
     beside it. If a worker dies again, that flight has killed it and is reported.
@@ -400,7 +402,7 @@ class TaskDistributor:
     campaign, draws, engine
         The campaign, its draws, and the engine name.
     stopped
-        Returns whether to stop; called a few times per second.
+        Function that returns whether to stop; it is called a few times per second.
     """
 
     def __init__(
@@ -426,7 +428,7 @@ class TaskDistributor:
         """Draws in tasks whose worker has died."""
 
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
-        """Yield the rows of draws as their tasks finish, and empty lists in between."""
+        """Yield the rows of draws as their tasks finish, and empty lists while no task finishes."""
         waiting = deque(numbers)
         while (
             waiting or self._fallbacks or self._retry_alone or self._running

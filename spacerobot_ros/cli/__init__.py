@@ -1,6 +1,7 @@
 """The command `spacerobot`: one module per command, loaded when the command is used.
 
-Command modules import nothing heavy at module level: `spacerobot --help` loads all of them.
+Command modules import no large packages at module level, because `spacerobot --help` loads all of
+them.
 """
 
 from __future__ import annotations

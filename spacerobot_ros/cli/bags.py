@@ -29,8 +29,8 @@ from spacerobot_ros.errors import printable
 @bag_argument
 @format_option(
     ("csv", "parquet", "mat", "tree"),
-    "csv and parquet: a folder with one file per topic; mat: one file for MATLAB; tree: csv whose "
-    "columns PlotJuggler shows as a tree.",
+    "csv and parquet: a folder with one file per topic; mat: one file for MATLAB; tree: csv with "
+    "columns that PlotJuggler shows as a tree.",
 )
 @out_option("Folder or file to write [BAG_csv, BAG_parquet, BAG_tree or BAG.mat].")
 @topic_option("Export only this topic, with or without the leading slash [all].")
@@ -90,8 +90,8 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
     "--style",
     type=PATH,
     metavar="FILE.mplstyle",
-    help="serif, a matplotlib style file, or the name of a matplotlib style: fonts, sizes, "
-    "colours.",
+    help="Fonts, sizes and colours: serif, a matplotlib style file, or the name of a matplotlib "
+    "style.",
 )
 @click.option("--degrees", is_flag=True, help="Show angles in degrees [rad].")
 @click.option("--events", is_flag=True, help="Show events below the time axes.")
@@ -102,9 +102,8 @@ def figures_command(
 ) -> None:
     """Draw figures for a paper from a BAG, one file each.
 
-    Several bags are drawn into the same panels. Existing files with these names are replaced. Exit
-    code 1:
-    the bags lack the data for a figure named by --only, or for all figures.
+    Several bags are drawn in the same panels. Existing files with these names are replaced. Exit
+    code 1: the bags lack the data for a figure named by --only, or for every figure.
     """
     from spacerobot_ros.report import write_figures
     from spacerobot_ros.report.figures import PictureFormat
@@ -126,13 +125,17 @@ def figures_command(
 @click.command("replay")
 @bag_argument
 @click.option(
-    "--rate", default=1.0, show_default=True, metavar="FACTOR", help="Bag time per wall time."
+    "--rate",
+    default=1.0,
+    show_default=True,
+    metavar="FACTOR",
+    help="Replay speed: ratio of bag time to wall time.",
 )
 @click.option(
     "--start",
     default=0.0,
     metavar="SECONDS",
-    help="Start of the replay, from the first message.",
+    help="Start of the replay, relative to the first message.",
 )
 @click.option("--duration", default=0.0, metavar="SECONDS", help="Duration to replay [all].")
 @click.option("--loop", is_flag=True, help="Repeat the replay when it ends.")
@@ -147,7 +150,7 @@ def figures_command(
     default=0.0,
     type=click.FloatRange(min=0.0),
     metavar="[HZ]",
-    help="Publish bag time on /clock HZ times per second (100 without a number) [as recorded].",
+    help="Publish bag time on /clock HZ times per second (100 if HZ is omitted) [as recorded].",
 )
 @click.option("--paused", is_flag=True, help="Begin paused.")
 @view_option
@@ -163,8 +166,8 @@ def replay_command(
 ) -> None:
     """Republish the messages in a BAG at their recorded times.
 
-    The services /replay/pause, /replay/resume and /replay/step control it. With --view the replay
-    pauses at the end until Ctrl-C, and can be restarted.
+    The services /replay/pause, /replay/resume and /replay/step control the replay. With --view, the
+    replay pauses at the end until Ctrl-C, and can be restarted.
     """
     from rclpy.parameter import Parameter
 
@@ -247,7 +250,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
 def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     """Re-simulate a BAG from its commands, and compare the states.
 
-    Exit code 0: every recorded state follows from the commands; 1: a state differs, states are
+    Exit code 0: the commands reproduce every recorded state; 1: a state differs, states are
     missing, or the other engine differs; 2: bad input.
     """
     from spacerobot_ros.flight.second_opinion import AGREEMENT_TOLERANCE
@@ -268,7 +271,7 @@ def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
         click.echo(f"engine      {other.engine}, {other.integrator}")
         click.echo(
             f"deviates    {other.position:.2g} m, {other.attitude:.2g} rad, joints "
-            f"{other.joints:.2g} m or rad, most at {other.time:.9g} s of {other.ticks} ticks"
+            f"{other.joints:.2g} m or rad, largest at {other.time:.9g} s of {other.ticks} ticks"
         )
         if not other.agrees:
             fail(f"{other.engine} differs by more than {AGREEMENT_TOLERANCE:g} m or rad.")

@@ -32,7 +32,7 @@ class _CampaignGroup(DefaultGroup):
 def campaign_command() -> None:
     """Fly a scenario many times with dispersed parameters.
 
-    `spacerobot campaign FILE.yaml` is short for `spacerobot campaign fly FILE.yaml`.
+    `spacerobot campaign FILE.yaml` is an abbreviation of `spacerobot campaign fly FILE.yaml`.
     """
 
 
@@ -57,7 +57,7 @@ def campaign_command() -> None:
     "--scheduler",
     default="",
     metavar="tcp://HOST:PORT",
-    help="Address of a dask scheduler whose workers fly the draws.",
+    help="Address of a dask scheduler whose workers execute the flights.",
 )
 @out_option("Folder for the results [out/NAME].")
 @report_option("Report to write [OUT/report.html].")
@@ -66,7 +66,7 @@ def campaign_command() -> None:
     type=PATH,
     nargs=2,
     metavar="A.yaml B.yaml",
-    help="Instead of FILE: fly two designs on the same draws.",
+    help="Fly two campaigns, given instead of FILE, with the same draws.",
 )
 def fly(
     file: Path | None,
@@ -93,12 +93,12 @@ def fly(
         criteria:
           position_error_m: {max: 0.02}
 
-    For --compare, the second file contains the second design, for example with `method:
-    lie_bracket` after the scenario. More are in examples/campaigns.
+    For --compare, the second file describes the second campaign, for example with `method:
+    lie_bracket` below the scenario. More are in examples/campaigns.
 
-    If a campaign was interrupted, it is continued. Exit code 0: all flights were flown; 1: every
-    flight was rejected or failed with an error; 2: bad input; 130: Ctrl-C, finished flights are
-    kept.
+    If a campaign was interrupted, the command continues it. Exit code 0: all flights were flown;
+    1: every flight was rejected or failed with an error; 2: bad input; 130: Ctrl-C, finished
+    flights are kept.
     """
     from spacerobot_ros.campaign.workers import Cluster
 
@@ -130,7 +130,7 @@ def report(folder: Path, report: Path | None) -> None:
 def rerun(folder: Path, number: int, bag: Path | None) -> None:
     """Repeat flight N in DIR, and record a bag.
 
-    Exit code 0: the flight equals the one in the dataset; 1: it differs; 2: bad input.
+    Exit code 0: the flight agrees with the dataset; 1: it differs; 2: bad input.
     """
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.campaign.running import rerun_flight
@@ -141,7 +141,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
         click.echo(line)
     exit_if_terminated()
     if not result.agrees:
-        fail("The flight differs from the one in the dataset.")
+        fail("The flight differs from the recorded flight in the dataset.")
 
 
 def _fly_campaign(

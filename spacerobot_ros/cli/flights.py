@@ -58,7 +58,8 @@ if TYPE_CHECKING:
     flag_value=1.0,
     type=click.FloatRange(min=0.0, min_open=True),
     metavar="[FACTOR]",
-    help="Fly with the nodes on the wall clock, at FACTOR times real time (1 without a number).",
+    help="Fly with the nodes on the wall clock, at FACTOR times real time (1 if FACTOR is "
+    "omitted).",
 )
 @click.option(
     "--longest",
@@ -90,12 +91,12 @@ def run_command(
 ) -> None:
     """Fly a SCENARIO or a ROBOT to its goal, and record a bag.
 
-    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. The flight needs ROS 2
-    only with --nodes or --realtime. In lockstep, the nodes produce the same states and commands.
+    A SCENARIO is a name or a parameter file; a ROBOT is a name or a URDF file. The flight needs ROS
+    2 only with --nodes or --realtime. In lockstep, the nodes produce the same states and commands.
 
     Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
     the flight early: the bag and the summary cover the flight up to that time, and the exit code is
-    128 plus the signal number, 130 after Ctrl-C.
+    128 plus the signal number (130 after Ctrl-C).
     """
     chosen = _changed_scenario(scenario, goal, method, settings, realtime)
     from spacerobot_ros.bag import free_name
@@ -125,13 +126,13 @@ def run_command(
     for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
         click.echo(line)
     if taken and path != usual:
-        click.echo(f"            {usual} is an earlier flight, which is kept")
+        click.echo(f"            {usual} contains an earlier flight and is kept")
     words = ["spacerobot", "report", str(path)]
     if report is None:
         click.echo(f"next        `{shlex.join(words)}` draws this flight")
     elif termination() is not None:
         words += ["--out", str(report)]
-        click.echo(f"report      none of an interrupted flight: `{shlex.join(words)}` makes one")
+        click.echo(f"report      none for an interrupted flight: `{shlex.join(words)}` makes one")
     exit_if_terminated()
     if report is not None:
         _write_report(path, report)
@@ -256,7 +257,7 @@ def _capture_line(summary: dict[str, Any]) -> list[str]:
         nearest, limit = capture["nearest_m"], quantity(capture["distance_limit_m"], "m")
         beyond = f"'capture.distance' is {limit}"
         if nearest <= capture["distance_limit_m"]:
-            beyond = "its angle, speed or rate was beyond the limits of 'capture'"
+            beyond = "its angle, speed or rate exceeded the limits in 'capture'"
         missed += (
             f": its grapple frame came within {quantity(nearest, 'm')} of the end-effector at "
             f"{capture['nearest_time_s']:.6g} s, and {beyond}"
@@ -328,9 +329,9 @@ def up_command(
 ) -> None:
     """Keep the nodes of a SCENARIO or a ROBOT running in real time.
 
-    A SCENARIO is a name or a parameter file, a ROBOT a name or a URDF file. Each node is a process.
-    Send goals on topics or with the command spacerobot goal. Ctrl-C, SIGTERM or SIGHUP ends the
-    nodes.
+    A SCENARIO is a name or a parameter file; a ROBOT is a name or a URDF file. Each node is a
+    process. Send goals on topics or with the command `spacerobot goal`. Ctrl-C, SIGTERM or SIGHUP
+    ends the nodes.
     """
     from spacerobot_ros.scenario import scenario_or_robot
 
@@ -383,10 +384,10 @@ def goal_command(
 ) -> None:
     """Send a goal pose to a running stack, and wait for the result.
 
-    Without X Y Z the base keeps its position; without an attitude, its attitude.
-    With an end-effector goal the base is free, unless its pose is also given. Exit code 0: the
-    goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C ended the command; the stack still
-    pursues the goal.
+    If X Y Z is omitted, the base keeps its position; if no attitude is given, it keeps its
+    attitude. With an end-effector goal, the base is free unless its pose is also given. Exit code
+    0: the goal was reached; 1: it was not; 2: bad input; 130: Ctrl-C ended the command; the stack
+    still pursues the goal.
     """
     hands = end_effector_goals(poses, positions, links, paths)
     turned = rotvec is not None or rpy_deg is not None

@@ -61,16 +61,15 @@ class CommandGroup(click.Group):
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     multiple=True,
     metavar="FILE.py",
-    help="Python file with your own control laws or gait methods, for all commands; nodes load "
-    "such files from SPACEROBOT_PLUGINS. May be repeated.",
+    help="Python file with custom control laws or gait methods, for all commands; nodes load the "
+    "files listed in SPACEROBOT_PLUGINS. May be repeated.",
 )
 @click.option(
     "--xacro-arg",
     "xacro_arguments",
     multiple=True,
     metavar="NAME:=VALUE",
-    help="Argument for xacro files, for all commands; nodes take arguments from "
-    "SPACEROBOT_XACRO_ARGS. "
+    help="Argument for xacro files, for all commands; nodes read them from SPACEROBOT_XACRO_ARGS. "
     "May be repeated.",
 )
 def main(plugins: tuple[Path, ...], xacro_arguments: tuple[str, ...]) -> None:

@@ -80,7 +80,7 @@ def json_option(help: str) -> Any:
 
 
 def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the scenarios and robots that complete a name, for shell completion."""
+    """Return the scenarios and robots whose names begin with a string, for shell completion."""
     from spacerobot_ros.resources import resource_names
     from spacerobot_ros.scenario import scenario_names
 
@@ -89,7 +89,7 @@ def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) ->
 
 
 def complete_setting(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the node parameters that complete a setting, for shell completion."""
+    """Return the node parameters that begin with a string, for shell completion."""
     from spacerobot_ros.parameters import declared
     from spacerobot_ros.scenario import CONFIGS
 
@@ -119,7 +119,9 @@ view_option = click.option(
 
 
 def format_option(formats: Sequence[str], help: str) -> Any:
-    """Return the option ``--format`` as the argument ``format_name``; the first is the default."""
+    """Return the option ``--format`` as the argument ``format_name``; the first format is the
+    default.
+    """
     return click.option(
         "--format",
         "format_name",
@@ -184,12 +186,14 @@ _position_option = click.option(
     nargs=3,
     type=float,
     metavar="X Y Z",
-    help="Goal position (m), as --goal with three numbers.",
+    help="Goal position (m), like --goal with three numbers.",
 )
 
 
 class GoalCommand(click.Command):
-    """A command whose ``--goal`` takes 3 or 7 numbers: click options take a fixed number."""
+    """A command whose ``--goal`` takes 3 or 7 numbers, because click options take a fixed
+    number.
+    """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments, treating ``--goal`` with three numbers as ``--goal-position``."""
@@ -288,8 +292,9 @@ def _read_path(file: Path) -> list[list[float]]:
     found = [row for row in rows if row]
     if not found or len({len(row) for row in found}) > 1:
         raise click.BadParameter(
-            f"The path {file} has lines with {sorted({len(row) for row in found})} numbers; give "
-            "all of them 3 (a position), or all of them 7 (a position and a quaternion)."
+            f"The path {file} has lines with {sorted({len(row) for row in found})} numbers; "
+            f"every line must have 3 numbers (a position), or every line 7 (a position and a "
+            f"quaternion)."
         )
     return found
 
@@ -327,8 +332,8 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
             "links",
             multiple=True,
             metavar="NAME",
-            help="Link of an end-effector goal [end_effector]. May be repeated, in the order "
-            "poses, positions, paths.",
+            help="Link of an end-effector goal [end_effector]. May be repeated: first for poses, "
+            "then for positions, then for paths.",
         ),
         click.option(
             "--end-effector-path",
@@ -422,7 +427,7 @@ LAWS = "spacerobot_ros.control.laws.registry:LAWS"
 def viewer_if_requested(
     view: bool, parameters: Mapping[str, Any], namespace: str = "", settings: Sequence[str] = ()
 ) -> Iterator[Viewer | None]:
-    """Run the viewer next to a command if ``view``; its address is written to standard error.
+    """Run the viewer during a command if ``view``; the viewer address is written to standard error.
 
     Otherwise ``settings``, from ``--set``, must not contain viewer parameters.
     """
@@ -453,7 +458,9 @@ def picture_option(help: str) -> Any:
 
 
 def beside(bag: Path, ending: str) -> Path:
-    """Return a path next to a bag (a file or a folder): its name without suffix, plus an ending."""
+    """Return a path next to a bag (a file or a folder): the bag name without suffix, plus an
+    ending.
+    """
     # The path ``.`` has no name before it is resolved.
     named = bag if bag.name not in ("", "..") else bag.resolve()
     return named.with_name(f"{named.name if bag.is_dir() else named.stem}{ending}")

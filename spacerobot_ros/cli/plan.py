@@ -51,11 +51,13 @@ if TYPE_CHECKING:
     "count",
     type=click.IntRange(min=1),
     metavar="N",
-    help="Plan N random goals instead, and print statistics.",
+    help="Plan for N random goals instead of one goal, and print statistics.",
 )
 @within_option((0.3, 180.0), "With --random: largest")
 @registered_option(
-    "--beside", registries=(METHODS,), help="With --random: also plan the goals with this method."
+    "--beside",
+    registries=(METHODS,),
+    help="With --random: also plan for the goals with this method.",
 )
 def plan_command(
     scenario: str,
@@ -87,7 +89,7 @@ def plan_command(
     for text in settings:
         node, _, _ = parse_setting(text)
         if node not in ("plant", "planner"):
-            raise ParameterError(f"'{text}' sets a parameter of {node}, which plans nothing.")
+            raise ParameterError(f"'{text}' sets a parameter of {node}, which does not plan.")
     chosen = goal.apply_to(scenario_or_robot(scenario).with_settings(settings))
     problem = PlanningProblem.of(chosen)
     method = method or problem.config.method
@@ -210,7 +212,9 @@ def _end_effectors_of(goal: Goal, trial: PlanEvaluation) -> dict[str, Any]:
 
 
 def comparison_lines(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> Iterator[str]:
-    """Yield a table of plans by method; errors that a method does not control are in brackets."""
+    """Yield the lines of a table of plans by method; errors in components that a method does not
+    control are in brackets.
+    """
     yield f"{'method':<14}{'manoeuvre':>12}{'planned in':>12}{'attitude':>14}{'position':>14}"
     yield f"{'':<14}{'s':>12}{'s':>12}{'rad off':>14}{'m off':>14}"
     for name, trial in plans.items():

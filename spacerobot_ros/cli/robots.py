@@ -23,19 +23,23 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.controllability import Controllability
 
 _MAX_LISTED_JOINTS = 12
-"""Maximum number of listed joints; further joints are only counted."""
+"""Maximum number of joints listed; any others are only counted."""
 
 
 _MAX_LISTED_DISTANCES = 3
 
 _MAX_LISTED_INTERVALS = 4
-"""Maximum number of listed distance intervals; beyond it, only number and length are listed."""
+"""Maximum number of distance intervals listed; if there are more, only their number and length are
+listed.
+"""
 
 
 @click.command("analyze")
 @click.argument("robot")
 @click.option(
-    "--shape", metavar="'Q1 Q2 ...'", help="Configuration to analyse, m or rad [the best]."
+    "--shape",
+    metavar="'Q1 Q2 ...'",
+    help="Configuration to analyse, m or rad [the one with the best condition].",
 )
 @click.option(
     "--end-effector",
@@ -253,12 +257,12 @@ def _rotation_lines(found: Analysis) -> list[str]:
         shape = ", ".join(f"{x:.4g}" for x in found.shape)
         lines += [
             f"{'at shape':<13}({shape}): rank {found.at_shape.rank}, condition {at.condition:.3g}",
-            f"{'':<13}singular values ({values}) rad a unit of area, joints {names}",
+            f"{'':<13}singular values ({values}) rad per unit of area, joints {names}",
         ]
         finite = _finite_conditions(found)
         lines.append(
             f"{'shape space':<13}rank 3 at {len(finite)} of {len(found.conditions)} shapes; "
-            f"condition {min(finite):.3g} at best, {median(finite):.3g} the median"
+            f"condition {min(finite):.3g} at best, {median(finite):.3g} in the median"
         )
     return lines
 
@@ -269,7 +273,7 @@ def _position_text(found: Analysis) -> str:
     count = len(sliders_of(found.robot))
     if found.sliding.controllable:
         return f"{count} sliders with independent slots control the base position (paper 1)"
-    return "follows from attitude and shape: the centre of mass rests"
+    return "follows from attitude and shape: the centre of mass is at rest"
 
 
 def _finding_json(found: Controllability) -> dict[str, Any]:
@@ -300,14 +304,14 @@ def _distance_lines(found: Analysis) -> list[str]:
     lines = [f"{pairs} of links may touch"]
     if distances:
         distance = "a distance" if len(distances) == 1 else "distances"
-        lines[0] += f", with {distance} at this shape of"
+        lines[0] += f", with {distance} at this shape:"
     lines += [f"  {d:.3g} m  {pair}" for pair, d in list(distances.items())[:_MAX_LISTED_DISTANCES]]
     if len(distances) > _MAX_LISTED_DISTANCES:
-        lines.append(f"  and more of {len(distances) - _MAX_LISTED_DISTANCES} others")
+        lines.append(f"  and larger distances for {len(distances) - _MAX_LISTED_DISTANCES} others")
     lines += [f"not counted: {pair} ({why})" for pair, why in geometry.ignored_pairs.items()]
     lines += geometry.notes
     if not geometry.exact and distances:
-        lines.append("Distances are bounds, because the package coal is not installed.")
+        lines.append("Distances are lower bounds, because the package coal is not installed.")
     return [f"{'distances' if not i else '':<13}{line}" for i, line in enumerate(lines)]
 
 
@@ -346,7 +350,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     if nearest_inertia:
         text, changes = nearest_inertias(file)
         for link, change in changes.items():
-            click.echo(f"{'inertia':<13}that of link '{link}' is changed by {100 * change:.2g} %")
+            click.echo(f"{'inertia':<13}link '{link}' is changed by {100 * change:.2g} %")
         if changes:
             file = free_name(target.with_name(f"{name}_possible.urdf"))
             write_output(file, text)
@@ -362,7 +366,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     named = from_there if is_path(robot) else robot
     if not model.n:
         write_output(target, thruster_scenario_text(model, named))
-        click.echo(f"It has no joints and uses thrusters. The scenario is {target}:")
+        click.echo(f"The robot has no joints and uses thrusters. The scenario is {target}:")
         click.echo(f"  spacerobot run {shlex.quote(str(target))}")
         return
     missing = [each.link for each in known.geometry.unread_meshes if each.is_collision_shape]

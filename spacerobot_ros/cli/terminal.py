@@ -34,7 +34,9 @@ class ExitCode(IntEnum):
     """The input is invalid, or a required program or package is missing."""
 
     INTERRUPTED = 130
-    """The command was ended by SIGINT (Ctrl-C); for other signals, 128 plus their number."""
+    """The command was ended by SIGINT (Ctrl-C); for other signals, the exit code is 128 plus the
+    signal number.
+    """
 
 
 _ROS_MODULES = ("rclpy", "rosidl_parser", "ament_index_python")
@@ -62,10 +64,11 @@ def exit_if_terminated() -> None:
 
 @contextmanager
 def sentences() -> Iterator[None]:
-    """Convert this package's exceptions into one sentence and an exit code.
+    """Convert exceptions from this package into a one-sentence message and an exit code.
 
-    An unreachable goal is not bad input; all other rejections are. A signal ends the command with
-    one line and exit code 128 plus its number, even if a library has replaced its exception.
+    An unreachable goal does not count as invalid input; all other rejections do. A signal ends the
+    command with one line and exit code 128 plus the signal number, even if a library has replaced
+    the exception.
     """
     try:
         with guarded():
@@ -105,16 +108,16 @@ _PERIOD, _PERIOD_WITHOUT_TERMINAL = 1.0, 10.0
 class Display:
     """A progress line for long work: the task, its duration, and the best result so far.
 
-    On a terminal each line replaces the previous line. Searches report from other threads and may
-    be silent for a long time, so a thread writes the line.
+    On a terminal, each line replaces the previous line. Searches report from other threads and may
+    be silent for a long time, so a separate thread writes the line.
 
     Parameters
     ----------
     label
         Name of the scenario or robot.
     period
-        Wall time between two lines, and before the first, s; None: one second, or ten if standard
-        error is not a terminal.
+        Wall time before the first line and between lines, s; None: 1 s, or 10 s if standard error
+        is not a terminal.
     """
 
     def __init__(self, label: str, period: float | None = None) -> None:
@@ -133,7 +136,7 @@ class Display:
             self._work, self._course = "planning", f": {progress.message}"
 
     def fly(self, now: float, end: float) -> None:
-        """Show simulated time relative to the schedule end, s; 0: unknown."""
+        """Show the simulated time and the end of the schedule in s; 0: unknown."""
         if end > 0.0 or now > 0.0:
             of_end = f" of {end:.1f}" if end > 0.0 else ""
             self._work, self._course = "flying", f": {now:.1f}{of_end} s"
@@ -145,7 +148,7 @@ class Display:
                 click.echo(f"{_CLEAR}{message}", err=True)
 
     def close(self) -> None:
-        """End the progress output; on a terminal the last line is cleared."""
+        """End the progress output; on a terminal, the last line is cleared."""
         self._ended.set()
         self._thread.join()
 
@@ -170,7 +173,7 @@ _CLEAR = "\r\x1b[K"
 
 @contextmanager
 def display(label: str) -> Iterator[Display]:
-    """Show the progress of long work during a block."""
+    """Show the progress of long work within a ``with`` block."""
     from spacerobot_ros.planning.core.progress import report_progress
 
     shown = Display(label)

@@ -1,4 +1,4 @@
-"""Distances between two solids: exact from coal, or bounds from the rounded boxes around them.
+"""Distances between two solids: exact values from coal, or bounds from rounded boxes around them.
 
 J. Pan, S. Chitta, D. Manocha, "FCL: a general purpose library for collision and proximity queries",
 ICRA, 2012; coal is its successor.
@@ -70,10 +70,10 @@ def _coal() -> Any:
 
 
 class ExactDistances:
-    """Exact distances of shapes and of the convex hulls of meshes, by coal.
+    """Exact distances between shapes and convex mesh hulls, computed by coal.
 
-    Two solids are given by index, with attitudes (N, 3, 3) and positions (N, 3), m, of their links
-    in a common frame. Negative distances are penetration depths.
+    Two solids are given by index, and their link poses by attitudes (N, 3, 3) and positions (N, 3),
+    m, in a common frame. Negative distances are penetration depths.
     """
 
     exact = True
@@ -116,11 +116,12 @@ class ExactDistances:
     def planes(
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
     ) -> tuple[Array, Array]:
-        """Return the distances (N,), m, and planes and points (N, 7) between the solids.
+        """Return the distances (N,) between the solids, m, with planes and points (N, 7).
 
-        A plane touches the first solid at its point nearest to the second. It is given by a unit
-        normal (3,) toward the second solid and the distance from the origin, m, in the first link
-        frame. The point (3,) is the nearest point on the second solid in its link frame, m.
+        A plane touches the first solid at its point nearest to the second. The plane is given by
+        its unit normal (3,) toward the second solid and its distance from the origin, m, in the
+        first link frame. The point (3,) is the nearest point on the second solid in its link frame,
+        m.
         """
         (_, R_a, r_a), (_, R_b, r_b) = self._geometries[first], self._geometries[second]
         distances, planes = np.empty(len(R_1)), np.empty((len(R_1), 7))
@@ -156,7 +157,7 @@ class ExactDistances:
 
 
 class EnclosureDistances:
-    """Lower bounds of distances: those of the rounded boxes around the solids.
+    """Lower bounds on distances: the distances between the rounded boxes around the solids.
 
     Arguments and results are those of :class:`ExactDistances`.
     """

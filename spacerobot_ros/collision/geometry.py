@@ -4,7 +4,7 @@ A link uses the shapes of its ``<collision>`` elements or, if it has none, of it
 elements. Meshes, closed or open, are replaced by their convex hulls.
 
 A pair is omitted if its solids belong to one body or to neighbouring bodies, if an SRDF disables
-it, or if it is in contact in all of 1000 random configurations, which is a modelling artefact.
+it, or if its solids touch in all of 1000 random configurations (a modelling artefact).
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from spacerobot_ros.model.rotations import matrices_from_quaternions
 from spacerobot_ros.model.visuals import Visual, solid_mesh
 
 _SHAPES, _SEED = 1000, 0
-"""Number of random configurations used to find pairs always in contact, and their seed."""
+"""Number and seed of the random configurations used to find pairs that are always in contact."""
 
 
 _COAXIAL_TOLERANCE = 1e-9
 """Largest offset (m) and tilt (rad) of a body of revolution from its joint axis."""
 
 _UNKNOWN_BASE_DISTANCE = 1e9
-"""Distance to obstacles if the base pose is unknown, m: obstacles are ignored."""
+"""Distance to obstacles if the base pose is unknown, m; large, so that obstacles are ignored."""
 
 
 class LinkPair(NamedTuple):
@@ -60,12 +60,12 @@ class LinkPair(NamedTuple):
 
     @property
     def subject(self) -> str:
-        """Both names, as the lower-case subject of a sentence."""
+        """Both names, worded as the subject of a sentence, in lower case."""
         return f"links {self}"
 
 
 class ObstaclePair(LinkPair):
-    """Names of a link and an obstacle, which is a link of the world."""
+    """Names of a robot link and an obstacle (a link of the world)."""
 
     __slots__ = ()
 
@@ -86,8 +86,8 @@ class BasePoses(NamedTuple):
         return BasePoses(self.position[rows], self.quaternion[rows])
 
     def between(self, before: npt.NDArray[np.int64], share: Array) -> BasePoses:
-        """Return poses (K,) interpolated by ``share`` (K, 1) between ``before`` (K,) and the next
-        poses."""
+        """Return poses (K,) at fractions ``share`` (K, 1) of the way from the poses ``before`` to
+        the next poses."""
         r, x = self
         position = (1 - share) * r[before] + share * r[before + 1]
         next_ = (
@@ -105,7 +105,7 @@ class BasePoses(NamedTuple):
 
 @dataclass(frozen=True)
 class UnreadMesh:
-    """A mesh that cannot be read, so some contacts of its link are not detected.
+    """An unreadable mesh: some contacts of its link are not detected.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class UnreadMesh:
 
     @property
     def note(self) -> str:
-        """A warning for the user, one sentence."""
+        """A one-sentence warning for the user."""
         return f"Some contacts of link '{self.link}' are not detected: {self.reason}"
 
 
@@ -140,7 +140,7 @@ class CollisionGeometry:
     robot
         The robot, with its world.
     mesh_of
-        Returns the triangles of a visual of kind ``mesh`` in its link frame; if it raises a
+        Returns the triangles of a ``mesh`` visual in its link frame; if this raises a
         :class:`.MeshError`, the mesh is omitted.
     obstacles_alone
         Whether to omit pairs of two robot links.
@@ -279,9 +279,9 @@ class CollisionGeometry:
     def planes(self, pair: int, poses: Poses) -> tuple[Array, Array]:
         """Return the distances (N,) of a pair, m, with planes and points (N, 7).
 
-        Planes are in the first link frame, points in the second one
-        (:meth:`.ExactDistances.planes`). For a link and an obstacle, planes belong to the
-        obstacle and are in W.
+        Planes are in the first link frame, points in the second link frame
+        (:meth:`.ExactDistances.planes`). For a link and an obstacle, planes belong to the obstacle
+        and are in W.
         """
         R, r = poses
         i, j = self.pairs[pair]
@@ -291,7 +291,8 @@ class CollisionGeometry:
         return self.distance_function.planes(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
     def nearest(self, shape: Array) -> tuple[float, int] | None:
-        """Return the smallest distance in a configuration (n,), m, and its pair; None: no pairs."""
+        """Return the smallest distance in a configuration (n,), m, and the pair with this distance;
+        None: no pairs."""
         if not len(self.pairs):
             return None
         distances, pairs = self.nearest_along(shape[np.newaxis])
@@ -302,9 +303,9 @@ class CollisionGeometry:
     ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the smallest distances (N,) for configurations (N, n), m, and their pairs (N,).
 
-        Distances are those beyond ``required``, (P,) distances of the pairs, of which minus
-        infinity ignores one. They are infinite if there are no pairs; obstacles are ignored without
-        poses of the base.
+        ``required`` (P,), m, is subtracted from the distances of the pairs; a pair with minus
+        infinity is ignored. The results are infinite if there are no pairs; without base poses,
+        obstacles are ignored.
         """
         return self.nearest_at(self.poses(shapes, base), required)
 
@@ -398,8 +399,8 @@ class CollisionGeometry:
         ``reaches`` (P, m) is the largest distance of any point of the pair from each moving joint
         between the two solids, over all configurations (N, n). It is zero for other joints,
         and for joints that rotate a body of revolution, such as a reaction wheel, about its axis.
-        Also return the largest distances (P,) from the base for pairs with obstacles, zero for
-        other pairs.
+        Also return, for pairs with obstacles, the largest distances (P,) from the base (zero for
+        other pairs).
         """
         bodies = self.robot.bodies
         travel = np.abs(self.moving_positions(shapes)).max(axis=0)
@@ -481,7 +482,7 @@ def solids_of(
         names = ", ".join(f"'{name}'" for name in drawn[:3]) + ", ..." * (len(drawn) > 3)
         notes.append(f"Links without <collision> use the shapes of their <visual>: {names}.")
     elif drawn:
-        notes.append("No link has a <collision>: distances are those of the <visual> shapes.")
+        notes.append("No link has a <collision>: distances are computed from the <visual> shapes.")
     for link in robot.links:
         body = robot.frames[link.name][0]
         for shape in link.collisions or link.shapes:

@@ -2,9 +2,9 @@
 
 While a command is held, two solids move relative to each other by at most v per tick
 (``CollisionGeometry.largest_lever_arms``). So their distance during the tick is at least
-``(d_0 + d_1 - v) / 2``, where d_0 and d_1 are the distances at its ends. Ticks for which this bound
-is below the clearance are bisected until v is small. For obstacles, the base motion also matters:
-within a tick, it is along a straight line and about one axis.
+``(d_0 + d_1 - v) / 2``, where d_0 and d_1 are the distances at the ends of the tick. Ticks for
+which this bound is below the clearance are bisected until v is small. For obstacles, the base
+motion also matters: within a tick, the base moves along a straight line and rotates about one axis.
 """
 
 from __future__ import annotations
@@ -113,14 +113,14 @@ def nearest_approaches(
     required: Array,
     base: BasePoses | None = None,
 ) -> list[Approach]:
-    """Return the nearest approaches of all pairs that come nearer than required, nearest first.
+    """Return the nearest approaches of all pairs that come closer than allowed, nearest first.
 
     Parameters
     ----------
     geometry
         The solids and pairs.
     positions
-        (N + 1, n) configurations at the ticks, with straight lines in between; m or rad.
+        (N + 1, n) configurations at the ticks, interpolated linearly in between, m or rad.
     required
         (P,) smallest allowed distances of the pairs, m; minus infinity: any distance.
     base
@@ -139,7 +139,7 @@ def nearest_approach(
 ) -> Approach | None:
     """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
 
-    ``base`` has the base poses at the ticks; None: obstacles are ignored.
+    ``base`` contains the base poses at the ticks; None: obstacles are ignored.
     """
     if not len(geometry.pairs):
         return None

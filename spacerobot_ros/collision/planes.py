@@ -1,10 +1,10 @@
 """Pair distances as smooth functions of the configuration for a solver, from separating planes.
 
-For two convex solids at given poses, a plane touches the first one at its point nearest to the
-second, and moves with the first. The distance of the second solid's nearest point from this plane
-equals the distance between the solids (or minus the penetration depth) at these poses and, to first
-order, near them. It is exact and cheap. The planes are recomputed along every path found by a
-solver.
+For two convex solids at given poses, a plane touches the first solid at its point nearest to the
+second solid, and moves with the first solid. The distance of the second solid's nearest point from
+this plane equals the distance between the solids (or minus the penetration depth) at these poses
+and, to first order, near them. This distance is cheap to compute. The planes are recomputed for
+every path that a solver finds.
 
 Distances between links depend only on the configuration q. The distance of a link from an obstacle
 also depends on the rotation X of the base since the start: without external force, the system's
@@ -38,8 +38,8 @@ class PlaneDistance:
 
     ``w`` (7,) is the unit normal (3,) of the plane and its distance from the origin, m, in the
     first link frame, and the point (3,), m, in the second link frame. For an
-    obstacle, the plane is in the centre-of-mass frame with the initial base attitude, and the point
-    in the link frame.
+    obstacle, the plane is given in the centre-of-mass frame with the initial base attitude, and the
+    point in the link frame.
 
     Attributes
     ----------
@@ -85,7 +85,8 @@ class PlaneDistance:
 
 
 _EDGE_ROUNDING = 0.03
-"""Smoothing of projection corners, m; makes the distance slightly smaller."""
+"""Length, m, over which projection corners are smoothed; smoothing makes the distance slightly
+smaller."""
 
 
 def support_distance(
@@ -93,11 +94,11 @@ def support_distance(
 ) -> ca.Function:
     """Return ``(y, plane) -> d``, m: the distance of the entire second solid from a plane.
 
-    The plane is that of :class:`PlaneDistance`, whose point is not used, and ``y = q``. For an
-    obstacle the plane is in W, and ``y = [q; X; r]`` (n + 7) has the rotation of the base and the
-    position of the centre of mass. The solid
-    is its rounded box, whose extent along the normal is ``sum h_i |n e_i| + radius``. So the
-    distance is valid for any rotation, and is smaller than that of a shape within the box.
+    The plane is given as in :class:`PlaneDistance`, the point is not used, and ``y = q``. For an
+    obstacle the plane is in W, and ``y = [q; X; r]`` (n + 7) contains the rotation of the base and
+    the position of the centre of mass. The solid is represented by its rounded box, whose extent
+    along the normal is ``sum h_i |n e_i| + radius``. So the distance is valid for any rotation, and
+    underestimates the distance of the shape in the box.
     """
     robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
     n = len(robot.joint_names)

@@ -1,10 +1,10 @@
 """Rounded boxes, which enclose the solids of a robot, and bounds on the distances between them.
 
-A rounded box is the set of all points within a radius of a box, its core. The core of a sphere is a
-point, that of a capsule a line: so one formula bounds all distances. The gap between the
+A rounded box is the set of all points within a radius of a box, its core. The core is a point for a
+sphere and a line for a capsule, so one formula bounds all distances. The gap between the
 projections of two convex bodies onto any direction is at most their distance, and equal to it along
-the line between their nearest points. The nearest points come from alternating projections; if
-cores overlap, the directions of the separating axis theorem give the depth.
+the line between their nearest points. The nearest points are found by alternating projections; if
+cores overlap, the depth is found along the axes of the separating axis theorem.
 
 S. Gottschalk, M. Lin, D. Manocha, "OBBTree: a hierarchical structure for rapid interference
 detection", SIGGRAPH, 1996. W. Cheney, A. Goldstein, "Proximity maps for convex sets", Proceedings
@@ -47,7 +47,7 @@ class RoundedBox:
 
     @property
     def bounding_radius(self) -> float:
-        """Radius of the bounding sphere about the centre, m."""
+        """Radius of the bounding sphere around the centre of the box, m."""
         return float(np.linalg.norm(self.half)) + self.radius
 
     @property
@@ -112,7 +112,7 @@ def separation(
     first, second
         The rounded boxes, in their link frames.
     R_1, r_1, R_2, r_2
-        Poses of these link frames in a common frame: (N, 3, 3), and (N, 3) in m.
+        Poses of these link frames in a common frame: attitudes (N, 3, 3), and positions (N, 3), m.
     """
     return _widest_gaps(first, R_1, r_1, second, R_2, r_2)[0]
 
@@ -120,12 +120,12 @@ def separation(
 def separating_planes(
     first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
 ) -> tuple[Array, Array]:
-    """Return the bounds from :func:`separation`, with the planes and points (N, 7) that attain
-    them.
+    """Return the bounds from :func:`separation`, with the planes and points (N, 7) for which they
+    are attained.
 
-    A plane touches the first box. It is given by a unit normal toward the second box and the
-    distance from the origin, m, in the first link frame. The point is the one on the second box
-    nearest to the plane, in its link frame, m. Parameters are as in :func:`separation`.
+    A plane touches the first box. The plane is given by its unit normal toward the second box and
+    its distance from the origin, m, in the first link frame. The point, in the second link frame,
+    m, is where the second box is nearest to the plane. Parameters are as in :func:`separation`.
     """
     bounds, directions = _widest_gaps(first, R_1, r_1, second, R_2, r_2)
     on_first = _support(first, R_1, directions)
@@ -158,7 +158,8 @@ def _widest_gaps(
     axes = np.concatenate([A, B, edges], axis=2)
 
     def gaps(directions: Array) -> Array:
-        """Return the gaps (N, k) between the projections onto unit vectors (N, 3, k)."""
+        """Return the gaps (N, k) between the projections of the boxes onto unit vectors (N, 3,
+        k)."""
         apart = np.abs(np.einsum("na,nak->nk", between, directions))
         for R, half in ((A, first.half), (B, second.half)):
             apart = apart - np.einsum("a,nak->nk", half, np.abs(np.swapaxes(R, 1, 2) @ directions))

@@ -1,1 +1,1 @@
-"""Commanders without ROS: a planner or a controller that commands a plant state by state."""
+"""Commanders without ROS: planners and controllers that command a plant state by state."""

@@ -1,8 +1,8 @@
-"""Commanders without ROS: a planner or a controller that commands a plant state by state.
+"""Commanders without ROS: planners and controllers that command a plant state by state.
 
-A commander receives messages as they arrive (goals, odom, joints, plant status) and calls its
-:class:`CommanderHost` in order, with statuses, events, log lines and commands. Nodes are
-hosts that convert messages; the loop without ROS is a host that passes arrays.
+A commander receives messages as they arrive (goals, odom, joints, plant status) and passes
+statuses, events, log lines and commands to its :class:`CommanderHost`, in order. Nodes are hosts
+that convert messages; the loop without ROS is a host that passes arrays.
 """
 
 from __future__ import annotations
@@ -73,13 +73,14 @@ _FAULT_LOG_PERIOD = 5.0  # wall s, of one kind of faulty message
 class Commander(ABC):
     """Base class of the commanders: planner and controller.
 
-    A commander sends commands while it is active and knows the robot and the plant's rate, and only
-    for states at the plant's current time (:class:`StampFilter`). Commands follow the plant's rate
-    regardless of the configured rate. Goals received before the robot description wait for it. All
-    goals are aborted if the plant reports that it ignores commands (:class:`PlantListener`).
+    A commander sends commands only while it is active and the robot and the plant's rate are known,
+    and only for states at the plant's current time (:class:`StampFilter`). Commands follow the
+    plant's rate regardless of the configured rate. Goals received before the robot description wait
+    for it. All goals are aborted if the plant reports that it ignores commands
+    (:class:`PlantListener`).
 
-    ``goal_keys`` are the parts of the robot that goals may be for; ``pose_required``: a state waits
-    for its odom; ``clock`` returns the wall time, s.
+    ``goal_keys``: the parts of the robot for which goals are accepted; ``pose_required``: whether a
+    state waits for its odom message; ``clock`` returns the wall time, s.
     """
 
     executive: ControlExecutive | Executive | None = None
@@ -115,7 +116,7 @@ class Commander(ABC):
         self._obstacles: str | None = None
         """The URDF on the topic obstacles; None: the robot's own obstacles apply."""
         self._world: RobotDescription | None = None
-        """The obstacles in this URDF."""
+        """The obstacles described by that URDF."""
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
@@ -123,9 +124,10 @@ class Commander(ABC):
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
         self.inputs = InputWatch(self.states, self.plant, host.has_publisher, clock)
         self._reported_missing = self._reported_waiting = ""
-        """The missing topics in the last status, as a clause, and the waiting goal; empty: none."""
+        """The missing topics in the last status, as a clause, and the goal that waits; empty:
+        none."""
         self._last_status: Status | None = None
-        """The last status that reported nothing missing."""
+        """The last status that reported no missing messages."""
         self._ignored_reported, self._next_report = 0, 0.0
         self._fault_log_times: dict[str, float] = {}
         """Wall time of the last log line by kind of fault, s."""
@@ -168,15 +170,15 @@ class Commander(ABC):
         if given and abs(rate - given) > _EQUAL_RATES * given:
             self.host.log(
                 "warning",
-                f"Parameter 'tick_rate' is {given:g} Hz, but the plant has {rate:g} Hz: commands "
-                f"follow the plant. Set it to {rate:g}, or omit it.",
+                f"Parameter 'tick_rate' is {given:g} Hz, but the plant runs at {rate:g} Hz: "
+                f"commands follow the plant. Set it to {rate:g}, or omit it.",
             )
         if self.robot is not None and self.executive is not None:
             self._change_rate(self.robot)
         self.answer_latest()
 
     def drop_robot(self, why: str) -> None:
-        """Drop the goals and the robot; later goals wait for another robot."""
+        """Discard the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
             self.give_up_goals(PlantStopped(why))
             self._reset_executive()
@@ -199,7 +201,8 @@ class Commander(ABC):
         self.answer()
 
     def deactivate(self, failure: str = "") -> None:
-        """Drop the goals and stop commanding, after a failure or not; keep the goal file."""
+        """Discard the goals and stop commanding, but keep the goal file; ``failure`` is
+        reported."""
         why = f"Aborted: {failure or 'this node was deactivated.'}"
         if self.config.resume_file:
             why += " A goal from a topic is resumed when the node is activated again."
@@ -223,7 +226,7 @@ class Commander(ABC):
         Parameters
         ----------
         key
-            Link for which the goal is.
+            Link to which the goal applies.
         sec, nanosec
             Stamp of the goal's header, which identifies the goal.
         read
@@ -249,7 +252,7 @@ class Commander(ABC):
     def receive_fly_to(self, goal_id: str, read: Callable[[], FlyTo], client: FlyToClient) -> None:
         """Accept or reject an action goal; the client receives feedback and a result.
 
-        ``read`` returns the goal, or raises PlanningError with the message of the refusal.
+        ``read`` returns the goal, or raises PlanningError with the reason.
         """
         try:
             self._require_free()
@@ -271,7 +274,7 @@ class Commander(ABC):
         self._abort_fly_to()
 
     def abort(self, why: str = "on request") -> str | None:
-        """Abort all goals; return a message for the client, or None without a goal."""
+        """Abort all goals; return a message for the client, or None if there is no goal."""
         if self._waiting_goals:
             message = f"Aborted {why}, before the robot was known."
             self._abort_waiting(message)
@@ -393,12 +396,13 @@ class Commander(ABC):
     # -- states -------------------------------------------------------------------------------
 
     def receive_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Process a received odom; defer it if its stamp is not current."""
+        """Process a received odom message; defer it if its stamp is not current."""
         if self.stamps.accepts_odom(stamp_ns, odom):
             self.take_odom(stamp_ns, odom)
 
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Process received joints; defer them if their stamp is not current, and skip late ones."""
+        """Process received joint states; defer them if their stamp is not current, and skip late
+        joint states."""
         odoms, waiting = self.host.waiting_states()
         self._take_states(odoms, [Stamped(stamp_ns, joints), *waiting])
         if self._fly_to:
@@ -406,22 +410,23 @@ class Commander(ABC):
         self.inputs.note_state()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Process an odom with the current time, and handle its state if complete."""
+        """Process an odom message with the current time, and handle its state if the state is
+        complete."""
         if self.states.put_odom(stamp_ns, odom):
             # One alone is a plant that was reset or restarted, whose status comes later.
             since = (stamp_ns - self._contradicted_ns) / SECOND
             if 0.0 < since <= max(_LONGEST_REPETITION, 2 * self.config.control_period):
                 self._log_fault(
                     "contradiction",
-                    "odom: two messages with one stamp differ; more than one node publishes it, "
-                    "and such poses are ignored.",
+                    "odom: two messages with the same stamp differ; more than one node publishes "
+                    "odom, and the poses in such messages are ignored.",
                 )
             self._contradicted_ns = stamp_ns
         if self._awaits_odom():
             self.answer()
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Process joints with the current time, and handle their state if complete."""
+        """Process joint states with the current time, and handle the state if it is complete."""
         self.states.put_joints(stamp_ns, joints)
         if not self.config.tick_rate:
             self._follow_rate()
@@ -556,7 +561,7 @@ class Commander(ABC):
                 self._change_masses(self.robot)
 
     def receive_obstacles(self, text: str) -> None:
-        """Plan around the obstacles of a URDF text from now on, if it is valid; empty: none."""
+        """Plan around the obstacles in a URDF string from now on, if valid; empty: no obstacles."""
         if text == self._obstacles:
             return
         try:
@@ -583,7 +588,7 @@ class Commander(ABC):
             return robot
 
     def give_up_goals(self, stopped: PlantStopped) -> None:
-        """Give up the goals, because the plant does not obey or is silent."""
+        """Give up the goals, because the plant ignores commands or is silent."""
         if stopped.commanded_until_ns is None:
             self._goal_file.delete()
         if self.executive is not None:
@@ -613,7 +618,7 @@ class Commander(ABC):
         """Have the executive command a robot of the same joints and other masses."""
 
     def reconfigure(self, config: Any) -> None:
-        """Set the live parameters from another configuration."""
+        """Set the parameters that may change at run time from another configuration."""
         adapted = self._adapted(config)
         self._given, self.config = config, adapted
         if self.executive is not None:
@@ -655,7 +660,7 @@ class Commander(ABC):
         """Give a goal to the executive."""
 
     def answer(self) -> None:
-        """Handle a ready state once, if the commander is active and knows the rate."""
+        """Handle a ready state once, if the commander is active and the rate is known."""
         if self.executive is not None and self.active and self.config.tick_rate > 0:
             pairing = self.states.take_ready()
             if pairing is not None:

@@ -50,14 +50,14 @@ class _ReferenceWait:
     waited: float = 0.0
     """Wall time for which states have waited, s."""
     silent: bool = False
-    """Whether states no longer wait for it."""
+    """Whether states no longer wait for the topic."""
 
 
 class ControllerCommander(Commander):
     """Commands a wrench and joint efforts for every state (:class:`ControlExecutive`).
 
-    ``effort`` (n,), N m or N, and ``wrench`` (6,), N and N m in the base frame, are the last
-    command's values.
+    ``effort`` (n,), N m or N, and ``wrench`` (6,), N and N m in the base frame, are the values of
+    the last command.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class ControllerCommander(Commander):
         return ControllerStatus(ControllerState(state), message, goal_id)
 
     def activate(self) -> None:
-        """Start handling states, each with the references that have a publisher."""
+        """Start handling states; each state waits for the references that have a publisher."""
         for topic in (JOINT_REFERENCE, BASE_REFERENCE):
             self.states.require(topic, required=self.host.has_publisher(topic))
             self._references[topic] = _ReferenceWait()
@@ -124,7 +124,8 @@ class ControllerCommander(Commander):
             raise CommandError(self.plant.refusal_of_goals)
         if task is Task.APPROACH and self._target is None:
             raise CommandError(
-                "There is no target to approach: 'target/robot_description' has no message."
+                "There is no target to approach: no message has arrived on "
+                "'target/robot_description'."
             )
         executive.request(task)
         return f"The task '{task.value}' has started; controller/status reports its progress."
@@ -142,7 +143,7 @@ class ControllerCommander(Commander):
             self.executive.servicing.target.describe(target, frame)
 
     def receive_target(self, stamp_ns: int, message: Any) -> None:
-        """Store target odometry; the next state reads it if a task needs it.
+        """Store target odometry; it is used at the next state if a task needs it.
 
         States do not wait for it: the motion since the last odometry is predicted.
         """
@@ -161,8 +162,8 @@ class ControllerCommander(Commander):
         self.answer()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Process odom with the current time, after handling a state whose reference never
-        arrived."""
+        """Process an odom message with the current time, after handling any state whose reference
+        never arrived."""
         missing = self.states.missing
         if missing and self.active and self.executive is not None:
             pairing = self.states.take_overdue()
@@ -218,7 +219,8 @@ class ControllerCommander(Commander):
         super()._publish_status(status)
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Process joints with the current time, after handling a state whose odom never arrived."""
+        """Process joint states with the current time, after handling any state whose odom message
+        never arrived."""
         overdue = None
         if self.active and self.executive is not None and not self._waits_for_first_pose():
             overdue = self.states.take_overdue()

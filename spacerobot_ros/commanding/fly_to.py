@@ -60,7 +60,7 @@ class FlyTo:
             if not 0 <= value < math.inf:
                 raise PlanningError(
                     f"The {name} of the goal is {value:g} {unit}: give a finite number above 0, or "
-                    "0 for the parameter's."
+                    "0 for the parameter value."
                 )
         return cls(goal, tolerance, time_limit)
 
@@ -115,7 +115,7 @@ class GoalErrors:
         )
 
     def reported_by(self, status: Status) -> GoalErrors:
-        """Return the errors, replaced by those reported in a status."""
+        """Return the errors, updated with the errors reported in a status."""
         if not isinstance(status, PlannerStatus):
             return self
         reported = {
@@ -210,7 +210,7 @@ class FlyToGoals:
     Parameters
     ----------
     errors
-        Returns the last measured state's errors relative to a goal.
+        Returns the errors of the last measured state relative to a goal.
     report_aborted
         Publishes the abort of a goal (id, message), and returns this status.
     """
@@ -256,9 +256,9 @@ class FlyToGoals:
     def abort_reason(self, waiting: Collection[str]) -> str:
         """Return the reason to abort all goals now; empty: no abort.
 
-        An abort ends every goal. If a goal is about to be replaced, its abort therefore waits until
-        it is replaced or the later goal is rejected: as long as ``waiting`` has the id of another
-        goal.
+        An abort ends every goal. So if a goal is about to be replaced, its abort waits until the
+        goal is replaced or the later goal is rejected: as long as ``waiting`` contains another goal
+        id.
         """
         for goal_id, served in self._served.items():
             alone = self._accepted[-1:] == [goal_id] or set(waiting) <= {goal_id}
@@ -270,7 +270,8 @@ class FlyToGoals:
     def advance(self, now_ns: int, progress: Callable[[str, Goal, int], Progress]) -> None:
         """Check the time limits at a state, and send feedback to the clients.
 
-        ``progress`` returns the progress of a goal from its id, the goal, and its start stamp.
+        ``progress`` returns the progress of a goal, given the goal id, the goal, and the start
+        stamp.
         """
         for goal_id, served in self._served.items():
             if served.request is None or served.client is None:
@@ -291,7 +292,7 @@ class FlyToGoals:
                 )
 
     def update(self, status: Status) -> None:
-        """End the goal completed by a status, if a client waits for it."""
+        """End the goal completed by a status, if a client waits for its result."""
         if status.state.value == "refused" and status.goal_id in self._accepted:
             self._accepted.remove(status.goal_id)
         if status.state.decided:

@@ -1,4 +1,4 @@
-"""Commander statuses: their topics, and tracking the statuses of one goal."""
+"""Commander statuses: the topics of the statuses, and tracking of the statuses of one goal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class GoalFollower:
         self.gait: PlannerStatus | None = None
         """The planner's status at the start of its first schedule for the goal."""
         self.decision: Status | None = None
-        """The goal's final status; None while it is pursued."""
+        """The goal's final status; None while the goal is pursued."""
 
     def is_about_goal(self, status: Status) -> bool:
         """Whether a status refers to the goal."""
@@ -55,6 +55,6 @@ class GoalFollower:
 
 
 def decision_event(status: Status) -> Event:
-    """Return the event of a status that decides a goal."""
+    """Return the event for a status that decides a goal."""
     kind = EventKind(f"goal_{status.state.value}")
     return Event(kind, status.message, status.state.level, goal_id=status.goal_id)

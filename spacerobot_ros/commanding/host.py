@@ -1,4 +1,4 @@
-"""The surroundings of a commander: its host, and the decoder of the states that it receives."""
+"""Interfaces that a commander uses: its host, and the decoder of the received states."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CommanderHost(Protocol):
     """The host of a commander: a node, a loop without ROS, or a test."""
 
     def send_command(self, stamp_ns: int) -> None:
-        """Send the commander's current values as the command for the state with a stamp."""
+        """Send the commander's current values as the command for the state with this stamp."""
 
     def publish_status(self, status: Any) -> None:
         """Publish a status of the goal."""
@@ -39,7 +39,8 @@ class CommanderHost(Protocol):
         """Publish the start of a schedule; only planners have schedules."""
 
     def publish_path(self, path: BasePath, stamp_ns: int) -> None:
-        """Publish the path of a planned reference that starts; only controllers have references."""
+        """Publish the path of a planned reference when the reference starts; only controllers have
+        references."""
 
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line into the log."""
@@ -48,11 +49,12 @@ class CommanderHost(Protocol):
         """Whether a publisher of odom, or of a reference, is connected."""
 
     def waiting_states(self) -> tuple[Sequence[Stamped], Sequence[Stamped]]:
-        """Return received odoms and joints that the commander has not processed yet."""
+        """Return received odom messages and joint states that the commander has not processed
+        yet."""
 
 
 class StateDecoder(Protocol):
-    """Reads the messages for one robot, which are opaque to a commander."""
+    """Decodes the messages for one robot; the messages are opaque to a commander."""
 
     q: Array
     """Latest accepted joint positions (n,), m or rad."""
@@ -63,13 +65,15 @@ class StateDecoder(Protocol):
         """Raise CommandError if the joint states are from another robot."""
 
     def decode_joints(self, joints: Any) -> int:
-        """Read joints into ``q`` and ``qdot``; return their stamp, ns, or raise CommandError."""
+        """Read joint states into ``q`` and ``qdot``; return their stamp, ns, or raise
+        CommandError."""
 
     def decode_base(self, odom: Any) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) from an odom or base reference, or raise CommandError."""
+        """Return pose (7,) and twist (6,) from an odom message or a base reference, or raise
+        CommandError."""
 
     def target(self, odom: Any) -> tuple[Array, Array]:
-        """Return pose (7,) and twist (6,) from a target odom, or raise CommandError."""
+        """Return pose (7,) and twist (6,) from a target odom message, or raise CommandError."""
 
     def joint_reference(self, message: Any) -> tuple[Array, Array]:
         """Return positions and rates (n,) from a joint reference, or raise CommandError."""

@@ -106,7 +106,7 @@ class PlannerCommander(Commander):
         return PlanningWorker(robot, self.config, method, self._on_long_work, described)
 
     def end_schedule(self, end: TrajectoryEnd) -> None:
-        """End the current schedule, because its controller has ended it."""
+        """End the current schedule, because the controller that executes it has ended it."""
         if self.executive is not None:
             self.executive.schedule_ended(end.message, final=end.final)
 
@@ -158,15 +158,15 @@ class PlannerCommander(Commander):
         super()._accept_goal(BASE_GOAL_KEY, goal)
 
     def receive_twist(self, link: str, frame: str, linear: Array, angular: Array) -> None:
-        """Make a link follow a twist until twists stop; if this is impossible, the reason is
-        logged.
+        """Make a link follow a twist until no more twists arrive; if this is impossible, the reason
+        is logged.
 
         Parameters
         ----------
         link
             Name of the link.
         frame
-            Frame of both velocities: world, base, or the link itself.
+            Frame of the velocity and the angular velocity: world, base, or the link itself.
         linear, angular
             (3,) velocity of the link's origin, m/s, and angular velocity, rad/s.
         """
@@ -210,7 +210,7 @@ class PlannerCommander(Commander):
         """Report disturbances that a schedule does not know; a controller holds against them."""
         if lines and self._status is not None and self.config.output != "reference":
             message = (
-                "The plan assumes constant momenta, which a disturbance changes: "
+                "The plan assumes constant momenta, but a disturbance changes them: "
                 f"{'; '.join(lines)}."
             )
             goal_id = self._status.goal_id

@@ -37,19 +37,21 @@ _JUMP_CONFIRMATION_TIME = 0.5
 """Wall time without a state at the old time before a time jump is accepted, s."""
 
 _STEP_SLACK = 1.5
-"""Maximum distance between two states without a loss, in plant steps."""
+"""Maximum distance, in plant steps, between two states if no state was lost."""
 
 _PACE_SLACK = 2.0
 """Maximum ratio of the time of lost states to the time expected from the plant's rate."""
 
 _MEETING_TIME = 1.0
-"""Wall time from the first state in which poses may come before or long after their joints, s."""
+"""Wall time after the first state during which poses may arrive before or long after their joints,
+s."""
 
 _LATE_POSES = 6
-"""Poses of this many longest steps ago are late on a busy machine: discarded without a message."""
+"""Poses that are older than this number of longest steps are late (the machine is busy), and are
+discarded without a message."""
 
 _MEASURED_STEPS = 8
-"""Number of steps used to compute the state rate if they are not equal."""
+"""Number of steps used to compute the state rate if the steps are not equal."""
 
 _STEADY = 1.2
 """Maximum ratio of two steps at a steady rate; states skipped by a busy node make steps longer."""
@@ -70,8 +72,8 @@ class StampFilter:
 
     Any other state is a *time jump*, and is deferred. If a state with the current time follows, the
     jump is ignored and counted. If none follows for 0.5 s of wall time, the time has really
-    changed, for example after a plant restart, and the jump is accepted. A plant in lockstep
-    waits that long for its command. ``clock`` returns the wall time, s.
+    changed, for example after a plant restart, and the jump is accepted. A plant in lockstep waits
+    for its command during this time. ``clock`` returns the wall time, s.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -79,7 +81,7 @@ class StampFilter:
         self._steps: deque[int] = deque(maxlen=_MEASURED_STEPS)
         """Latest steps between two states, ns."""
         self._longest_step = math.inf
-        """Maximum step without a loss, ns; infinite before the second state."""
+        """Maximum step if no state was lost, ns; infinite before the second state."""
         self._first_ns, self._first_wall, self._wall = _NO_STAMP, 0.0, 0.0
         """Stamp (ns) and wall time (s) of the first state at the current time; wall time (s) of the
         last."""
@@ -94,7 +96,7 @@ class StampFilter:
 
     @property
     def rate(self) -> float:
-        """State rate from the stamps, Hz; 0 if there are too few."""
+        """State rate from the stamps, Hz; 0 if there are too few stamps."""
         steps = list(self._steps)
         if len(steps) > 1 and abs(steps[-1] - steps[-2]) <= _STEP_ROUNDING_NS:
             return SECOND / steps[-1]
@@ -113,7 +115,7 @@ class StampFilter:
         return self.rate if steady else 0.0
 
     def is_present(self, stamp_ns: int, behind_ns: float = 0.0) -> bool:
-        """Whether a stamp is current, and at most ``behind_ns`` before the last."""
+        """Whether a stamp is current, and precedes the last stamp by at most ``behind_ns``."""
         ahead = stamp_ns - self.now_ns
         if ahead <= self._longest_step:
             return ahead >= -behind_ns
@@ -122,7 +124,7 @@ class StampFilter:
         return ahead <= self._longest_step + _PACE_SLACK * pace * (self._clock() - self._wall)
 
     def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
-        """Return whether joints have the current time; defer other joints."""
+        """Return whether joint states have the current time; defer other joint states."""
         if not self.is_present(stamp_ns):
             if self._jump.message is None:
                 self._jump_wall = self._clock()
@@ -151,7 +153,7 @@ class StampFilter:
         return False
 
     def accepted_jump(self) -> tuple[Stamped | None, Stamped] | None:
-        """Return the deferred odom (or None) and joints once their time is accepted.
+        """Return the deferred odom message (or None) and joint states once their time is accepted.
 
         Call this several times per second; None if no jump is accepted.
         """
@@ -194,25 +196,27 @@ class Pairing(str, Enum):
     """The messages of a state from a :class:`StateSynchroniser`."""
 
     WHOLE = "whole"
-    """Joints and odom with one stamp."""
+    """Joint states and odom with the same stamp."""
 
     WITHOUT_POSE = "without pose"
-    """Only joints: their odom has not arrived."""
+    """Only joint states: the odom message has not arrived."""
 
     LATE_POSE = "late pose"
     """Odom of a state that was previously returned without odom."""
 
 
 class StateSynchroniser:
-    """Pairs the latest odom and joints by their stamps, and returns every state once.
+    """Pairs the latest odom message and joint states by their stamps, and returns every state once.
 
     A commander either requires the pose (a controller) or does not (a planner, which needs it
     only to plan):
 
-    * *Pose required:* a state is ready when its odom has arrived. If odom fails, this is detected
-      when the next joints arrive: the previous state is then overdue (:meth:`take_overdue`). From
-      then on states are ready without their pose, until odom arrives again.
-    * *Pose optional:* a state is ready with its joints; odom that arrives after them is returned as
+    * *Pose required:* a state is ready when its odom message has arrived. If odom fails, this is
+      detected
+      when the next joint states arrive: the previous state is then overdue (:meth:`take_overdue`).
+      From then on states are ready without their pose, until odom arrives again.
+    * *Pose optional:* a state is ready when its joint states have arrived; odom that arrives later
+      is returned as
       a :attr:`Pairing.LATE_POSE`.
 
     Further topics can be required (:meth:`require`): a state then waits for a message with its
@@ -222,9 +226,9 @@ class StateSynchroniser:
     def __init__(self, *, pose_required: bool) -> None:
         self._pose_required = pose_required
         self.odom: Any = None
-        """The latest odom; None before the first odom."""
+        """The latest odom; None before the first odom message."""
         self.joints: Any = None
-        """The latest joints; None before the first joints."""
+        """The latest joints; None before the first joint states."""
         self._odom_ns = self._joints_ns = _NO_STAMP
         self._odom_fresh = self._joints_fresh = self._without_pose = False
         self._required: dict[str, Stamped] = {}
@@ -238,10 +242,10 @@ class StateSynchroniser:
             self._required.setdefault(topic, _NO_MESSAGE)
 
     def put_odom(self, stamp_ns: int, odom: Any) -> bool:
-        """Accept an odom; poses are now measured.
+        """Accept an odom message; from now on, the pose is considered measured.
 
-        Return whether it contradicts the previous odom with the same stamp: if so, another node
-        also publishes odom, and the state has no pose.
+        Return whether the odom message contradicts the previous odom message with the same stamp:
+        if so, another node also publishes odom, and the state has no pose.
         """
         contradicts = stamp_ns == self._odom_ns and odom != self.odom
         self._odom_ns, self.odom = stamp_ns, odom
@@ -249,17 +253,18 @@ class StateSynchroniser:
         return contradicts
 
     def forget_pose(self) -> None:
-        """Discard the latest odom, because the plant publishes another state for the same time.
+        """Discard the latest odom message, because the plant publishes another state for the same
+        time.
 
-        A later odom with this time is then neither a contradiction nor the pose for joints that
-        were returned before.
+        A later odom with this time is then not treated as a contradiction, or as the pose for
+        joints that were returned before.
         """
         self.odom, self._odom_ns, self._odom_fresh = None, _NO_STAMP, False
         if not self._joints_fresh:
             self.joints, self._joints_ns = None, _NO_STAMP
 
     def put_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Accept joints; see :meth:`take_overdue` for the previous state."""
+        """Accept joint states; see :meth:`take_overdue` for the previous state."""
         self.joints, self._joints_ns = joints, stamp_ns
         self._joints_fresh = True
 
@@ -278,11 +283,11 @@ class StateSynchroniser:
         self._required[topic] = Stamped(stamp_ns, message)
 
     def latest(self, topic: str) -> Any:
-        """Return the latest message on a required topic; None before its first message."""
+        """Return the latest message on a required topic; None before the first message."""
         return self._required.get(topic, _NO_MESSAGE).message
 
     def take_ready(self) -> Pairing | None:
-        """Return a ready state once; None without a new ready state."""
+        """Return a ready state once; None if there is no new ready state."""
         stamp = self._joints_ns
         together = stamp == self._odom_ns
         if not self._pose_required:
@@ -304,7 +309,7 @@ class StateSynchroniser:
     def take_overdue(self) -> Pairing | None:
         """Return a state that was never ready; call this before :meth:`put_joints`.
 
-        :attr:`Pairing.WITHOUT_POSE`: its odom is missing, and states are ready without odom from
+        :attr:`Pairing.WITHOUT_POSE`: the odom is missing, and states are ready without odom from
         now on. :attr:`Pairing.WHOLE`: another required topic is silent.
         """
         if not self._joints_fresh:
@@ -326,10 +331,10 @@ class PlantStopped:
     reason
         Message of the plant.
     commanded_until_ns
-        If the plant is at rest because no command arrived: the stamp of the last command; None: it
-        ignores all commands.
+        If the plant is at rest because no command arrived: stamp of the last command; None: the
+        plant ignores all commands.
     rests_since_ns
-        Time since which it is at rest, if known.
+        Time at which the plant came to rest, if known.
     """
 
     reason: str
@@ -356,7 +361,7 @@ class PlantListener:
 
     @property
     def refusal_of_goals(self) -> str:
-        """Message on why goals are currently rejected; empty: goals are accepted."""
+        """Message that says why goals are currently rejected; empty: goals are accepted."""
         status = self.status
         if status.latched_fault:
             return f"'{self._name}' is latched: {status.latched_fault}; rearm it first."
@@ -427,15 +432,15 @@ def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
 # -- inputs that do not come ------------------------------------------------------------------
 
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
-"""Time without a state after which it is reported as missing, s of wall time, and minimum in
+"""Wall time without a state after which states are reported as missing, s, and its minimum in
 control periods."""
 
 _SUSPENSION_TIME = 0.5
-"""Wall time between two checks beyond which this process itself was suspended, s."""
+"""Wall time between two checks above which this process is assumed to have been suspended, s."""
 
 
 class InputWatch:
-    """Whether the states of a plant arrive; ``clock`` returns the wall time, s."""
+    """Checks whether the states of a plant arrive; ``clock`` returns the wall time, s."""
 
     def __init__(
         self,
@@ -464,7 +469,7 @@ class InputWatch:
         return self._clock() - self._begun < _LONGEST_SILENCE
 
     def excuse_suspension(self) -> None:
-        """Count no silence for the time in which this process itself stood still."""
+        """Exclude the time during which this process itself was suspended from the silence."""
         now = self._clock()
         if now - self._checked > _SUSPENSION_TIME:
             self._heard += now - self._checked

@@ -1,7 +1,7 @@
-"""Schedules for a FollowJointTrajectory server, one at a time, and their completion.
+"""Execution of schedules by a FollowJointTrajectory server, one at a time.
 
-This module is independent of ROS: a :class:`TrajectoryServer` sends and cancels, and its responses
-contain the schedule number. A response about a replaced or cancelled schedule is ignored.
+This module is independent of ROS: a :class:`TrajectoryServer` sends and cancels schedules, and its
+responses contain the schedule number. A response about a replaced or cancelled schedule is ignored.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _ANSWER_TIMEOUT_NS = 5 * SECOND
 _SERVER_CHECK_PERIOD_NS = SECOND
 
 _PHASES_OF_MOTION = (Phase.EXECUTING, Phase.REPLANNING, Phase.TAKING_OVER, Phase.PLANNING)
-"""Phases in which a schedule continues; in PLANNING its successor replaces it."""
+"""Phases in which a schedule continues; in PLANNING, the next schedule replaces it."""
 
 
 class ErrorCode(IntEnum):
@@ -50,7 +50,7 @@ class TrajectoryEnd:
     message
         Reason for an early end, as a clause; empty: the schedule was completed.
     final
-        Whether a correction would end in the same way, so that none is planned.
+        Whether a correction would end in the same way; if so, none is planned.
     """
 
     message: str = ""
@@ -58,7 +58,7 @@ class TrajectoryEnd:
 
 
 class TrajectoryServer(Protocol):
-    """The connection with the action server."""
+    """The connection to the action server."""
 
     def is_available(self) -> bool:
         """Whether the server is available."""
@@ -92,7 +92,8 @@ class TrajectoryOutput:
         self._sent: int | None = None
         """Number of the schedule without a result."""
         self._replaced: int | None = None
-        """Number of the schedule replaced by the latest, until the latest is accepted."""
+        """Number of the schedule replaced by the latest schedule, until the latest schedule is
+        accepted."""
         self._accepted = False
         self._watched_ns: int | None = None
         """Stamp of the first state after the latest schedule was sent, ns."""
@@ -110,7 +111,8 @@ class TrajectoryOutput:
         self._server.send(self._number, start)
 
     def check_server(self, now_ns: int) -> None:
-        """End a schedule if its server does not respond or is gone, at a state with a stamp."""
+        """End a schedule if its server does not respond or no longer exists; called for every
+        state."""
         if self._sent is None:
             return
         if self._watched_ns is None or now_ns < self._watched_ns:

@@ -2,11 +2,13 @@
 
 The reference is a path relative to the grapple frame, whose motion is predicted from the target's
 torque-free motion (:mod:`spacerobot_ros.model.target_motion`). The path leads from the current pose
-to a standoff; there the end-effector moves with the grapple frame for a while, then closes in along
-a straight line in that frame. At contact, both have the same pose and velocity.
+to a standoff; at the standoff, the end-effector moves with the grapple frame for a while, then
+closes in along a straight line in that frame. At contact, the end-effector and this frame have the
+same pose and velocity.
 
-The approach starts at the earliest time for which the whole reference is within its limits and the
-arm can follow it, with the base fixed, within joint position and rate limits.
+The approach starts at the earliest time for which the whole reference is within the limits. In
+addition, an arm on a fixed base must be able to follow the reference within joint position and rate
+limits.
 """
 
 from __future__ import annotations
@@ -42,10 +44,11 @@ _COARSE_STRIDE = 8
 _START_PERIOD = 1.0  # s
 
 _SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
-"""Shortest duration of a path to the standoff, ratio of successive trials, and longest, s."""
+"""Shortest duration of a path to the standoff, s, ratio of successive trial durations, and longest
+duration, s."""
 
 _CLOSING_SHARE = 0.5
-"""Fraction of the acceleration limit used for closing in; the grapple frame's motion needs the
+"""Fraction of the acceleration limit used for closing in; the motion of the grapple frame needs the
 rest."""
 
 _STANDOFF_FACTORS = (1.0, 2.0, 3.0)
@@ -84,7 +87,10 @@ class ApproachOptions:
         120.0, "time limit for the start of the approach", unit="s", minimum=0.0, maximum=3600.0
     )
     patience: float = parameter(
-        3.0, "time at contact within which the target must be captured", unit="s", minimum=0.0
+        3.0,
+        "time, from contact on, within which the target must be captured",
+        unit="s",
+        minimum=0.0,
     )
     clearance: float = parameter(
         0.02,
@@ -97,9 +103,8 @@ class ApproachOptions:
     detumble: str = parameter(
         "after",
         "when the angular momentum of the robot and the target is removed: before the capture, by "
-        "a "
-        "planned approach that leaves none (profile: planned); after it, by the task 'detumble'; "
-        "none: that task is skipped",
+        "a planned approach that leaves no momentum (profile: planned); after the capture, by the "
+        "task 'detumble'; none: that task is skipped",
         choices=("before", "after", "none"),
     )
     timeout: float = parameter(
@@ -112,7 +117,7 @@ class ApproachOptions:
 
 @dataclass(frozen=True)
 class ApproachPlan:
-    """Paths and times of an approach, s since the state from which it was planned.
+    """Paths of an approach, and times since the state from which it was planned, s.
 
     Attributes
     ----------
@@ -124,7 +129,7 @@ class ApproachPlan:
         Time at the standoff, s.
     distance
         Smallest distance between the robot and the target body during the approach, m; infinite if
-        nothing can touch.
+        no bodies can touch.
     """
 
     start: float
@@ -157,8 +162,8 @@ class ApproachPlan:
 class ArmReach:
     """Checks whether an arm on a fixed base can follow end-effector motions.
 
-    ``axes`` of the end-effector ``link`` are controlled; ``rates`` are the largest ones of the
-    joints (n,).
+    ``axes`` of the end-effector ``link`` are controlled; ``rates`` (n,) are the largest joint
+    rates.
     """
 
     def __init__(
@@ -176,8 +181,8 @@ class ArmReach:
         return self._arm.nearest_shape(self.q, Pose(motion.R[k], motion.r[k]))[1]
 
     def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
-        """Return the arm shapes (K, n) along a motion, from the current shape, and the reason if
-        the arm cannot follow (else empty).
+        """Return the arm shapes (K, n) along a motion, from the current shape, and the reason why
+        the arm cannot follow; empty if it can follow.
 
         ``period`` is the time between successive poses of the motion, s.
         """
@@ -193,8 +198,8 @@ class ArmReach:
             if k and share.max(initial=0.0) > 1.0:
                 worst = int(share.argmax())
                 return shapes, (
-                    f"joint '{self._joint_names[worst]}' would move at {rate[worst]:.3g}/s, "
-                    f"of {self._rates[worst]:.3g}/s"
+                    f"joint '{self._joint_names[worst]}' would move at {rate[worst]:.3g}/s, but "
+                    f"its limit is {self._rates[worst]:.3g}/s"
                 )
         return shapes, ""
 
@@ -210,8 +215,8 @@ def plan_approach(
 ) -> ApproachPlan:
     """Return the approach with the earliest start.
 
-    If the target body blocks the way, the end-effector avoids it by a path that is short in W, to
-    the standoff or to one at two or three times the distance, or by a later start.
+    If the target body blocks the way, the end-effector takes a path that is short in W, to the
+    standoff or to a standoff at two or three times the distance, or starts later.
 
     Parameters
     ----------
@@ -373,7 +378,7 @@ class TargetClearance:
     Relative to the target frame, the target body is a fixed obstacle. The collision checks
     therefore use the target as the robot's world, and the base pose relative to the target.
 
-    ``link`` is that of the end-effector, whose rigid body may touch the target when closing in;
+    ``link`` is the end-effector link, whose rigid body may touch the target while closing in;
     ``grapple`` is the pose of the grapple frame in the frame T of the target, and ``least`` the
     smallest permitted distance, m.
     """

@@ -25,17 +25,17 @@ class ErrorMargin:
 
     position: float = nonnegative(
         1.0,
-        "abort a goal if a position error exceeds twice its distance by more than this; 0: never",
+        "abort if a position error exceeds twice the goal distance by more than this; 0: never",
         "m",
     )
     attitude: float = nonnegative(
         1.0,
-        "abort a goal if an attitude error exceeds twice its angle by more than this; 0: never",
+        "abort if an attitude error exceeds twice the goal angle by more than this; 0: never",
         "rad",
     )
 
     def as_errors(self) -> OutputErrors:
-        """Return the margins; those given as 0, and those of joints, are infinite."""
+        """Return the margins; margins given as 0, and joint margins, are infinite."""
         return OutputErrors(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
@@ -46,7 +46,9 @@ class ControllerConfig(CommanderConfig):
     law: str = parameter("transposed_jacobian", "control law", choices=LAWS)
     end_effector_frame: str = parameter("", "end-effector link; '': 'end_effector', if it exists")
     base_outputs: str = parameter(
-        "", "base axes used as outputs: x y z rx ry rz; if all three are '': chosen from the robot"
+        "",
+        "base axes used as outputs: x y z rx ry rz; if all three output parameters are '': "
+        "chosen from the robot",
     )
     end_effector_outputs: str = parameter("", "end-effector axes used as outputs")
     joint_outputs: str = parameter("", "joints that are outputs")
@@ -73,7 +75,7 @@ class ControllerConfig(CommanderConfig):
     reference_timeout: float = nonnegative(
         1.0,
         "longest time for which states wait for a silent publisher of joint_reference or "
-        "base_reference: simulated time, or wall time in lockstep; 0: forever",
+        "base_reference (simulated time; in lockstep, wall time); 0: forever",
         "s",
     )
     settle_time: float = nonnegative(
@@ -81,7 +83,7 @@ class ControllerConfig(CommanderConfig):
     )
     time_limit: float = nonnegative(
         0.0,
-        "time after which an unreached goal fails; 0: 300 s after its reference ends",
+        "time after which an unreached goal fails; 0: 300 s after the end of its reference",
         "s",
     )
     wheels: WheelOptions = group(WheelOptions())
@@ -91,8 +93,9 @@ class ControllerConfig(CommanderConfig):
     )
     tasks: str = parameter(
         "",
-        "tasks before a goal, in this order, separated by spaces: 'approach' the target until it "
-        "is captured, 'detumble' the robot that holds it; '': none",
+        "tasks to carry out before a goal, in this order, separated by spaces: 'approach' "
+        "(approach the target until it is captured), 'detumble' (detumble the robot that holds "
+        "it); '': none",
     )
     target: ApproachOptions = group(ApproachOptions())
     detumble: DetumbleOptions = group(DetumbleOptions())

@@ -78,7 +78,7 @@ class Mode(str, Enum):
 
 
 class CoordinatedController:
-    """Controls spacecraft and arm together, with one command per state.
+    """Controls the spacecraft and the arm together, with one command per state.
 
     Until a goal is set, the robot holds its pose in the first state. A goal starts a new reference
     profile from the current reference, for the base and the end-effector together.
@@ -92,13 +92,13 @@ class CoordinatedController:
     rates
         Joint rate limits; commands that exceed them are also reported.
     profile, motion
-        Reference profile and limits; the available thrust lowers accelerations further.
+        Reference profile and limits; the available thrust may lower accelerations further.
     control_period
         Time between commands, s.
     estimation_time
-        Longest time for which the base state is estimated by integration after its measurements
-        stop (paper 4, section IV), s. After that, the thrusters are off and the joints are brought
-        to rest.
+        Longest time, s, for which the base state is estimated by integration after base
+        measurements have stopped (paper 4, section IV). After that, the thrusters are off and the
+        joints are brought to rest.
     wheels
         The reaction wheels, if the robot has any; the law then controls the robot's gyrostat.
     planner
@@ -142,7 +142,7 @@ class CoordinatedController:
         self._to_rest: Callable[[ControlState], Actuation] = self.detumbling(None, 0.0).command
 
     def reset(self) -> None:
-        """Drop goals and measurements; the next state is treated as the first."""
+        """Discard goals and measurements; the next state is treated as the first."""
         self.law.reset_integral()
         self.profile, self._followed = None, Reference()
         self.coming_to_rest = False
@@ -173,8 +173,8 @@ class CoordinatedController:
         """Start towards new goals; a group without a new goal keeps its previous goal.
 
         If the end-effector has had no goal since the robot was held or brought to rest, the base
-        carries it and the arm keeps its shape. The error integral is reset. The reference
-        follows the profile; it is not planned.
+        carries the end-effector along and the arm keeps its shape. The error integral is reset. The
+        reference follows the profile; it is not planned.
         """
         motion = self.motion_to(time, state, base=base, end_effector=end_effector, joints=joints)
         self._begin_motion(time, state, motion)
@@ -225,7 +225,7 @@ class CoordinatedController:
         return PlanningJob(work, time + lead)
 
     def begin(self, time: float, profile: ReferenceProfile) -> None:
-        """Follow a profile from a time on."""
+        """Follow a profile from a given time on."""
         self.profile, self._began = profile, time
         with self._failures_of_law(time):
             self.law.start(time, profile.start, profile.goal)
@@ -317,7 +317,8 @@ class CoordinatedController:
         self._began += seconds
 
     def follow(self, reference: Reference) -> None:
-        """Track an external reference at the next command; other groups follow the profile."""
+        """Track an external reference at the next command; output groups without an external
+        reference follow the profile."""
         self._followed = reference
         self.coming_to_rest = False
 
@@ -419,7 +420,7 @@ class CoordinatedController:
         self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
     ) -> tuple[ca.SX, ca.SX]:
         """Return the part of ``[f; n; tau]`` (6 + n,) within the actuator limits, and whether joint
-        rate limits lower it further, which requires :meth:`apply_limits`.
+        rate limits lower it further; if so, call :meth:`apply_limits`.
         """
         realised = self._limits.expression(actuation)
         return realised, self.joint_rate_limits.exceeds_limits_expression(omega, q, qdot, realised)
@@ -439,7 +440,8 @@ class CoordinatedController:
         return self.profile is not None and not self.reference_at_rest(time)
 
     def time_until_blocked(self, time: float) -> float:
-        """Return how long the planned reference stays clear of obstacles from ``time`` on, s."""
+        """Return the time, s, for which the planned reference stays clear of obstacles from
+        ``time`` on."""
         if self.planner is None or not isinstance(self.profile, PlannedReference):
             return math.inf
         return self.planner.time_until_blocked(self.profile, time - self._began)
@@ -478,10 +480,10 @@ class CoordinatedController:
     def error_bounds(self, margins: OutputErrors) -> Array:
         """Return the output errors (m,) beyond which control is lost.
 
-        Call this after the first command towards the current goals. The bound is the same for all
-        outputs of a kind: a margin (m, rad) plus twice the larger of two values: the distance
-        covered by the reference, and the largest current error plus what its rate adds until it is
-        damped.
+        Call this after the first command towards the current goals. All outputs of a kind have the
+        same bound: a margin (m, rad) plus twice the larger of two values. These are the distance
+        covered by the reference, and the largest current error plus the distance by which its rate
+        increases it before the rate is damped.
         """
         assert self.profile is not None
         law, far = self.law, self.profile.distances()
@@ -550,7 +552,8 @@ class CoordinatedController:
 def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:
     """Return the controller for a robot, as described by a configuration.
 
-    If the robot has reaction wheels, the law controls its gyrostat, without the wheels as joints.
+    If the robot has reaction wheels, the law controls its gyrostat, in which the wheels are not
+    joints.
 
     Raises
     ------
@@ -636,6 +639,6 @@ def _require_torque(
     if len(turns) > rank:
         raise ParameterError(
             f"Robot '{name}' has no thrusters (use_thrusters is false), and its reaction wheels "
-            f"rotate it about {rank} of {len(turns)} controlled axes: remove rx, ry or rz from "
-            "base_outputs."
+            f"can rotate it about only {rank} of {len(turns)} controlled axes: remove rx, ry or "
+            "rz from base_outputs."
         )

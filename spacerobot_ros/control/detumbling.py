@@ -1,10 +1,9 @@
 """Detumbling: brings a robot that has captured a target to rest without overloading its grasp.
 
 The torque ``n`` about the centre of mass changes the angular momentum ``L`` of the robot and the
-target at a rate of at most ``n_max``; so no control brings it to zero in less than
-``|L0| / n_max``. A torque
-of that magnitude against ``L`` takes exactly this time, and leaves the direction of ``L`` in W
-unchanged.
+target at a rate of at most ``n_max``; so no control can bring ``L`` to zero in less than
+``|L0| / n_max``. A torque of that magnitude opposite to ``L`` takes exactly this time, and leaves
+the direction of ``L`` in W unchanged.
 """
 
 from __future__ import annotations
@@ -69,7 +68,7 @@ def shortest_detumbling(momentum: float, torque: float) -> float:
 def largest_feasible_share(start: Array, change: Array, limit: float) -> float:
     """Return the largest fraction ``s`` in [0, 1] with ``|start + s change| <= limit``.
 
-    If there is none, return the fraction with the smallest norm.
+    If there is no such fraction, return the fraction with the smallest norm.
     """
     square, along = float(change @ change), float(start @ change)
     if square == 0.0:
@@ -115,7 +114,7 @@ class Detumbling:
 
     Angular momentum is removed first, with the largest opposing torque, then linear momentum with
     the remaining thrust; joints are braked. If the grasp would be overloaded, the whole command is
-    scaled down, and all three motions decay together.
+    scaled down, and the angular, linear and joint motions decay together.
 
     Parameters
     ----------
@@ -148,12 +147,12 @@ class Detumbling:
         """Largest grasp torque due to a command, N m."""
 
     def angular_momentum(self, state: ControlState) -> Array:
-        """Return the angular momentum (3,) about the centre of mass, N m s, base components."""
+        """Return the angular momentum (3,) about the centre of mass, N m s, in base components."""
         H = self._robot.inertia_matrix(state.q)
         return np.asarray(H[3:6, 3:6] @ state.omega_WB_B + H[3:6, 6:] @ state.qdot)
 
     def velocity(self, state: ControlState) -> Array:
-        """Return the centre-of-mass velocity (3,), m/s, base components."""
+        """Return the centre-of-mass velocity (3,), m/s, in base components."""
         J = self._robot.jacobian(self._robot.base_link, state.q)
         return np.asarray(state.v_WB_B - J[:3, 3:6] @ state.omega_WB_B - J[:3, 6:] @ state.qdot)
 

@@ -1,4 +1,4 @@
-"""Executive of coordinated control: accepts, pursues, decides, aborts and saves goals."""
+"""Executive of coordinated control: accepts, pursues, evaluates, aborts and saves goals."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ class _Next(IntEnum):
     HOLD = 2
     """The robot holds the measured pose, without a goal."""
     ABORT = 3
-    """Like ``HOLD``, and the abort is reported."""
+    """Like ``HOLD``, but the abort is also reported."""
 
 
 class ControlExecutive:
-    """Gives a :class:`CoordinatedController` its goals, and reports their outcome.
+    """Sets the goals of a :class:`CoordinatedController`, and reports their outcome.
 
     For every state, the owner calls :meth:`command`, sends the result to the actuators, and then
     calls :meth:`evaluate`. The goal state is one of
@@ -94,14 +94,15 @@ class ControlExecutive:
         self.reset()
 
     def reset(self) -> None:
-        """Drop goals and measurements, without a status: the next state is the first."""
+        """Discard goals and measurements, without a status; the next state is treated as the
+        first."""
         self.controller.reset()
         self._planning.close()
         self._time: float | None = None
         """Time of the last state, s."""
         self._next = _Next.GO_ON
         self.plant_blocked = False
-        """Whether the plant ignores commands, set by the owner. If so, each command holds the
+        """Whether the plant ignores commands, as set by the owner. If so, each command holds the
         current pose, so that the robot does not move when the plant accepts commands again."""
         self._abort_message = ""
         self._pending: dict[str, IdentifiedGoal] = {}
@@ -182,7 +183,8 @@ class ControlExecutive:
         return frozenset(goal.goal_id for goal in self._pending.values())
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the current activity for a goal, and the predicted time until it ends, s."""
+        """Return the current activity for a goal, and the predicted time, s, until the current
+        motion ends."""
         task, ends = self.servicing.task, self.controller.reference_ends
         if self._planning.active and goal_id in self.waiting_goals:
             return "planning", None
@@ -233,7 +235,7 @@ class ControlExecutive:
 
         Returns a message that describes the robot's reaction.
         """
-        self._give_up(f"Aborted {why}; the robot holds.")
+        self._give_up(f"Aborted {why}; the robot holds its pose.")
         self._next = _Next.ABORT
         return "The robot holds its pose."
 
@@ -254,7 +256,8 @@ class ControlExecutive:
         return True
 
     def take_contacts(self, contacts: tuple[str, ...], time: float) -> None:
-        """Take the links that touch from a time on, s; a new contact on the way fails a goal."""
+        """Set the links that are in contact from a time (s) on; a new contact on the way makes a
+        goal fail."""
         self._watch.take_contacts(contacts, time, pursues=self._pursues)
 
     def on_plant_obeying(self) -> None:
@@ -297,7 +300,8 @@ class ControlExecutive:
         self._begin_anew_or_hold()
 
     def plant_reset(self) -> None:
-        """Restart the goal at the next measured state; without a goal, hold its pose."""
+        """Restart the goal at the next measured state, or hold the pose of that state if there is
+        no goal."""
         self.servicing.end()
         if self._pursues and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
@@ -315,8 +319,8 @@ class ControlExecutive:
     ) -> None:
         """Use another controller with the same outputs, because the robot's masses have changed.
 
-        The goal restarts at the next measured state; without a goal, the robot continues to hold.
-        ``payload`` is the body held from now on.
+        The goal restarts at the next measured state; without a goal, the robot continues to hold
+        its pose. ``payload`` is the body held from now on.
         """
         controller.take_over_goals(self.controller)
         self.controller = controller
@@ -355,7 +359,8 @@ class ControlExecutive:
     ) -> Saturated:
         """Return the actuation for a state; see :meth:`CoordinatedController.command`.
 
-        ``reference`` is a planner's reference for this state; groups not in it are held.
+        ``reference`` is a planner's reference for this state; groups that the reference lacks hold
+        their pose.
 
         Raises
         ------
@@ -693,9 +698,13 @@ class ControlExecutive:
                 return self._abort_message
             case ControllerState.ESTIMATING:
                 elapsed = self.controller.time_since_measurement
-                return f"The base is not measured; it has been estimated for {elapsed:.3g} s."
+                return (
+                    f"The base motion is not measured; it has been estimated for {elapsed:.3g} s."
+                )
             case ControllerState.STOPPED:
-                return "The base is no longer measured: thrusters off, joints brought to rest."
+                return (
+                    "The base motion is no longer measured: thrusters off, joints brought to rest."
+                )
             case ControllerState.REFUSED:
                 raise ValueError("a refusal has its own message")
 

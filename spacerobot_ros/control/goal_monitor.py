@@ -30,8 +30,8 @@ LOST_RATE = 1.5
 """Ratio of joint rate to rate limit above which control of the joint is lost."""
 
 LOST_STATES = 3
-"""Number of consecutive states beyond a bound after which control is lost; a single one may be a
-bad measurement."""
+"""Number of consecutive states beyond a bound after which control is lost; a single such state may
+be a bad measurement."""
 
 AUTOMATIC_TIME_LIMIT = 300.0
 """Time (s) from the end of the reference after which a goal without a time limit fails."""
@@ -64,10 +64,11 @@ class GoalMonitor:
     started
         Goal start time, s.
     within_since
-        Time since which all errors have been within tolerance with the reference at rest, s; -1 if
-        they are not.
+        Time since which all errors have been within tolerance with the reference at rest, s; -1:
+        there is no such time.
     fast_states, large_error_states
-        Numbers of consecutive states with a joint too fast, and with an error beyond its bound.
+        Numbers of consecutive states with an excessive joint rate, and with an error beyond its
+        bound.
     """
 
     started: Scalar = 0.0

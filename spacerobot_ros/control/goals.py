@@ -70,10 +70,11 @@ class Aims(TypedDict):
 def goal_parts(
     controller: CoordinatedController, key: str, identified: IdentifiedGoal
 ) -> dict[str, IdentifiedGoal]:
-    """Return the goals of base and end-effector in a goal received for one of them.
+    """Return the base and end-effector goals contained in a goal that was received for either of
+    them.
 
-    A goal that names an end-effector is for that end-effector, and for the base if it has a base
-    pose.
+    A goal that names an end-effector applies to that end-effector, and also to the base if the goal
+    has a base pose.
 
     Raises
     ------
@@ -169,8 +170,8 @@ def require_controlled_axes(
     Raises
     ------
     PlanningError
-        A goal is several tolerances away from the pose along such an axis; the message names
-        it.
+        A goal differs from the pose by several tolerances along such an axis; the message names the
+        axis.
     """
     selection, labels = law.outputs.selection, ", ".join(law.outputs.labels)
     here = Reference.present(law.robot, state, selection.end_effector_link)
@@ -190,7 +191,7 @@ def require_controlled_axes(
             if 0 < len(left) < 3 and off > _FREE_AXIS_MARGIN * tolerance:
                 raise PlanningError(
                     f"The goal {part} of the {name.replace('_', '-')} is {off:.4g} {unit} "
-                    f"from the current one along {' and '.join(axes[i] for i in left)} of the "
+                    f"from the current value along {' and '.join(axes[i] for i in left)} of the "
                     "world, "
                     f"which the law '{law.name}' does not control; its outputs are {labels}."
                 )
@@ -199,8 +200,8 @@ def require_controlled_axes(
 def aims_of(
     controller: CoordinatedController, goals: Mapping[str, IdentifiedGoal], state: ControlState
 ) -> tuple[Aims, frozenset[Controlled]]:
-    """Return the poses and the shape of goals in a state, and the parts of the base's pose that
-    they ask for.
+    """Return the goal poses and the goal shape in a state, and the base pose components that the
+    goals request.
     """
     asked: frozenset[Controlled] = frozenset()
     poses, shapes, waypoints = {}, [], ()
@@ -231,7 +232,7 @@ def goals_to_save(
     waypoints: Array | None,
     resumes: bool,
 ) -> dict[str, IdentifiedGoal]:
-    """Return the goals of the present reference by part of the robot.
+    """Return the goals of the current reference by robot part.
 
     ``asked`` are the parts of the poses of base and end-effector that goals request, ``waypoints``
     those of the base.
@@ -256,7 +257,7 @@ def goals_to_save(
 
 
 def config_with(config: ControllerConfig, tolerance: Tolerance | None) -> ControllerConfig:
-    """Return a configuration with the tolerances of a goal; None: those of the parameters."""
+    """Return a configuration with the tolerances of a goal; None: the parameters' tolerances."""
     if tolerance is None:
         return config
     return replace(
@@ -268,7 +269,8 @@ def config_with(config: ControllerConfig, tolerance: Tolerance | None) -> Contro
 
 
 class GoalWatch:
-    """The states since a goal began: how the goal ends, stalls or control over it is lost."""
+    """Evaluates the states since a goal began: whether the goal ends or stalls, or control is
+    lost."""
 
     def __init__(self) -> None:
         self.monitor, self.stall = GoalMonitor(), StallMonitor()
@@ -277,7 +279,7 @@ class GoalWatch:
         self._contacts: tuple[str, ...] = ()
         """The links that touch."""
         self.asked: dict[str, frozenset[Controlled]] = dict.fromkeys(GOAL_KEYS, frozenset())
-        """Parts of the poses of base and end-effector that the present goals request."""
+        """Base and end-effector pose components requested by the current goals."""
         self.touched = ""
         """First contact on the way to the current goal, and its time; empty: none."""
 
@@ -296,23 +298,25 @@ class GoalWatch:
         self._error_bounds = None
 
     def shift_time(self, jump: float) -> None:
-        """Continue after a jump of time, s."""
+        """Continue after a time jump, s."""
         self.monitor.shift_time(jump)
         self.stall.restart()
 
     def forget_touch(self, time: float) -> None:
-        """Begin a way at a time, s; links that touch now touch on it, too."""
+        """Begin a motion at a time, s; current contacts also count as contacts during the
+        motion."""
         self.touched = _touch(self._contacts, time)
 
     def take_contacts(self, contacts: tuple[str, ...], time: float, *, pursues: bool) -> None:
-        """Take the links that touch from a time on, s; a new contact counts on the way."""
+        """Set the links that are in contact from a time (s) on; a new contact during the motion is
+        recorded."""
         met = [each for each in contacts if each not in self._contacts]
         self._contacts = contacts
         if not self.touched and pursues:
             self.touched = _touch(met, time)
 
     def loss_by_rates(self, controller: CoordinatedController, qdot: Array) -> str:
-        """Return a clause on a joint that stays far beyond its rate limit; empty: none does."""
+        """Return a clause about a joint that stays far beyond its rate limit; empty: no joint."""
         limits = controller.joint_rate_limits
         if not self.monitor.check_rates(limits.largest_rate_share(qdot)):
             return ""
@@ -324,19 +328,19 @@ class GoalWatch:
         )
 
     def loss_by_errors(self, controller: CoordinatedController, config: ControllerConfig) -> str:
-        """Return a clause on errors far beyond the distance of the goal; empty: they are not."""
+        """Return a clause about errors far beyond the goal distance; empty: no such errors."""
         if self._error_bounds is None:
             self._error_bounds = controller.error_bounds(config.error_margin.as_errors())
         share = controller.law.largest_error_share(self._error_bounds)
         if not self.monitor.check_errors(share):
             return ""
         away = controller.distance_from_reference()
-        return f"the errors grow, the robot is {away} from the reference"
+        return f"the errors grow and the robot is {away} from the reference"
 
     def decision(
         self, controller: CoordinatedController, time: float, config: ControllerConfig
     ) -> ControllerState | None:
-        """Return the state of a goal that is decided at a time, s; None: it is not yet."""
+        """Return the state of a goal that is decided at a time, s; None: not decided yet."""
         at_rest, ends = controller.reference_at_rest(time), controller.reference_ends
         assert ends is not None
         if not at_rest and not self.monitor.is_late(time, ends, config):
@@ -395,7 +399,7 @@ def decided_message(
     missed: Mapping[str, str] | None = None,
     touched: str = "",
 ) -> str:
-    """Return the message for a reached or failed goal, including the distance from it.
+    """Return the message for a reached or failed goal, including the distance from the goal.
 
     ``cause`` is the reason, if known, why the robot came no closer; ``missed`` lists the missed
     components of a partly reached goal; ``touched`` is the contact that made the goal fail.

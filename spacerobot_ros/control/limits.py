@@ -2,8 +2,8 @@
 
 A control law commands forces without regard to the resulting speeds. If a goal is far away, a
 measurement
-is late or a thruster is stuck open, joints would exceed their motor rates, and rates controllable
-by commands held for a control period: :class:`JointRateLimits` lowers their efforts.
+is late or a thruster is stuck open, joints would exceed the rates of their motors, and the rates
+that held commands can control. In such cases, :class:`JointRateLimits` lowers the joint efforts.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _REFERENCE_THRUST_SHARE = 0.5
 
 _MIN_PERIODS_TO_LIMIT = 2
 """Shortest time for a joint to reach its rate limit, in control periods: neither the held nor the
-next efforts may exceed the limit, even if the model is slightly wrong."""
+next efforts may bring the joint beyond the limit, even if the model is slightly wrong."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,11 @@ class MotionLimits:
     ) -> MotionLimits:
         """Return the limits with accelerations lowered to what the thrusters can produce.
 
-        The robot is treated as one rigid body in the shape ``q`` (n,): force over total mass;
-        torque over the largest moment of inertia about the centre of mass; and the torque that
-        balances the force on the base if the centre of mass is elsewhere. Without thrusters,
-        nothing is lowered.
+        The robot is treated as one rigid body in the shape ``q`` (n,): the linear acceleration is
+        at most the force divided by the total mass, the angular acceleration at most the torque
+        divided by the largest moment of inertia about the centre of mass. The thrusters can also
+        balance the torque of their force if the centre of mass is not at the base origin. Without
+        thrusters, the limits are unchanged.
         """
         force, torque = (_REFERENCE_THRUST_SHARE * x for x in (actuators.force, actuators.torque))
         lever = float(np.linalg.norm(robot.center_of_mass(q)))
@@ -97,8 +98,8 @@ class ActuatorLimits:
     """Thruster and joint limits.
 
     The thrusters produce any force up to ``force`` (N) and any torque up to ``torque`` (N m), both
-    in Euclidean norm and independently of each other. A larger force or torque is scaled to its
-    limit, preserving its direction. Each joint produces up to its ``effort`` (n,), N m or N.
+    in Euclidean norm and independently of each other. A larger force or torque is scaled down to
+    the limit, preserving its direction. Each joint produces up to its ``effort`` (n,), N m or N.
     Infinite means no limit.
     """
 
@@ -124,7 +125,7 @@ class ActuatorLimits:
 
 
 def limit_norm(vector: Array, limit: float) -> Array:
-    """Return a vector of at most a norm, in the same direction."""
+    """Return a vector scaled down to at most a given norm."""
     size = math.sqrt(vector.dot(vector))
     return vector if size <= limit else vector * (limit / size)
 
@@ -138,9 +139,9 @@ class JointRateLimits:
 
     The joints obey ``Js(q) qddot + Fs = tau + G(q) wrench``: the last rows of paper 4, eq. (19),
     with the base acceleration eliminated. If a commanded acceleration would bring a joint beyond
-    its rate within a few control periods, it is lowered, and the efforts are recomputed for the
-    lowered accelerations. If motors are too weak to hold joints against the thrust on the base, the
-    thrust is lowered, preserving its direction.
+    its rate within a few control periods, the acceleration is lowered, and the efforts are
+    recomputed. If motors are too weak to hold joints against the thrust on the base, the thrust is
+    lowered, preserving its direction.
 
     Parameters
     ----------
@@ -164,9 +165,9 @@ class JointRateLimits:
     def apply(
         self, state: ControlState, given: Actuation, effort: Array, periods: int = 1
     ) -> Actuation:
-        """Return a command that keeps the joint rates within limits: the given one if possible.
+        """Return a command that keeps the joint rates within limits: the given command if possible.
 
-        ``effort`` (n,) are the largest joint efforts, N m or N, not exceeded by ``given``;
+        ``effort`` (n,) are the joint effort limits, N m or N, which ``given`` satisfies;
         ``periods`` is the number of control periods for which the command will probably be held.
         """
         if self._unlimited:
@@ -203,7 +204,7 @@ class JointRateLimits:
         return ca.sum1(ca.vertcat(*beyond)) > 0
 
     def largest_rate_share(self, qdot: Array) -> float:
-        """Return the largest of the rates (n,) as a fraction of its limit."""
+        """Return the largest ratio of the rates (n,) to their limits."""
         return float(np.abs(qdot * (1 / self.rates)).max(initial=0.0))
 
     def efforts(self, q: Array, qdot: Array, qddot: Array) -> Array:

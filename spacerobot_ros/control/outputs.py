@@ -7,7 +7,8 @@ the velocity of an attitude output is a component of the angular velocity. So th
 no singularity, and ``J_z`` loses rank only if the manipulator is singular.
 
 The rate of an attitude error is ``omega_des - omega``. For rotation about one fixed axis (every
-planar robot), it is the derivative of the error; in general only to first order.
+planar robot), it is exactly the derivative of the error; in general, this is true only to first
+order.
 """
 
 from __future__ import annotations
@@ -116,8 +117,9 @@ class OutputSelection:
 class OutputDistance:
     """Distances between the outputs and a reference; NaN for uncontrolled kinds.
 
-    ``position`` (m) and ``attitude`` (rad): distance and angle along the controlled axes, the
-    larger of base and end-effector; ``joints``: the largest joint error, m or rad.
+    ``position`` (m) and ``attitude`` (rad): distance and angle along the controlled axes, of the
+    base or of the end-effector, whichever distance or angle is larger; ``joints``: the largest
+    joint error, m or rad.
     """
 
     position: float
@@ -139,7 +141,7 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
     position (three to five).
     * Without an end-effector, or with fewer joints: the base pose and the joints.
 
-    So there are never more outputs than degrees of freedom.
+    This way, there are never more outputs than degrees of freedom.
 
     Raises
     ------
@@ -171,8 +173,8 @@ def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozens
 
 
 _POSE_REFERENCE_SIZE = 19
-"""Number of values in a pose reference: position 3, quaternion 4, two velocities and two
-accelerations."""
+"""Number of values in a pose reference: 3 for the position, 4 for the quaternion, and 3 each for
+two velocities and two accelerations."""
 
 
 class _OutputGroup(NamedTuple):
@@ -212,7 +214,7 @@ class OutputVector:
     selection
         The outputs.
     thrust
-        Whether forces on the base move the centre of mass; otherwise its columns of ``J_z`` are
+        Whether forces on the base move the centre of mass; if not, the first columns of ``J_z`` are
         zero.
 
     Raises
@@ -274,7 +276,7 @@ class OutputVector:
         Raises
         ------
         NotFiniteError
-            A value in it is not finite.
+            A value in the state is not finite.
         ValueError
             A component has the wrong length.
         """
@@ -289,7 +291,7 @@ class OutputVector:
         TargetNotSetError
             The reference lacks a selected group.
         NotFiniteError
-            A value in it is not finite.
+            A value in the reference is not finite.
         ValueError
             A component has the wrong length.
         """
@@ -403,6 +405,6 @@ def require_finite(name: str, memory: Array) -> None:
 def _require_known(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
-            raise ParameterError(f"There is no {kind} '{name}'; there are: {', '.join(known)}.")
+            raise ParameterError(f"There is no {kind} '{name}'; available: {', '.join(known)}.")
         if names.count(name) > 1:
             raise ParameterError(f"The {kind} '{name}' is named twice.")

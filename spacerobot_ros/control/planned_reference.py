@@ -119,7 +119,7 @@ class PlannedReference(ReferenceProfile):
         return sum(leg.spent for leg in self._legs) if self.uses_table else None
 
     def at(self, time: float) -> Reference:
-        """Return the reference ``time`` s after its start."""
+        """Return the reference at ``time`` s after the start."""
         if time >= self.duration:
             return self.goal
         leg, begins = self._leg_at(time)
@@ -133,11 +133,11 @@ class PlannedReference(ReferenceProfile):
         )
 
     def actuation(self, time: float, period: float, joint_damping: float = 0.0) -> Actuation:
-        """Return the mean wrench and efforts of the plan over a control period that begins
-        ``time`` s after its start; zero before its start and after its end.
+        """Return the mean wrench and efforts of the plan over a control period that begins ``time``
+        s after the start of the plan; zero outside the plan.
 
-        Samples would not suffice: efforts jump between intervals, and joints would reach other
-        rates.
+        Sampled values would not suffice: efforts jump between intervals, so joints would reach
+        different rates.
 
         Parameters
         ----------
@@ -160,14 +160,14 @@ class PlannedReference(ReferenceProfile):
 
 
 class GrappleReference(PlannedReference):
-    """A planned motion to a target, then along with the target.
+    """A planned motion to a target, followed by the motion together with the target.
 
     Parameters
     ----------
     start, limits, motion
         See :class:`PlannedReference`.
     grapple
-        The target, whose motion begins with the plan.
+        The target; its motion starts at the same time as the plan.
     """
 
     name: ClassVar[str] = "grapple"
@@ -194,7 +194,7 @@ class GrappleReference(PlannedReference):
         return RelativeMotionOverTime.between(frame, _pose(hand).motion)
 
     def at(self, time: float) -> Reference:
-        """Return the reference ``time`` s after its start."""
+        """Return the reference at ``time`` s after the start."""
         if time < self.duration:
             return super().at(time)
         frame = self.grapple.motion.grapple([time])
@@ -264,8 +264,8 @@ class ReferencePlanner:
         self._planner.use_obstacles(world)
 
     def time_until_blocked(self, profile: PlannedReference, time: float) -> float:
-        """Return how long a reference stays clear of obstacles, s, from a given time after its
-        start; infinite: until its end.
+        """Return the time, s, for which a reference stays clear of obstacles, from a given time
+        after the start; infinite: until the end of the reference.
         """
         clearance = self._planner.clearance
         if clearance is None or not clearance.has_obstacles or time >= profile.duration:

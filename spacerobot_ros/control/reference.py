@@ -1,7 +1,8 @@
 """Reference profiles from current poses and joint positions to the goals.
 
-The paper sets the goal as a step (:class:`StepReference`): simple, but with the largest actuator
-command at the start. :class:`QuinticReference` moves the reference there smoothly.
+In the paper, the reference is a step to the goal (:class:`StepReference`), which is simple, but
+requires the largest actuator command at the start. :class:`QuinticReference` moves the reference to
+the goal smoothly.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class ReferenceProfile(ABC):
 
     @abstractmethod
     def at(self, time: float) -> Reference:
-        """Return the reference ``time`` s after its start."""
+        """Return the reference at ``time`` s after the start."""
 
     def distances(self) -> OutputErrors:
         """Return the distances between the start and the goal."""
@@ -109,9 +110,9 @@ class QuinticReference(ReferenceProfile):
     """Positions along straight lines, attitudes along geodesics (one fixed axis), in W.
 
     An end-effector carried by the base rotates about the base origin, which moves along its line.
-    All share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` of ``u = t / T``: rest to rest, without
-    acceleration jumps. T is the shortest time for which all motions are within their limits: the
-    slowest motion determines it, and all reach their goals together.
+    All motions share one profile, ``s = 10 u^3 - 15 u^4 + 6 u^5`` with ``u = t / T``: rest to rest,
+    without acceleration jumps. T is the shortest time for which all motions are within their
+    limits: the slowest motion determines T, and all motions reach their goals together.
     """
 
     name: ClassVar[str] = "quintic"
@@ -137,8 +138,8 @@ class QuinticReference(ReferenceProfile):
         self.duration = max(needs, default=0.0)
 
     def at(self, time: float) -> Reference:
-        """Return the reference ``time`` s after its start; before that, the reference at the
-        start."""
+        """Return the reference at ``time`` s after the start; for earlier times, the reference at
+        the start."""
         time = max(time, 0.0)
         if time >= self.duration:
             return self.goal

@@ -1,4 +1,5 @@
-"""Tasks before a goal: approaching a target until its capture, and detumbling after it.
+"""Tasks that precede a goal: approaching a target until its capture, and detumbling after the
+capture.
 
 A task sets the controller's references, state by state, until it succeeds or fails. An approach
 sets the end-effector reference; detumbling replaces the law until the robot is at rest.
@@ -48,7 +49,8 @@ class Task(str, Enum):
     """Controller tasks with a target, performed before a goal is pursued."""
 
     APPROACH = "approach"
-    """Bring the end-effector to the grapple frame, until the target is captured."""
+    """Bring the end-effector to the grapple frame, and keep it there until the target is
+    captured."""
     DETUMBLE = "detumble"
     """Bring the robot to rest, with or without a held body."""
 
@@ -71,7 +73,7 @@ class Task(str, Enum):
 
 
 class TaskState(Enum):
-    """State of the current task after a robot state."""
+    """State of the current task after processing a robot state."""
 
     ACTIVE = "active"
     DONE = "done"
@@ -101,7 +103,7 @@ class MeasuredTarget:
         self.why_unknown = ""
         """Why the body is unknown; empty: nothing was received."""
         self.motion: BodyMotion | None = None
-        """Motion of its root link."""
+        """Motion of the target's root link."""
         self.time = -math.inf
         """Time of the measurement, s."""
 
@@ -114,8 +116,8 @@ class MeasuredTarget:
             self.body, self.why_unknown = None, str(error)
 
     def measure(self, time: float, pose: Array, twist: Array) -> None:
-        """Set the root link's pose (7,) and twist (6,) at a given time, s; the twist is in the link
-        frame."""
+        """Set the root link's pose (7,) and twist (6,) at a given time (s); the twist is in the
+        link frame."""
         self.motion, self.time = BodyMotion.of(pose, twist), time
 
 
@@ -133,7 +135,7 @@ class ApproachTask:
         self.events: list[Event] = []
         self._plan: ApproachPlan | GrappleReference | None = None
         self._start = self._contact = 0.0
-        """When the end-effector sets out and meets the target, s after the plan was made."""
+        """Times, in s after planning, at which the end-effector sets out and meets the target."""
         self._predicted: TorqueFreeMotion | None = None
         self._planned_at = 0.0
         self._began: float | None = None
@@ -191,7 +193,7 @@ class ApproachTask:
         self._out_of_reach = RelativeMotion.between(hand, grapple.body_motion())
         if now > self._contact + options.patience:
             return self._ended(
-                f"the target is missed: at contact the end-effector is {self._distance_text}, and "
+                f"the target is missed: at contact, the end-effector is {self._distance_text}, and "
                 f"it was not captured within {options.patience:g} s"
             )
         if now >= self._start:
@@ -280,7 +282,8 @@ class ApproachTask:
         left = float(np.linalg.norm(planned.motion.joined_momentum(planned.grapple.motion)))
         message = (
             f"The base and the end-effector start at {job.begins:.4g} s and meet the target at "
-            f"{contact:.4g} s; the plan leaves {left:.4g} N m s after the grasp."
+            f"{contact:.4g} s; the plan leaves {left:.4g} N m s of angular momentum after the "
+            f"grasp."
         )
         about = {
             "detumble": options.detumble,
@@ -382,8 +385,9 @@ class DetumblingTask:
 
     @property
     def message(self) -> str:
-        """Sentence about the remaining motion."""
-        return f"Detumbling: base and joints rotate at up to {quantity(self._fastest, 'rad/s')}."
+        """One-sentence description of the remaining motion."""
+        fastest = quantity(self._fastest, "rad/s")
+        return f"Detumbling: the base and the joints rotate at up to {fastest}."
 
     def _begin(self, time: float, state: ControlState, controller: CoordinatedController) -> None:
         limit = self.config.detumble.grapple_torque_limit
@@ -393,8 +397,8 @@ class DetumblingTask:
         controller.come_to_rest(self._law.command)
         bound = shortest_detumbling(self._momentum, self._law.torque)
         message = (
-            f"The robot is brought to rest: {self._momentum:.4g} N m s takes at least {bound:.4g} "
-            "s."
+            f"The robot is brought to rest: removing an angular momentum of {self._momentum:.4g} "
+            f"N m s takes at least {bound:.4g} s."
         )
         self.events.append(Event(EventKind.DETUMBLE_STARTED, message))
 
@@ -403,8 +407,8 @@ class DetumblingTask:
         assert law is not None
         took, bound = at_rest - self._began, shortest_detumbling(self._momentum, law.torque)
         message = (
-            f"The robot came to rest in {took:.4g} s; the shortest time for {self._momentum:.4g} "
-            f"N m s is {bound:.4g} s, and the grasp torque was at most "
+            f"The robot came to rest in {took:.4g} s; the shortest time for an angular momentum "
+            f"of {self._momentum:.4g} N m s is {bound:.4g} s, and the grasp torque was at most "
             f"{law.largest_grasp_torque:.4g} N m."
         )
         about = {
@@ -418,7 +422,7 @@ class DetumblingTask:
 
 
 class Servicing:
-    """The tasks of a controller: those before its goals, and those on request."""
+    """The tasks of a controller: tasks that precede its goals, and tasks on request."""
 
     def __init__(self, config: ControllerConfig) -> None:
         tasks = Task.parsed(config.tasks)
@@ -443,14 +447,14 @@ class Servicing:
 
     @property
     def needs_target(self) -> bool:
-        """Whether target measurements are used, or will be."""
+        """Whether target measurements are used now, or will be used by a later task."""
         return (
             Task.APPROACH in (self._remaining_tasks or self.before_goals) and self.payload is None
         )
 
     @property
     def message(self) -> str:
-        """Sentence that describes the current task."""
+        """One-sentence description of the current task."""
         return "" if self._present is None else self._present.message
 
     def begin(self, tasks: Sequence[Task]) -> None:

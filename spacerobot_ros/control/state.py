@@ -110,7 +110,7 @@ class PoseReference:
 
     @property
     def motion(self) -> FrameMotion:
-        """The reference as a frame's motion at a single time."""
+        """The reference as the motion of a frame at a single time."""
         R = matrix_from_quaternion(self.quaternion)
         numbers = (self.position, self.velocity, self.angular_velocity, self.acceleration)
         return FrameMotion(*(x[np.newaxis] for x in (R, *numbers, self.angular_acceleration)))
@@ -164,7 +164,7 @@ class Reference:
 
 
 class Actuation(NamedTuple):
-    """``wrench_B`` (6,): thruster force (N) over torque (N m) at the base link origin, base
+    """``wrench_B`` (6,): thruster force (N), then torque (N m) at the base link origin, in base
     components; ``tau`` (n,): joint efforts (N m or N).
     """
 
@@ -176,15 +176,14 @@ class DeadReckoning:
     """Paper 4, end of section IV: the state obtained by integrating eq. (19) under the sent
     commands.
 
-    It starts from the last measured state and integrates one control period at a time under held
-    actuation, with Runge-Kutta 4. Differences between the model and the real robot accumulate over
+    Integration starts from the last measured state, and proceeds one control period at a time under
+    held actuation (Runge-Kutta 4). Differences between the model and the real robot accumulate over
     :attr:`elapsed`.
 
-    The integrated state is that of :mod:`spacerobot_ros.model.composite_rigid_body`, with both
+    The integrated state is the state of :mod:`spacerobot_ros.model.composite_rigid_body`, with both
     momenta and the centre of mass, which joint motion does not change. Measured joint positions and
-    rates
-    replace the predicted ones, and the base rotates by the connection ``A``. Only thruster effects
-    then accumulate errors.
+    rates replace the predicted ones, and the base rotates according to the connection ``A``. Only
+    thruster effects then accumulate errors.
 
     Parameters
     ----------

@@ -81,7 +81,8 @@ class CommandReport:
 
     @classmethod
     def of(cls, controller: CoordinatedController, result: Saturated) -> CommandReport:
-        """Return the report on the last command of a controller, which became ``result``."""
+        """Return the report on a controller's last command; ``result`` is this command within the
+        limits."""
         law, excess, wheels = controller.law, result.excess, controller.wheels
         status, state = law.status, law.state
         return cls(
@@ -149,7 +150,7 @@ class ControllerStatus:
         Raises
         ------
         SpaceRobotError
-            The pairs are not a controller status.
+            The pairs do not form a controller status.
         """
         command = None
         if "law" in values:

@@ -1,9 +1,8 @@
 """Flight software for reaction wheels: torque allocation, saturation, dumping, failures.
 
 A control law for the base and the arm commands a torque on the gyrostat's base
-(:mod:`spacerobot_ros.model.
-wheels`). The wheels provide as much of it as their torque and rate limits allow; the thrusters, if
-any, provide the rest.
+(:mod:`spacerobot_ros.model.wheels`). The wheels provide as much of this torque as their torque and
+rate limits allow; the thrusters, if any, provide the rest.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ _MIN_BOUND_WIDTH = 1e-12
 """Smallest width of the solver bounds, N m, and fraction of a torque that is considered zero."""
 
 _SMOOTHING = 1e-6
-"""Weight of the torques relative to their sum, which selects the smallest of equivalent
+"""Weight of the torques relative to their sum; selects the smallest torques among equivalent
 allocations."""
 
 
@@ -167,7 +166,7 @@ class WheelControl:
         self.reset()
 
     def reset(self) -> None:
-        """Clear measurements; failed wheels stay out of use."""
+        """Clear measurements; failed wheels remain unused."""
         count = len(self.wheels)
         self.torque = np.zeros(count)
         """Commanded motor torques (k,), N m."""
@@ -176,7 +175,7 @@ class WheelControl:
         self.rates, self._omega = np.zeros(count), np.zeros(3)
         self._q, self._spins = np.zeros(0), np.zeros(count)
         self._announced = np.zeros(count)
-        """Rate of each wheel when last reported, as a fraction of the largest; zero: not
+        """Rate of each wheel when last reported, as a fraction of the largest rate; zero: not
         reported."""
         self.dumping = False
         """Whether momentum is being dumped."""
@@ -200,8 +199,8 @@ class WheelControl:
 
     @property
     def torque_about_every_axis(self) -> float:
-        """Largest torque that the wheels in use provide about every axis, N m; 0 if not about all
-        axes."""
+        """Largest torque that the wheels in use can provide about every axis, N m; 0 if they cannot
+        provide torque about all axes."""
         return self._allocate.within(self.wheels.torque[self._used])
 
     # -- measurements -------------------------------------------------------------------------
@@ -249,7 +248,8 @@ class WheelControl:
     # -- torques ------------------------------------------------------------------------------
 
     def command_torque(self, torque: Array) -> Array:
-        """Command wheel torques for a base torque (3,), N m; return the part they provide.
+        """Command wheel torques for a base torque (3,), N m; return the part that the wheels
+        provide.
 
         The gyroscopic torque ``omega x A h`` of the spinning wheels is compensated for.
         """
@@ -275,7 +275,7 @@ class WheelControl:
         self.torque, self.thrust = np.zeros(len(self.wheels)), np.zeros(6)
 
     def limits_with_wheels(self, motion: MotionLimits, q: Array) -> MotionLimits:
-        """Return reference limits that wheels alone can follow, for a shape (n - k,)."""
+        """Return reference limits within which wheels alone suffice, for a shape (n - k,)."""
         if self.has_thrusters or self.rank < 3:
             return motion
         wheels, used = self.wheels, self._used
@@ -358,7 +358,10 @@ class WheelControl:
         shares = np.abs(self.rates) / wheels.rate
         for i in np.flatnonzero(self._used):
             share, name = float(shares[i]), wheels.names[i]
-            turns = f"Wheel '{name}' rotates at {self.rates[i]:.4g} of {wheels.rate[i]:.4g} rad/s"
+            turns = (
+                f"Wheel '{name}' rotates at {self.rates[i]:.4g} of at most "
+                f"{wheels.rate[i]:.4g} rad/s"
+            )
             if share < options.warning_rate - _ANNOUNCEMENT_HYSTERESIS:
                 self._announced[i] = 0.0
             elif share >= _SATURATED_SHARE > self._announced[i]:
@@ -402,7 +405,7 @@ class WheelControl:
         self._allocate = self._make_allocation()
         left = ", and thrusters" if self.has_thrusters else ""
         message = (
-            f"Wheel '{name}' absorbed {answered:.3g} of {asked:.3g} N m s and is out of use: "
+            f"Wheel '{name}' absorbed {answered:.3g} of {asked:.3g} N m s and is no longer used: "
             f"{np.count_nonzero(self._used)} wheel(s){left} remain."
         )
         self._add(EventKind.WHEEL_FAILED, message, 1, name)
@@ -425,11 +428,11 @@ def momentum_budget(
     rates: Array,
 ) -> dict[str, Array]:
     """Return the contributions (3,) to the angular momentum about the centre of mass by name, N m
-    s, base components.
+    s, in base components.
 
-    ``base`` is due to the gyrostat's rotation with the base, its joints at rest; ``arm`` is due to
-    the gyrostat's joints (q, qdot: (n - k,)) with the base at rest; ``wheels`` is ``A h``; ``sum``
-    their sum.
+    ``base`` is due to the rotation of the gyrostat with the base while its joints are at rest;
+    ``arm`` is due to the gyrostat's joints (q, qdot: (n - k,)) with the base at rest; ``wheels`` is
+    ``A h``; ``sum`` their sum.
     """
     H = gyrostat.inertia_matrix(q)
     parts = {

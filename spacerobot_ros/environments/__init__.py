@@ -1,8 +1,8 @@
-"""Gymnasium environments, with one robot or with thousands in SIMD lanes.
+"""Gymnasium environments with one robot, or with thousands of robots in SIMD lanes.
 
 If Gymnasium is installed, importing this package registers ``spacerobot/ReorientArm-v0``,
 ``spacerobot/Reach-v0`` and, for custom tasks, ``spacerobot/Task-v0``. Tasks and actions
-(:mod:`.tasks`) do not require Gymnasium: a trained policy flies without it.
+(:mod:`.tasks`) do not require Gymnasium, so a trained policy can fly without Gymnasium.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["register"]
 NAMESPACE = "spacerobot"
 
 ENVIRONMENTS = {"ReorientArm-v0": "reorient", "Reach-v0": "reach", "Task-v0": ""}
-"""Environment names in :data:`NAMESPACE`, and their tasks; empty: the task is an argument."""
+"""Environment names in :data:`NAMESPACE`, and their tasks; if empty, the task is an argument."""
 
 
 def import_gymnasium() -> Any:

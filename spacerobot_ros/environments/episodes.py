@@ -45,38 +45,52 @@ _CHANGEABLE = ("reward", "spread", "time_limit", "tolerance")
 """Arguments that may change between episodes."""
 
 _BEYOND_LANES = "faults", "plant.thrusters", "plant.disturbances", "plant.orbit.", "plant.table."
-"""Prefixes of dispersions for which each robot needs its own plant."""
+"""Prefixes of the names of dispersions that require a separate plant for each robot."""
 
 
 @dataclass(frozen=True)
 class EpisodeConfig:
     """Episode configuration: the keyword arguments of the environments.
 
-    ``reward`` has changed weights of :class:`.RewardWeights`.
+    ``reward`` contains the weights that differ from the defaults in :class:`.RewardWeights`.
     """
 
     task: str = parameter("", "name in TASKS, such as 'reorient', or a class derived from Task")
-    scenario: str = parameter("", "name or file of a scenario or robot; empty: the task's own")
+    scenario: str = parameter("", "name or file of a scenario or robot; empty: the task's default")
     campaign: str = parameter("", "file of a campaign, which draws starts, masses and goals")
-    hold: int = parameter(1, "during which an action is held", "ticks", minimum=1)
-    time_limit: float = parameter(60.0, "after which episodes are truncated", "s", minimum=1e-6)
-    tolerance: float = nonnegative(0.0, "error of reached goals; 0: the task's own", "rad or m")
+    hold: int = parameter(1, "time for which an action is held", "ticks", minimum=1)
+    time_limit: float = parameter(
+        60.0, "time after which episodes are truncated", "s", minimum=1e-6
+    )
+    tolerance: float = nonnegative(
+        0.0, "largest error at which a goal is reached; 0: the task's default", "rad or m"
+    )
     goals: str = parameter(
         "",
-        "random: around the start; scenario: that of the scenario or draw; empty: random without a "
-        "campaign",
+        "random: goals around the start; scenario: goals from the scenario or draw; empty: "
+        "random unless there is a campaign",
         choices=_GOALS,
     )
-    spread: float = nonnegative(0.0, "size of random goals; 0: the task's own", "rad or m")
-    link: str = parameter("", "link of the goal; empty: the scenario's, else the end-effector")
-    max_force: float = nonnegative(0.0, "on the base for 1; 0: the controller's limit", "N")
-    max_torque: float = nonnegative(0.0, "on the base for 1; 0: the controller's limit", "N m")
-    action_scale: Sequence[float] = parameter((), "command for an action of ones; empty: limits")
+    spread: float = nonnegative(
+        0.0, "largest displacement to random goals; 0: the task's default", "rad or m"
+    )
+    link: str = parameter(
+        "", "link with a goal; empty: the link in the scenario, or else the end-effector"
+    )
+    max_force: float = nonnegative(
+        0.0, "base force for an action of 1; 0: limit of the controller", "N"
+    )
+    max_torque: float = nonnegative(
+        0.0, "base torque for an action of 1; 0: limit of the controller", "N m"
+    )
+    action_scale: Sequence[float] = parameter(
+        (), "command for an action whose entries are all 1; empty: limits"
+    )
     reward: Mapping[str, float] | None = None
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> EpisodeConfig:
-        """Return the configuration of keyword arguments; ParameterError if one is invalid."""
+        """Return the configuration for keyword arguments; raise ParameterError if invalid."""
         require_names("An environment has no argument", arguments, [x.name for x in fields(cls)])
         values, reward = dict(arguments), arguments.get("reward")
         for name, value in arguments.items():
@@ -93,13 +107,13 @@ class EpisodeConfig:
     def __post_init__(self) -> None:
         if self.scenario and self.campaign:
             raise ParameterError(
-                "Arguments 'scenario' and 'campaign' are both given: a campaign names its own "
-                "scenario."
+                "Arguments 'scenario' and 'campaign' are both given: a campaign file already "
+                "names a scenario."
             )
 
     @property
     def kind(self) -> type[Task]:
-        """Class of the task; ParameterError if there is none or it has no link for ``link``."""
+        """Task class; raises ParameterError if it does not exist or does not support ``link``."""
         if self.task not in TASKS:
             raise ParameterError(f"Argument 'task' is '{self.task}'; it may be {', '.join(TASKS)}.")
         kind = TASKS[self.task]
@@ -152,18 +166,20 @@ class _Starts:
             or (plant.orbit, plant.table) != (OrbitConfig(), TableConfig())
             or any(name.startswith(_BEYOND_LANES) for name in dispersed)
         )
-        """Whether each robot needs its own plant, for features not supported by lanes."""
+        """Whether each robot needs its own plant because lanes do not support some feature."""
         self.nominal = _Start.of(self.robot, self.scenario)
         self.has_sensor_errors = bool(self.nominal.sensors.is_active[0]) or any(
             name.startswith("plant.sensors.") for name in dispersed
         )
         self._made: dict[int, _Start | str] = {}
-        """Draw starts by number; strings are reasons for rejection."""
+        """Starts by draw number; a string is the reason why the draw was rejected."""
 
     def draw(
         self, generators: Sequence[np.random.Generator], flights: SteppedFlights
     ) -> tuple[list[_Start], Counts]:
-        """Draw the starts of episodes: the different ones, and which one each episode has."""
+        """Draw episode starts: return the distinct starts, and the index of the start of each
+        episode.
+        """
         if self._campaign is None:
             return [self.nominal], np.zeros(len(generators), np.int64)
         drawn = [self._draw_number(self._campaign, rng, flights) for rng in generators]
@@ -181,7 +197,7 @@ class _Starts:
             if isinstance(self._made[number], _Start):
                 return number
         raise ParameterError(
-            f"{_MAX_REFUSED_DRAWS} successive draws of the campaign are refused, the last one "
+            f"{_MAX_REFUSED_DRAWS} successive campaign draws were rejected, the last one "
             f"because: {self._made[number]} Restrict the dispersions to values that the robot "
             "permits."
         )
@@ -196,7 +212,7 @@ class _Starts:
         except (ParameterError, RobotDescriptionError) as refusal:
             if not any(isinstance(each, str) for each in self._made.values()):
                 warn_once(
-                    f"Campaign draw {number} is omitted, as are other refused draws: {refusal}"
+                    f"Campaign draw {number} is omitted, as are other rejected draws: {refusal}"
                 )
             return str(refusal)
         _require_steppable(flight.scenario)
@@ -220,11 +236,11 @@ def _require_steppable(scenario: Scenario) -> None:
 
 
 class Episodes:
-    """N episodes that are stepped together.
+    """N episodes that are advanced together.
 
-    Attributes are arrays of N rows: ``observations``, ``goals``, and after :meth:`step`
-    ``rewards``, ``terminations`` and ``truncations``; ``errors`` are rad or m. ``flights`` has the
-    states of the robots, to be read only.
+    Attributes are arrays with N rows: ``observations``, ``goals``, and after :meth:`step`
+    ``rewards``, ``terminations`` and ``truncations``; ``errors`` are in rad or m. ``flights``
+    contains the robot states; do not change them.
 
     Parameters
     ----------
@@ -281,11 +297,11 @@ class Episodes:
         self.tolerance = config.tolerance or self.task.tolerance
 
     def has_attribute(self, name: str) -> bool:
-        """Return whether :meth:`change` accepts a name."""
+        """Return whether :meth:`change` accepts an attribute name."""
         return name in _CHANGEABLE or (hasattr(self.task, name) and not name.startswith("_"))
 
     def attribute(self, name: str) -> Any:
-        """Return the value that :meth:`change` sets."""
+        """Return the value of an attribute that :meth:`change` can set."""
         return getattr(self if name in _CHANGEABLE else self.task, name)
 
     def change(self, name: str, value: Any) -> None:
@@ -343,8 +359,9 @@ class Episodes:
     ) -> None:
         """Restart the episodes in some rows, given the random generators of all rows.
 
-        ``goal``, one for all (goal_size,) or one per row (N, goal_size), overrides the drawn goals.
-        ``start``, one dictionary or one per row, overrides some values of :class:`.InitialState`.
+        ``goal``, either (goal_size,) for all rows or (N, goal_size) with one goal per row,
+        overrides the drawn goals. ``start``, either one dictionary for all rows or one per row,
+        overrides values of :class:`.InitialState`.
 
         Raises
         ------
@@ -422,8 +439,8 @@ class Episodes:
     def step(self, actions: Any) -> None:
         """Step all unfinished episodes by ``hold`` ticks.
 
-        ``actions`` (N, entries of an action) are shares of the largest command, clipped to -1 and
-        1.
+        ``actions`` (one row per robot, one column per action entry) are fractions of the largest
+        command, clipped to the range from -1 to 1.
 
         Raises
         ------
@@ -433,7 +450,7 @@ class Episodes:
         flights, task, wanted = self.flights, self.task, (len(self.goals), len(self.taken))
         shares = as_numbers(actions, "The array of actions", CommandError)
         if shares.shape != wanted:
-            raise CommandError(f"The actions are {shares.shape}, not {wanted}.")
+            raise CommandError(f"The actions have shape {shares.shape}, not {wanted}.")
         under_way, errors = flights.has_not_ended.copy(), self.errors.copy()
         before, after = self._states[np.arange(len(shares))], self._states  # The former is a copy.
         flights.step(command_of(shares, self.scale, self.taken), self._config.hold)

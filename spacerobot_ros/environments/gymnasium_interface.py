@@ -53,7 +53,7 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
         raise ValueError(f"There are {len(each)} seeds for {count} environments.")
     if not all(one is None or (isinstance(one, int | np.integer) and one >= 0) for one in each):
         raise Error(
-            f"The seed is {seed!r}: give a whole number from 0, or a list of {count} of them or "
+            f"The seed is {seed!r}: give a nonnegative integer, or a list of {count} of them or "
             "None."
         )
     return [None if one is None else int(one) + alone * i for i, one in enumerate(each)]
@@ -62,7 +62,7 @@ def _seeds_of(seed: Any, count: int) -> list[int | None]:
 class SpaceRobotEnv(gymnasium.Env, EzPickle):
     """One robot, stepped by a plant. The arguments are those of `EpisodeConfig`.
 
-    A copy, including a pickled one, has the same arguments and starts from scratch.
+    A copy (also by pickling) has the same arguments but a new state.
     `get_wrapper_attr` and `set_wrapper_attr` read and change arguments and task attributes; see
     `Episodes.change`.
 
@@ -127,8 +127,8 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
 class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     """Many robots in SIMD lanes, with the same episodes as :class:`SpaceRobotEnv`.
 
-    With seed s, lane i has the same episodes as a single environment with seed s + i. A copy,
-    including a pickled one, has the same arguments and starts from scratch.
+    With seed s, lane i has the same episodes as a single environment with seed s + i. A copy
+    (also by pickling) has the same arguments but a new state.
 
     Parameters
     ----------
@@ -184,7 +184,8 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     ) -> tuple[Any, dict[str, Any]]:
         """Start all episodes, or only those in ``options["reset_mask"]`` (num_envs,).
 
-        Options ``goal`` and ``start``, one for all or one per robot, override the drawn values.
+        Options ``goal`` and ``start``, each given once for all robots or once per robot, override
+        the drawn values.
         """
         mask, begin = np.ones(self.num_envs, dtype=np.bool_), _begin_options(options)
         if options is not None and "reset_mask" in options:
@@ -243,7 +244,9 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         return tuple(self.episodes.picture(row) for row in range(self.num_envs))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Return an attribute, shared by all robots, once per robot; see `Episodes.change`."""
+        """Return the value of an attribute that all robots share, repeated for each robot; see
+        `Episodes.change`.
+        """
         return (self.episodes.attribute(name),) * self.num_envs
 
     def set_attr(self, name: str, values: Any) -> None:

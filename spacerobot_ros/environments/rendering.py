@@ -29,8 +29,8 @@ Picture = npt.NDArray[np.uint8]
 
 
 class Camera:
-    """Draws the robots of a task; the base is in the centre, and one scale fits all
-    configurations."""
+    """Draws the robots of a task with the base in the centre and a scale that fits
+    all configurations."""
 
     def __init__(self, task: Task) -> None:
         self._task, self._robot = task, task.robot.description
@@ -44,8 +44,8 @@ class Camera:
         return robot_bodies(self._robot, self._meshes, poses, q, MAX_MESH_FACES)
 
     def picture(self, states: RobotStates, goals: Array) -> Picture:
-        """Return a picture (HEIGHT, WIDTH, 3) of one robot from its state and goal (one row
-        each)."""
+        """Return a picture (HEIGHT, WIDTH, 3) of one robot from its state and its goal (one
+        row each)."""
         view, half = View(), self._reach * np.array([WIDTH / HEIGHT, 1.0])
         middle = view(states.pose[0, :3])
         canvas = Canvas(view, middle - half, middle + half, WIDTH)

@@ -35,7 +35,7 @@ class SpaceRobotVecEnv(VecEnv):
         super().__init__(num_envs, made.single_observation_space, made.single_action_space)
 
     def reset(self) -> Any:
-        """Start all episodes with the seeds and options that were set."""
+        """Start all episodes with the seeds and options set before."""
         options = {name: [each[name] for each in self._options] for name in self._options[0]}
         seen, infos = self.env.reset(seed=self._seeds, options=options)
         self.reset_infos = [{"error": error} for error in infos["error"]]
@@ -74,7 +74,7 @@ class SpaceRobotVecEnv(VecEnv):
         return [getattr(self.env, method_name)(*args, **named)]
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for every robot: none is wrapped."""
+        """Return False for every robot, because no robot is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Any:

@@ -1,8 +1,8 @@
-"""Environment tasks: goals, observations, rewards, ends, and the commands for actions.
+"""Environment tasks: goals, observations, rewards, episode ends, and the commands for actions.
 
 All functions take the states of N robots at once, so the same code can observe one robot in a
-plant, many robots in lanes, or a robot over ROS topics. A custom task is a class derived from
-:class:`Task`.
+plant, many robots in lanes, or a robot controlled through ROS topics. A custom task is a class
+derived from :class:`Task`.
 """
 
 from __future__ import annotations
@@ -36,17 +36,19 @@ from spacerobot_ros.simulation.plant import InitialState
 _SAMPLED_SHAPE_COUNT = 12
 
 _MIN_SHARE_OF_MOTION = 1e-7
-"""Singular values below this fraction of the largest are treated as no motion."""
+"""Directions with singular values below this fraction of the largest are treated as immovable."""
 
 Flags = npt.NDArray[np.bool_]
 Generators = Sequence[np.random.Generator]
 
 LARGEST_OBSERVATION = 1e6
-"""Bound for observed quantities without another bound; observations are clipped to it."""
+"""Bound for observed quantities that have no other bound; observations are clipped to this
+value.
+"""
 
 
 def require_names(none: str, given: Iterable[str], known: Collection[str]) -> None:
-    """Raise ParameterError, which begins with ``none``, for a name that is not known."""
+    """For an unknown name, raise a ParameterError whose message begins with ``none``."""
     for name in given:
         if name not in known:
             raise ParameterError(f"{none} '{name}'; it has {', '.join(known)}.")
@@ -75,7 +77,7 @@ class RobotStates:
 
 @dataclass(frozen=True)
 class Step:
-    """A step of N robots."""
+    """One step of N robots."""
 
     before: RobotStates
     """States before the step."""
@@ -84,7 +86,7 @@ class Step:
     goals: Array
     """(N, goal_size) their goals."""
     actions: Array
-    """(N, entries) shares from -1 to 1 of the largest command."""
+    """(N, entries) fractions from -1 to 1 of the largest command."""
     errors_before: Array
     """(N,) errors before the step; see :meth:`Task.errors`."""
     errors: Array
@@ -99,22 +101,22 @@ class Step:
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """Weights of the terms of the reward of a step."""
+    """Weights of the step reward terms."""
 
     progress: float = 10.0
-    """Reward per rad or m by which the error decreased."""
+    """Reward per rad or m of decrease in the error."""
     time: float = 0.02
     """Penalty per s."""
     action: float = 0.01
-    """Penalty per s, times the mean square of the action's entries."""
+    """Penalty per second; it is multiplied by the mean square of the action entries."""
     reached: float = 5.0
-    """Reward, once, in the step in which the goal is reached."""
+    """One-time reward in the step in which the goal is reached."""
     failed: float = 5.0
-    """Penalty, once, if the flight cannot continue."""
+    """One-time penalty if the flight cannot continue."""
 
     @classmethod
     def of(cls, changes: Mapping[str, float] | None) -> RewardWeights:
-        """Return the weights with some changed; ParameterError if a change is invalid."""
+        """Return the weights after some changes; raise ParameterError if a change is invalid."""
         require_names("The reward has no weight", changes or {}, [x.name for x in fields(cls)])
         for name, value in (changes or {}).items():
             if not (isinstance(value, numbers.Real) and np.isfinite(value)):
@@ -135,7 +137,7 @@ class Task(ABC):
     robot
         The robot.
     link
-        Link from argument ``link``, the scenario, or the end-effector; empty: none.
+        Link from argument ``link`` or from the scenario, else the end-effector; empty: no link.
     pushed
         Whether actions include a base force and a base torque.
     """
@@ -146,17 +148,17 @@ class Task(ABC):
     scenario: ClassVar[str] = "arm_attitude"
     """Default scenario."""
     weights: ClassVar[type[RewardWeights]] = RewardWeights
-    """Class of the reward weights, which may define further weights."""
+    """Class of the reward weights; a subclass may define additional weights."""
     has_link: ClassVar[bool] = False
     """Whether the task has a link; if so, its position is in :attr:`RobotStates.link_r`."""
     tolerance: float = 0.01
-    """Default error within which the goal is reached."""
+    """Default for the largest error at which the goal is reached."""
     spread: float = 1.0
-    """Default size of random goals."""
+    """Default of the largest displacement to a random goal."""
     error_size: int = 3
     """Number of entries in :meth:`remaining`."""
     largest_error: float = LARGEST_OBSERVATION
-    """Bound on the entries of :meth:`remaining`."""
+    """Upper bound on the absolute values of the entries of :meth:`remaining`."""
 
     def __init__(
         self, robot: SpaceRobot, link: str = "", pushed: tuple[bool, bool] = (False, False)
@@ -175,7 +177,9 @@ class Task(ABC):
 
     @abstractmethod
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return the remaining errors (N, error_size): rotation vectors (rad) or vectors (m)."""
+        """Return the remaining errors (N, error_size): rotation vectors (rad) or displacements
+        (m).
+        """
 
     def start(self, initial: InitialState, rng: np.random.Generator) -> InitialState:
         """Return the initial state of an episode, given the state in the scenario or the draw."""
@@ -204,7 +208,9 @@ class Task(ABC):
         return goals
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array | None:
-        """Return the poses (N, 7) in W of goals in pictures; None: goals are not shown."""
+        """Return the poses (N, 7) in W at which pictures show the goals; None: goals are not
+        shown.
+        """
         return None
 
     def errors(self, remaining: Array) -> Array:
@@ -216,7 +222,7 @@ class Task(ABC):
         return np.asarray(errors <= tolerance)
 
     def failed(self, states: RobotStates, goals: Array) -> Flags:
-        """Return which episodes fail (N,), in addition to flights that cannot continue."""
+        """Return which episodes fail (N,), apart from those whose flights cannot continue."""
         return np.zeros(len(states.q), dtype=np.bool_)
 
     def reward(self, step: Step, weights: Any) -> Array:
@@ -232,7 +238,7 @@ class Task(ABC):
         return np.clip(np.concatenate(parts, axis=1), *self.observation_bounds())
 
     def observation_bounds(self) -> tuple[Array, Array]:
-        """Return the smallest and largest observations (error_size + 2 n + 6,)."""
+        """Return the lower and upper bounds of the observations (error_size + 2 n + 6,)."""
         robot, most = self.robot, LARGEST_OBSERVATION
         error, rest = np.full(self.error_size, self.largest_error), np.full(robot.n + 6, most)
         low = np.concatenate([-error, np.maximum(robot.lower, -most), -rest])
@@ -253,7 +259,9 @@ def _directions_and_shares(rngs: Generators) -> tuple[Array, Array]:
 
 
 class Reorient(_DrawnTogether):
-    """The joints rotate the base to a goal attitude, a quaternion (x, y, z, w) of R_WG."""
+    """The joints rotate the base to a goal attitude ``R_WG``, given as a quaternion (x, y, z,
+    w).
+    """
 
     name, goal_size, tolerance, spread = "reorient", 4, 0.01, 0.15
     largest_error = np.pi
@@ -267,8 +275,8 @@ class Reorient(_DrawnTogether):
         if not self.by_torque:
             raise ParameterError(
                 f"The joints of robot '{self.robot.description.name}' cannot rotate its base near "
-                "the start, so there are no random goals: set 'max_torque' under efforts, or use "
-                "the scenario goal (goals: scenario)."
+                "the start, so there are no random goals: set 'max_torque' for effort actuation, "
+                "or use the scenario goal (goals: scenario)."
             )
         return np.eye(3)
 
@@ -282,7 +290,7 @@ class Reorient(_DrawnTogether):
         return quaternion_multiply(starts.pose[:, 3:], quaternions_from_rotvecs(turns))
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return the rotation vectors (N, 3) from base to goal attitudes in B, rad."""
+        """Return the rotation vectors (N, 3), rad, from base to goal attitudes, in B."""
         return rotvecs_from_quaternions(
             quaternion_multiply(quaternion_inverse(states.pose[:, 3:]), goals)
         )
@@ -327,7 +335,9 @@ class Reach(_DrawnTogether):
         return np.eye(3) if len(found) == 3 else found
 
     def random_goals(self, starts: RobotStates, spread: float, rngs: Generators) -> Array:
-        """Return positions within ``spread`` m of the links' starts, in their free directions."""
+        """Return positions within ``spread`` m of the initial link positions, in the directions in
+        which the links can move.
+        """
         axes, (ways, shares) = self._directions, _directions_and_shares(rngs)
         if len(axes) < 3:
             R = matrices_from_quaternions(starts.pose[:, 3:])
@@ -337,7 +347,7 @@ class Reach(_DrawnTogether):
         return np.asarray(self.link_positions(starts) + ways)
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
-        """Return the displacements (N, 3) from link to goal in B, m."""
+        """Return the displacements (N, 3), m, from link to goal, in B."""
         R = matrices_from_quaternions(states.pose[:, 3:])
         of_base = np.einsum("nji,nj->ni", R, goals - states.pose[:, :3])
         assert states.link_r is not None
@@ -355,7 +365,7 @@ class Reach(_DrawnTogether):
         return scenario.end_effector_goal.position
 
     def goal_poses(self, states: RobotStates, goals: Array) -> Array:
-        """Return the goals with the world's attitude."""
+        """Return goal poses with the attitude of the world frame."""
         return np.hstack([goals, np.tile([0.0, 0.0, 0.0, 1.0], (len(goals), 1))])
 
     def link_positions(self, states: RobotStates) -> Array:
@@ -373,7 +383,8 @@ TASKS.load()
 
 
 def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque: float) -> Array:
-    """Return the command for an action of ones: joint rates, or efforts, force (N), torque (N m).
+    """Return the command for an action whose entries are all 1: joint rates; or joint efforts,
+    force (N) and torque (N m).
 
     Raises
     ------
@@ -385,7 +396,7 @@ def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque
         if not np.isfinite(limit):
             raise ParameterError(
                 f"Joint '{name}' has no {actuation} limit, and actions are fractions of this "
-                "limit: set it in the URDF, or set action_scale."
+                f"limit: set the limit in the URDF, or set action_scale."
             )
     if actuation == "velocity":
         return limits.copy()
@@ -393,7 +404,8 @@ def action_scale(robot: SpaceRobot, actuation: str, max_force: float, max_torque
 
 
 def command_of(actions: Any, scale: Array, taken: Sequence[int] | npt.NDArray[np.int64]) -> Array:
-    """Return the commands (N, len(scale)) for actions (N, len(taken)), fractions from -1 to 1.
+    """Return the commands (N, len(scale)) for actions (N, len(taken)), which are fractions from -1
+    to 1.
 
     ``taken`` are the command entries set by actions; the others are zero.
     """

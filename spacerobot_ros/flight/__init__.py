@@ -1,1 +1,1 @@
-"""Scenario flights without ROS, in which commanders respond to plant states."""
+"""Flights of scenarios without ROS, in which commanders respond to the states of the plant."""

@@ -55,30 +55,30 @@ def fly(
     seed: int | None = None,
     parameters: Mapping[str, Any] | None = None,
 ) -> Flight:
-    """Fly a scenario or a robot to a goal without ROS: the same flight as ``spacerobot run``.
+    """Fly a scenario or a robot to a goal without ROS, like ``spacerobot run``.
 
-    ``fly("sliding_masses")``, ``fly("planar_chain", rotvec=(0, 0, 1))``,
+    Examples: ``fly("sliding_masses")``, ``fly("planar_chain", rotvec=(0, 0, 1))``,
     ``fly("my.urdf", (0.1, 0, 0), parameters={"planner.position_tolerance": 1e-3})``.
 
     Parameters
     ----------
     what
-        A scenario: its name, its file, or the result of
-        :func:`~spacerobot_ros.scenario.load_scenario`; or a robot: its name, its URDF file, or its
-        model. A name of both means the scenario.
+        A scenario (its name, its file, or the result of
+        :func:`~spacerobot_ros.scenario.load_scenario`) or a robot (its name, its URDF file, or its
+        model). If a name denotes both a scenario and a robot, the scenario is used.
     goal
-        Base goal pose; or its position (3,), m, or position and quaternion (7,). None: the
-        scenario's goal.
+        Base goal: a pose, a position (3,), m, or a position and quaternion (7,). By default, the
+        goal in the scenario.
     position, rotvec
         Position (3,), m, and attitude (3,), rad, as exponential coordinates; they override
         ``goal``.
     end_effector_position, end_effector_pose, end_effector
         End-effector goal, as for :func:`plan`.
     method
-        A gait method or a control law; None: as in the scenario.
+        A gait method or a control law; by default, the one in the scenario.
     law, law_options
-        Class of your own control law, and its options by name. The scenario must have a
-        controller, whose gains it uses.
+        Class of a user-defined control law, and its options by name. The law uses the gains of the
+        scenario's controller, so the scenario must have a controller.
     seed
         Seed of the sensor and actuator noise.
     parameters
@@ -87,11 +87,11 @@ def fly(
     Raises
     ------
     ParameterError
-        There is no such scenario, robot, method or parameter, or the scenario requires nodes.
+        There is no such scenario, robot, method or parameter, or the scenario requires ROS nodes.
     GoalError
         The goal is not a pose.
     PlanningError
-        The goal is rejected, as in :func:`plan`, or by the controller.
+        The goal is rejected by the planner, as in :func:`plan`, or by the controller.
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)
@@ -103,7 +103,7 @@ def fly(
         scenario = scenario.with_method(law.name)
         scenario = scenario.with_overrides("coordinated_control", options)
     elif law_options is not None:
-        raise ParameterError("law_options needs a law: give it as law=MyLaw.")
+        raise ParameterError("law_options requires a law: pass it as law=MyLaw.")
     if method is not None:
         scenario = scenario.with_method(method)
     scenario = _with_parameters(scenario, {} if parameters is None else parameters)
@@ -142,7 +142,7 @@ def plan(
     """Plan a gait for a scenario or for a robot.
 
     A scenario defines the start, the limits, the tolerances, the control period, the method and the
-    default goal: ``plan("arm_attitude")``, or for another goal
+    default goal: ``plan("arm_attitude")``, or, for another goal,
     ``plan(load_scenario("sliding_masses"), rotvec=(0, 0, 0.1))``. A robot uses the defaults of
     :func:`spacerobot_ros.planning.plan`, which has more arguments: ``plan("sliding_masses",
     rotvec=(0.5, 0, 0), start=(0, 1, 0))``.
@@ -150,26 +150,28 @@ def plan(
     Parameters
     ----------
     what
-        A robot's model, URDF file or name; or a scenario, its file, or its name. If a scenario and
-        a robot have the same name, the scenario is used if no goal is given, otherwise the robot.
+        A robot (its model, URDF file or name), or a scenario (or its file or name). If a scenario
+        and a robot have the same name, the name denotes the robot if a goal is given, and the
+        scenario otherwise.
     goal
-        Base goal pose; or its position (3,), m, or position and quaternion (7,).
+        Base goal: a pose, a position (3,), m, or a position and quaternion (7,).
     position, rotvec
         Position (3,), m, and attitude (3,), rad, as exponential coordinates; they override
         ``goal``.
     end_effector_position, end_effector_pose, end_effector
-        End-effector goal: its position (3,), m, or position and quaternion (7,), and its link name;
-        or positions or poses of several end-effectors, by name. Only given components of the base
-        pose are constrained.
+        End-effector goal: a position (3,), m, or a position and quaternion (7,), with the link
+        name; for several end-effectors, their positions or poses by link name. Only the given
+        components of the base pose are constrained.
     method
-        Name of a gait method; None: as in the scenario. For a robot the default is ``auto``, or
-        ``optimal`` if method options are given.
+        Name of a gait method; by default, the one in the scenario. For a robot the default is
+        ``auto``, or ``optimal`` if method options are given.
     parameters
         Node parameters by name, as for :func:`fly`, such as
-        ``{"planner.attitude_tolerance": 0.001}``; a robot is then handled as in :func:`fly`.
+        ``{"planner.attitude_tolerance": 0.001}``; if they are given, a robot is handled as in
+        :func:`fly`.
     options
-        Method options by name; for a robot, also other arguments of
-        :func:`spacerobot_ros.planning.plan`.
+        Method options by name; for a robot, other arguments of :func:`spacerobot_ros.planning.plan`
+        are also accepted.
 
     Raises
     ------
@@ -237,8 +239,8 @@ def scenario_to_fly(
     rotvec: npt.ArrayLike | None = None,
     hands: Sequence[EndEffectorGoal] = (),
 ) -> Scenario:
-    """Return the scenario to fly, with the given goals; a robot alone becomes a scenario without a
-    goal.
+    """Return the scenario to fly, with the given goals; a robot becomes a scenario whose only goals
+    are the given ones.
 
     Raises
     ------
@@ -286,7 +288,10 @@ def _changed_goal(
     elif goal is not None:
         pose = _float_list(goal, "goal")
         if len(pose) not in (3, 7):
-            raise GoalError(f"A goal is 3 or 7 numbers, not {len(pose)}: position, quaternion.")
+            raise GoalError(
+                "A goal must have 3 numbers (position) or 7 (position and quaternion), not "
+                f"{len(pose)}."
+            )
         given = Goal.checked(pose[:3], pose[3:] or before.quaternion)
         made = replace(before, position=given.position, quaternion=given.quaternion)
         made = replace(made, asked=POSE if pose[3:] else before.asked | {"position"})
@@ -309,14 +314,15 @@ def _float_list(values: npt.ArrayLike, what: str) -> list[float]:
 def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     if not isinstance(settings, Mapping):
         raise ParameterError(
-            "Parameters are given by name, as {'plant.sensors.position_noise': 0.001}, not as "
+            "Parameters must be given by name, such as {'plant.sensors.position_noise': 0.001}, "
+            "not as "
             f"{settings!r}."
         )
     for key, value in settings.items():
         node, dot, name = str(key).partition(".")
         if not dot or node not in CONFIGS:
             raise ParameterError(
-                f"'{key}' is not a parameter: give node.parameter with one of the nodes "
+                f"'{key}' is not a parameter: write it as node.parameter, with one of the nodes "
                 f"{', '.join(CONFIGS)}."
             )
         scenario = scenario.with_overrides(node, {name: value})

@@ -47,7 +47,7 @@ class HeldTarget:
     Attributes
     ----------
     start, end
-        Capture and release times, s; the end is infinite without a release.
+        Capture and release times, s; ``end`` is infinite if there is no release.
     payload
         The body, according to the target's description.
     """
@@ -116,24 +116,25 @@ def _held_between(
 
 
 def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
-    """Return the angular momenta of base, arm, wheels and their sum about the centre of mass, N m
-    s.
+    """Return the angular momenta of base, arm and wheels, and their total, about the centre of
+    mass.
 
     The columns are :data:`BUDGET_PARTS`: norms of the components of
-    :func:`~spacerobot_ros.control.wheels.momentum_budget`, as in controller/status, but from the
-    true states. A held body is part of the holding link.
+    :func:`~spacerobot_ros.control.wheels.momentum_budget`, as in controller/status, but computed
+    from the true states. Values are in N m s. A held body is treated as part of the link that holds
+    it.
 
     Parameters
     ----------
     flight
-        The flight; without a robot description, or without states, the signal is empty.
+        The flight; if it has no robot description or no states, the returned signal is empty.
     most
         Maximum number of states to evaluate.
 
     Raises
     ------
     RobotDescriptionError
-        The described robot has no positive inertia.
+        The inertia of the described robot is not positive definite.
     """
     if flight.robot is None:
         return Signal.empty(len(BUDGET_PARTS))
@@ -158,9 +159,9 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
 def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate, ...]:
     """Return the estimated parameters of each body held by the robot.
 
-    They are determined by conservation of momentum (:mod:`.model.payload_estimation`) from the
-    measured base and joint motion, the robot's masses and the thrust; the target's description is
-    not used.
+    The parameters are determined from conservation of momentum (:mod:`.model.payload_estimation`),
+    the measured base and joint motion, the robot's masses and the thrust. The target's description
+    is not used.
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
     SpaceRobotError
         Loads with unknown impulse acted on the robot.
     RobotDescriptionError
-        The described robot has no positive inertia.
+        The inertia of the described robot is not positive definite.
     """
     robot, plant = flight.robot, flight.scenario.plant
     held = held_bodies(flight)
@@ -183,9 +184,9 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
     loaded = any(event.kind is EventKind.DISTURBANCE for event in flight.events)
     if loaded or plant.disturbances or Surroundings.of(plant.orbit, plant.table).has_loads:
         raise SpaceRobotError(
-            "The held body is not estimated: external loads (disturbances, an orbit or a table) "
-            "acted on the robot, and their impulse is unknown; estimate it from a flight without "
-            "them."
+            "The parameters of the held body are not estimated: external loads (disturbances, an "
+            "orbit or a table) "
+            "acted on the robot, and their impulse is unknown; use a flight without such loads."
         )
     prefix = "measured_" if len(flight.signal("measured_pose")) else ""
     states, alone = _states(flight, robot, prefix), SpaceRobot(robot)

@@ -1,6 +1,8 @@
-"""The clearance of a flight: the smallest distance between links, and to obstacles, in true states.
+"""The clearance during a flight: the smallest distance of the links from each other and from
+obstacles, in the true states.
 
-A flight without ROS reports clearances like the plant node: :meth:`FlightClearance.statuses`.
+A flight without ROS reports clearances in the same way as the plant node:
+:meth:`FlightClearance.statuses`.
 """
 
 from __future__ import annotations
@@ -20,14 +22,14 @@ from spacerobot_ros.simulation.clearance import ClearanceStatus
 
 @dataclass(frozen=True, eq=False)
 class FlightClearance:
-    """The smallest distance between robot links over the time of a flight.
+    """The smallest distance between robot links during a flight.
 
     Attributes
     ----------
     geometry
-        The robot's solids, with at least one pair.
+        The robot's solids, with at least one pair to check.
     time
-        (N,) times of the states, s; at least one.
+        (N,) times of the states, s; N is at least 1.
     shapes
         (N, n) true joint positions, m or rad.
     base
@@ -48,7 +50,8 @@ class FlightClearance:
         pose: tuple[Array, Array],
         mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh,
     ) -> FlightClearance | None:
-        """Return the clearance of a flight; None without states, or if no link pair is checked.
+        """Return the clearance of a flight; None if the flight has no states, or if no link pair is
+        checked.
 
         Parameters
         ----------
@@ -58,7 +61,7 @@ class FlightClearance:
             The names of the columns of ``q``.
         q, pose
             Times (N,), s, and joint positions (N, n), m or rad; times (M,) and base poses (M, 7).
-            If there are obstacles, only states with equal times are used.
+            If there are obstacles, only the times common to ``q`` and ``pose`` are used.
         mesh_of
             As for :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
         """
@@ -77,7 +80,7 @@ class FlightClearance:
 
     @cached_property
     def nearest(self) -> Approach:
-        """The smallest distance between two links, also between the states."""
+        """The smallest distance between two links, including times between the states."""
         found = nearest_approach(self.geometry, self.shapes, self.base)
         assert found is not None
         return found
@@ -107,8 +110,8 @@ class FlightClearance:
     def over_time(self, most: int) -> tuple[Array, Array]:
         """Return times (K,), s, and the smallest distances (K,) over all pairs, m.
 
-        These are ``most`` states at about equal intervals, and the state with the smallest
-        distance.
+        The distances are evaluated in ``most`` states at approximately equal intervals, and in the
+        state with the smallest distance.
         """
         rows = np.unique(np.linspace(0, len(self.time) - 1, most).round().astype(int))
         distances, _ = self._nearest_at(rows)

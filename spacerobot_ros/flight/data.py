@@ -1,8 +1,8 @@
 """The data of one flight: arrays over time, reports, measures and verdict.
 
 A bag need not contain everything: all components are optional. A commander evaluates its goal with
-the measured state, at the time of its decision. The verdict uses the true state at the end, with
-the errors in :attr:`FlightData.error`.
+the measured state, at the time of its decision. The verdict uses the true state at the end of the
+flight; its errors are in :attr:`FlightData.error`.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ _QUANTITY_SIZES = {
     **dict.fromkeys(("twist", "measured_twist", "expected_momenta"), 6),
     **dict.fromkeys(("target_twist", "true_target_twist"), 6),
 }
-"""Values per sample by quantity; other quantities have one value per joint."""
+"""Number of values per sample, by quantity; other quantities have one value per joint."""
 
 _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 
@@ -81,13 +81,13 @@ class Verdict:
     Attributes
     ----------
     word
-        The outcome in a few words, such as ``Reached, but for the position``.
+        The outcome in a few words, such as ``Reached, except for the position``.
     sentence
-        The message of the commander. If the goal is reached, or not in time, the true errors with
-        their tolerances.
+        The commander's message; if the goal is reached or the time limit has expired, a sentence
+        with the true errors and the tolerances.
     succeeded
-        Whether the true state reaches all controlled components of the goal, and an automatic
-        capture has happened.
+        Whether the true state reaches all controlled components of the goal, and whether any
+        automatic capture has taken place.
     complete
         Whether every component of the goal was also controlled.
     """
@@ -102,7 +102,7 @@ class Verdict:
 class FlightData:
     """The data of a flight, from :func:`spacerobot_ros.fly` or from a bag.
 
-    All arrays are copies; arrays of missing data have no rows.
+    All arrays are copies; arrays for which data are missing have no rows.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class FlightData:
     series
         All plant quantities by name, each with its times (s). The true quantities are ``pose`` (N,
         7), position (m) and quaternion (x, y, z, w) of the base in the world; ``twist`` (N, 6),
-        its velocities in its own frame, m/s and rad/s; ``q``, ``qdot``, ``effort`` (N, n), joint
+        base velocities in the base frame, m/s and rad/s; ``q``, ``qdot``, ``effort`` (N, n), joint
         positions (m or rad), rates and actuator efforts; ``momentum`` (N, 7), linear (kg m/s) and
         angular momentum (kg m^2/s) in the world and kinetic energy (J). For other quantities see
         :attr:`quantities`.
@@ -126,20 +126,20 @@ class FlightData:
     events
         Events of the nodes.
     outcome, message
-        The goal's outcome, and a sentence about it.
+        The goal's outcome, and a sentence describing it.
     goal, end_effector_goal
-        The active goals at the end; None: there is none.
+        The goals that are active at the end of the flight; None if there is no active goal.
     goals, end_effector_goals
         All goals that were sent.
     schedules
         The flown gaits, each with its start stamp, ns; empty for a bag.
     plant_statuses, diagnostics, covariances
-        Plant statuses, plant and commander diagnostics, and covariances (72,) of measured pose and
-        twist, each with the time of its first publication, ns. Empty for a bag;
-        no covariances if sensors have no errors.
+        Plant statuses, plant and commander diagnostics, and covariances (72,) of the measured pose
+        and twist, each with the time of its first publication, ns. Empty for a bag; no covariances
+        if the sensors have no errors.
     status, gait
-        The last status of the deciding commander, and the planner's status when its first gait
-        started.
+        The last status of the commander that decides the outcome, and the planner's status when its
+        first gait started.
     plan_time, wall_time
         Wall time for planning, and for the whole flight, s; NaN if unknown.
     refusals
@@ -177,7 +177,7 @@ class FlightData:
     # -- arrays -------------------------------------------------------------------------------
 
     def signal(self, name: str) -> Signal:
-        """Return a quantity over time; empty if the flight does not have it."""
+        """Return a quantity over time; empty if the flight does not contain it."""
         found = self.series.get(name)
         if found is not None:
             return found
@@ -221,10 +221,10 @@ class FlightData:
 
     @property
     def quantities(self) -> dict[str, Array]:
-        """The quantities without an attribute of their own, (N, size) each.
+        """The quantities that have no separate attribute, each of shape (N, size).
 
-        For names see :class:`~spacerobot_ros.simulation.sensors.ReportedState`: measured states
-        (only if sensors have errors), the end-effector, thrusters, expected momenta.
+        For the names, see :class:`~spacerobot_ros.simulation.sensors.ReportedState`: measured
+        states (only if sensors have errors), the end-effector, thrusters, expected momenta.
         """
         return {
             name: self.series[name].values for name in self.series if name not in _TRUE_QUANTITIES
@@ -246,18 +246,18 @@ class FlightData:
 
     @cached_property
     def target(self) -> RobotDescription | None:
-        """The second floating body; None: there is none."""
+        """The second floating body; None if there is no such body."""
         return load_target(self.scenario.plant.target)
 
     @cached_property
     def capture(self) -> dict[str, Any]:
         """The first capture of the target, with the keys of ``spacerobot run --json``.
 
-        Without a capture, ``captured`` is false, and ``nearest_m`` and ``nearest_time_s`` are the
-        smallest distance of the end-effector from the grapple frame, and its time; empty if there
-        is no target.
-        After a planned approach, ``detumble`` is the request, ``planned_momentum_Nms`` the plan
-        and ``angular_momentum_Nms`` the result.
+        If there was no capture, ``captured`` is false, and ``nearest_m`` and ``nearest_time_s`` are
+        the smallest distance of the end-effector from the grapple frame and the time at which it
+        occurs; the dictionary is empty if there is no target. After a planned approach,
+        ``detumble`` contains the requested momentum, ``planned_momentum_Nms`` the planned value and
+        ``angular_momentum_Nms`` the result.
         """
         planned: dict[str, Any] = {}
         for event in self.events:
@@ -293,7 +293,7 @@ class FlightData:
 
     @cached_property
     def capture_measures(self) -> CaptureMeasures:
-        """The capture measures; all are NaN without a target."""
+        """The capture measures; all are NaN if there is no target."""
         capture, detumbling = self.capture, self.detumbling
         if not capture:
             return CaptureMeasures()
@@ -445,14 +445,14 @@ class FlightData:
 
     @property
     def error(self) -> PoseError | None:
-        """Error of the last true pose relative to the goal; None without a base pose or goal."""
+        """Error of the last true pose relative to the goal; None if either is unknown."""
         goal = self.goal
         return None if goal is None or not goal.base else pose_error(self.signal("pose"), goal)
 
     @property
     def errors(self) -> Array:
-        """(N, 2) distances (m) and angles (rad) of the true poses from the final goal; no rows
-        without a base goal.
+        """(N, 2) distances (m) and angles (rad) of the true poses from the final goal; no rows if
+        there is no base goal.
         """
         if self.goal is None or not self.goal.base:
             return np.empty((0, 2))
@@ -463,7 +463,7 @@ class FlightData:
 
     @property
     def end_effector_error(self) -> PoseError | None:
-        """Error of the end-effector's last pose relative to its goal; None without a pose or a
+        """Error of the end-effector's last pose relative to its goal; None if there is no pose or
         goal.
 
         If there are several end-effectors, the one with the largest distance is used.
@@ -474,7 +474,7 @@ class FlightData:
 
     @property
     def end_effector_errors(self) -> dict[str, PoseError]:
-        """Errors in the last true poses of the end-effectors in the planner's goal."""
+        """Errors in the last true end-effector poses relative to the planner's goal."""
         goal, robot = self.goal, self.robot
         if goal is None or not goal.end_effectors or not len(self.q) or not len(self.pose):
             return {}
@@ -495,22 +495,23 @@ class FlightData:
 
     @property
     def planned_propellant(self) -> float | None:
-        """Propellant used by the last planned reference, kg; None without such a reference for
-        thrusters."""
+        """Propellant used by the last planned reference, kg; None if no reference with thrusters
+        was planned."""
         key = "planned_propellant_kg"
         found = [event.about[key] for event in self.events if key in event.about]
         return float(found[-1]) if found else None
 
     @cached_property
     def momentum_drift(self) -> Array:
-        """(2,) see :func:`~spacerobot_ros.measures.momentum_drift`; kg m/s and kg m^2/s."""
+        """(2,) drift of the linear and angular momentum, kg m/s and kg m^2/s; see
+        :func:`~spacerobot_ros.measures.momentum_drift`."""
         expected = self.series.get("expected_momenta")
         return momentum_drift(self.momentum, None if expected is None else expected.values)
 
     @cached_property
     def clearance(self) -> FlightClearance | None:
-        """The smallest distance between links over time; None if not measured, without joint
-        states, or if no links could touch.
+        """The smallest distance between links over time; None if it was not measured, there are no
+        joint states, or no pair of links can touch.
         """
         if self.robot is None or not self.measures_clearance:
             return None
@@ -524,7 +525,7 @@ class FlightData:
         )
 
     def mesh_of(self, shape: Shape) -> TriangleMesh:
-        """Return the triangles of a shape, from a file if it is a mesh.
+        """Return the triangles of a shape, read from a file if the shape is a mesh.
 
         Raises
         ------
@@ -541,7 +542,7 @@ class FlightData:
     def measured(self, *, clearance: bool = True) -> Measures:
         """Return the measures of the flight, which must have states.
 
-        ``clearance``: whether to measure the smallest distance between links, which is slow.
+        ``clearance``: whether to measure the smallest distance between links (slow).
         """
         wrench = self.commands.get("base_wrench")
         distance, angle = self._largest_end_effector_errors
@@ -604,7 +605,7 @@ class FlightData:
         left_out, missed = self.not_controlled, reached and self._automatic_capture_is_missing
         word = "Reached" if reached else "Failed"
         if reached and left_out:
-            word += f", but for the {' and '.join(left_out)}"
+            word += f", except for the {' and '.join(left_out)}"
         if missed:
             word += ", but the target is not captured"
         succeeded = self.outcome is Outcome.REACHED and not missed
@@ -631,7 +632,7 @@ class FlightData:
             sentence = (
                 f"The measured pose is within tolerance of the goal; the true pose is {errors}."
             )
-            return Verdict("Reached by the measured pose", sentence)
+            return Verdict("Reached according to the measured pose", sentence)
         controlled = frozenset(controls)
         parts = {} if goal is None else missed_parts(goal, error, controlled, tolerance)
         if not self.turns_end_effector:

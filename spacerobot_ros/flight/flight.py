@@ -1,7 +1,7 @@
-"""One flight: its data, its summary, and its views and files.
+"""One flight: its data, summary, views and files.
 
-A flight comes from the loop without ROS (:mod:`~spacerobot_ros.flight.lockstep`) or from a bag
-(:mod:`~spacerobot_ros.flight.reading`).
+A flight is produced by the loop without ROS (:mod:`~spacerobot_ros.flight.lockstep`) or read from a
+bag (:mod:`~spacerobot_ros.flight.reading`).
 """
 
 from __future__ import annotations
@@ -121,8 +121,8 @@ class Flight(FlightData):
     def to_pandas(self, *, euler: bool = False) -> pd.DataFrame:
         """Return a table with one row per state, indexed by time (s).
 
-        Columns and their units, ``attrs["units"]``, are as in bag tables. Columns of
-        ``odom`` and ``joint_states`` have the true state; other columns have their topic as a
+        Columns and their units (``attrs["units"]``) are the same as in bag tables. Columns of
+        ``odom`` and ``joint_states`` contain the true state; other columns have their topic as a
         prefix, such as ``momentum.data[linear_x]``. Measured states that differ from the true
         states have the prefix ``measured``. If ``euler`` is set, the columns ``roll``, ``pitch``
         and ``yaw`` contain each attitude's rotations about the fixed axes x, y, z (rad).
@@ -142,7 +142,8 @@ class Flight(FlightData):
     def to_xarray(self, *, euler: bool = False) -> xr.Dataset:
         """Return the columns of :meth:`to_pandas` as variables over ``time``, with their units.
 
-        Arrays remain arrays, over ``time`` and ``joint`` for joint states, as for bags.
+        Arrays are kept as arrays, with dimensions ``time`` and ``joint`` for joint states, as for
+        bags.
 
         Raises
         ------
@@ -165,7 +166,7 @@ class Flight(FlightData):
         }
 
     def plot(self) -> Any:
-        """Return a matplotlib figure: base pose and goal, joints, efforts or rates."""
+        """Return a matplotlib figure with base pose and goal, joints, and efforts or rates."""
         from spacerobot_ros.flight.views import figure
 
         return figure(self)
@@ -197,7 +198,7 @@ class Flight(FlightData):
         Raises
         ------
         RecordingError
-            The file exists and may not be replaced, or cannot be written; or the flight has no
+            The file exists and may not be replaced, or cannot be written, or the flight has no
             robot description.
         """
         from spacerobot_ros.flight.saved import save_flight

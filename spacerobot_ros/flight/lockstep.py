@@ -1,4 +1,5 @@
-"""A lockstep flight without ROS: the plant and its commanders, in the order of the nodes.
+"""A lockstep flight without ROS: the plant and its commanders, called in the same order as the
+nodes.
 
 Nodes in lockstep exchange messages in publication order. The
 loop makes the same calls in the same order:
@@ -7,11 +8,12 @@ loop makes the same calls in the same order:
 2. The planner responds as soon as the joint state arrives, the controller once the pose and the
    planner's reference, if any, have also arrived.
 3. The first command of the tick is used; the plant steps when all expected commands have arrived.
-4. The flight ends when the goal ends. The planner reports this before its command, so the last
-   state is from tick k; the controller after its commands, so the last state is from tick k + 1.
+4. The flight ends when the goal is completed. The planner reports completion before its command, so
+the last state is from tick k; the controller reports it after its commands, so the last state is
+from tick k + 1.
 
 The planner and the controller are the same :class:`~spacerobot_ros.commanding.commander.Commander`
-objects as in the nodes, given arrays instead of messages.
+objects as in the nodes, but receive arrays instead of messages.
 """
 
 from __future__ import annotations
@@ -76,9 +78,10 @@ class Robots:
     planner: SpaceRobot
     controller: SpaceRobot
     description: RobotDescription | None = None
-    """Description of the plant, with the URDF to record; None: the model's own description."""
+    """Description of the plant, with the URDF to record; None selects the model's description."""
     method: GaitMethod | None = None
-    """Gait method for the planner's robot and configuration; None: built for this flight."""
+    """Gait method for the planner's robot and configuration; by default, the method is built for
+    this flight."""
 
     @classmethod
     def of(
@@ -112,19 +115,19 @@ class Robots:
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Raise an error for a scenario that requires nodes: wall time, other processes, resumed
-    flights.
+    """Raise an error if a scenario requires ROS nodes, as it does for wall time, other processes or
+    a resumed flight.
 
     Raises
     ------
     ParameterError
-        The scenario requires nodes; the message gives the command.
+        The scenario requires nodes; the message names the command to use.
     """
     why = ""
     if not scenario.lockstep:
         why = "plant.time_mode is realtime"
     elif scenario.kills:
-        why = "it kills nodes in flight"
+        why = "it kills nodes during the flight"
     elif scenario.plant.resume_bag:
         why = "plant.resume_bag is set"
     elif any(scenario.config(name).resume_file for name in scenario.commanders):
@@ -153,11 +156,11 @@ def fly_scenario(
     Parameters
     ----------
     scenario
-        What to fly, in lockstep.
+        The scenario to fly in lockstep.
     robots
-        The models; None: the models named in the scenario.
+        The models; by default, the models named in the scenario.
     progress
-        Called with the flight's progress; may end the flight.
+        Called with the flight's progress; it may end the flight.
     longest
         Simulated time after which the flight is interrupted, s.
 
@@ -217,7 +220,7 @@ class LockstepFlight:
     Parameters
     ----------
     scenario
-        What to fly; :func:`require_flyable` must accept it.
+        The scenario to fly; :func:`require_flyable` must accept it.
     robots
         The models.
 
@@ -288,13 +291,13 @@ class LockstepFlight:
         progress: Progress = lambda now, end: False,
         longest: float = math.inf,
     ) -> Flight:
-        """Fly until the goal has ended; for parameters see :func:`fly_scenario`."""
+        """Fly until the goal is completed; for parameters see :func:`fly_scenario`."""
         began = time.perf_counter()
         interrupted = self._fly(progress, longest)
         return self.until_now(time.perf_counter() - began, interrupted)
 
     def interrupt(self) -> None:
-        """End the flight and the plan in progress; called from another thread."""
+        """End the flight and the plan in progress; this may be called from another thread."""
         self._interrupted = True
         for commander in (self._planner, self._controller):
             if commander is not None:
@@ -535,7 +538,8 @@ class LockstepFlight:
         self.log.events.append(replace(event, time_s=time, node=node))
 
     def until_now(self, wall_time: float, interrupted: str = "") -> Flight:
-        """Return the flight so far; ``interrupted`` gives the reason for an early end, if any."""
+        """Return the flight up to the current time; ``interrupted`` gives the reason for an early
+        end, if any."""
         decision = None if self._interrupted else self._follower.decision
         outcome = Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value)
         message = interrupted

@@ -63,7 +63,7 @@ class FlightLog:
             sources["propellant"] = self._propellant
         self._sources, self._parts = sources, tuple(sources.values())
         self._states: list[Array] = []
-        """All quantities of each state side by side."""
+        """All quantities of each state, in one row per state."""
         self._commands: dict[str, list[tuple[int, Array]]] = {
             source.topic: [] for source in commands.sources
         }

@@ -1,4 +1,4 @@
-"""Reads a flight from its bag; data not in the bag stay empty.
+"""Reads a flight from its bag; data missing in the bag are empty.
 
 :func:`read_flight` reads bags from any stack; :func:`read_run` reads complete bags recorded by
 ``spacerobot run``.
@@ -44,7 +44,7 @@ from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, StateField, goal_topic, path_topic, topic_named
 
 _SAME_CLOCK_TOLERANCE = 1.0
-"""If stamps differ by less from the log times, s, both come from the same clock."""
+"""If stamps differ from log times by less than this value (s), both come from the same clock."""
 
 _STATE_QUANTITIES = {"odom": ("pose", "twist"), "joint_states": ("q", "qdot", "effort")}
 """Quantities of the fields of the topics with true and measured variants."""
@@ -67,10 +67,11 @@ _FLIGHT_TOPICS = (
 """Topics read together for every flight, so that the bag is unpacked only once."""
 
 _NO_GOAL = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-"""Base goal if a bag has none, or leaves the base free."""
+"""Base goal if a bag contains no goal, or a goal that leaves the base free."""
 
 _ABSENT_MEANS_ZERO = (("planner", "clearance"), ("plant", "clearance_period"))
-"""Parameters missing from bags of earlier versions, by node: they were not in effect."""
+"""Parameters missing from bags recorded by earlier versions, by node; the features that these
+parameters control did not exist."""
 
 WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 """Paths of force and torque in a wrench message."""
@@ -86,7 +87,7 @@ class FlightBag(RecordedRobot):
     bag
         The recording.
     namespace
-        Namespace of the robot's topics, such as ``/robot_1``; empty for none.
+        Namespace of the robot's topics, such as ``/robot_1``; empty if there is no namespace.
     """
 
     def __init__(self, bag: Bag, namespace: str = "") -> None:
@@ -112,8 +113,8 @@ class FlightBag(RecordedRobot):
 
     @property
     def description(self) -> RobotDescription | None:
-        """The first readable robot description, with the last received obstacles; None if there is
-        none.
+        """The first readable robot description, with the last received obstacles; None if no
+        description is readable.
         """
         for text in self.bag.robot_descriptions(self.namespace):
             try:
@@ -127,7 +128,7 @@ class FlightBag(RecordedRobot):
     @cached_property
     def obstacles(self) -> list[tuple[int, RobotDescription | None]]:
         """The messages on the topic obstacles, with their log times, ns; None: no obstacles.
-        Messages that nodes reject are omitted.
+        Messages that the nodes would reject are omitted.
         """
         came = []
         for time_ns, message in self.messages("obstacles"):
@@ -226,7 +227,7 @@ class FlightBag(RecordedRobot):
             yield time_ns, replace(event, node=message.name.strip("/"))
 
     def goals(self, topic: str) -> tuple[SentGoal, ...]:
-        """Return valid goal poses, and the last poses of paths, in the odometry frame."""
+        """Return the valid goal poses, and the last pose of each path, in the odometry frame."""
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals, ids = [], GoalIds()
@@ -312,13 +313,13 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     path
         As for :func:`~spacerobot_ros.bag.read_bag`.
     namespace
-        Namespace of the robot's topics, with or without the leading slash; None: the first
-        namespace with an ``odom``, in alphabetical order.
+        Namespace of the robot's topics, with or without the leading slash; None selects the first
+        namespace with an ``odom`` topic, in alphabetical order.
 
     Raises
     ------
     RecordingError
-        There is no such bag or robot, or it is damaged.
+        The bag or the robot does not exist, or the bag is damaged.
     """
     bag = read_bag(path)
     prefixes = namespaces(bag)
@@ -334,7 +335,7 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
 
 
 def namespaces(bag: Bag) -> list[str]:
-    """Return the namespaces with an ``odom`` in a bag, in alphabetical order."""
+    """Return the namespaces with an ``odom`` topic in a bag, in alphabetical order."""
     found = {
         topic.rpartition("/")[0]
         for topic, kind in bag.topics.items()
@@ -345,7 +346,7 @@ def namespaces(bag: Bag) -> list[str]:
 
 
 def read_flight(bag: FlightBag) -> Flight:
-    """Return a flight with all data in its bag.
+    """Return a flight with all the data in its bag.
 
     Raises
     ------
@@ -408,12 +409,12 @@ def read_flight(bag: FlightBag) -> Flight:
 
 
 def require_states(bag: FlightBag, flight: Flight) -> None:
-    """Raise an error for a bag without poses, joint states or momenta.
+    """Raise an error if a bag lacks the poses, the joint states or the momenta.
 
     Raises
     ------
     RecordingError
-        One of them is missing.
+        The poses, joint states or momenta are missing.
     """
     for topic, quantity in (("odom", "pose"), ("joint_states", "q"), ("momentum", "momentum")):
         if not len(flight.signal(quantity)):
@@ -423,12 +424,12 @@ def require_states(bag: FlightBag, flight: Flight) -> None:
 
 
 def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Flight:
-    """Return a flight with the quantity ``propellant`` (N, 1), kg, integrated over its thrusts.
+    """Return a flight with the quantity ``propellant`` (N, 1), kg, integrated from its thrusts.
 
     Parameters
     ----------
     flight
-        A flight; returned unchanged if it has no thrusters, or already has that quantity.
+        A flight; it is returned unchanged if it has no thrusters or already contains that quantity.
     thrusters
         Source of the thruster table, as in the plant's parameters.
     names
@@ -449,7 +450,7 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
 
 
 def since(flight: Flight, start: float) -> Flight:
-    """Return a flight with times since ``start``, s."""
+    """Return a flight whose times are relative to ``start``, s."""
 
     def earlier(goals: tuple[SentGoal, ...]) -> tuple[SentGoal, ...]:
         return tuple(replace(sent, time=sent.time - start) for sent in goals)
@@ -470,7 +471,7 @@ def since(flight: Flight, start: float) -> Flight:
 
 
 def impulse(thrust: Signal, weights: Array) -> Signal:
-    """Return the time integral (N, 1) of thrusts (N, m), N, weighted by (m,)."""
+    """Return the time integral (N, 1) of thrusts (N, m), N, with weights (m,)."""
     ticks = np.diff(thrust.time, prepend=thrust.time[:1])
     total = np.cumsum(ticks * (thrust.values @ weights))
     return Signal(thrust.time, total[:, np.newaxis])
@@ -538,7 +539,8 @@ def recorded_actuation(robot: FlightBag) -> str:
     """Return the commanded quantity for a robot in a bag: ``velocity``, ``effort``, or
     nothing.
 
-    It is read from the plant's status. In bags without a plant status, wrenches imply efforts.
+    The quantity is read from the plant's status. In bags without a plant status, efforts are
+    assumed if there are wrench commands.
     """
     for _, message in reversed(list(robot.messages("plant/status"))):
         actuation = read_status(message).values.get("actuation", "")
@@ -559,7 +561,7 @@ def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any
 
 
 def recorded_target(robot: FlightBag) -> str:
-    """Return the URDF of a robot's target in a bag; empty without a target."""
+    """Return the URDF of a robot's target in a bag; empty if there is no target."""
     described = next(robot.messages("target/robot_description"), None)
     return "" if described is None else str(described[1].data)
 
@@ -586,8 +588,8 @@ def recorded_scenario(bag: Bag) -> Scenario:
     scenario = _scenario_in_bag(FlightBag(bag))
     if not scenario.has_goal or "plant" not in scenario.in_file:
         raise RecordingError(
-            f"The bag {bag.path} lacks the goal or the parameters of its flight, which bags "
-            f"recorded by 'spacerobot run' contain."
+            f"The bag {bag.path} lacks the goal or the parameters of its flight; bags recorded "
+            f"by 'spacerobot run' contain them."
         )
     return scenario
 
@@ -620,7 +622,7 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
     Raises
     ------
     RecordingError
-        There is no such bag, it is damaged, or it does not contain a complete lockstep flight.
+        The bag does not exist, is damaged, or does not contain a complete lockstep flight.
     SpaceRobotError
         Its robot is invalid.
     """
@@ -641,7 +643,7 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
     if len(flight.pose) != len(flight.q):
         raise RecordingError(
             f"The bag {bag.path} has {len(flight.pose)} base poses and {len(flight.q)} "
-            "joint states: its flight is incomplete."
+            "joint states: the flight is incomplete."
         )
     if not flight.goals and not scenario.goal.end_effectors:
         raise RecordingError(f"The bag {bag.path} contains no goal pose.")

@@ -1,4 +1,4 @@
-"""A flight as a bag, as if published by the nodes, and as a table.
+"""Converts a flight to a bag, with the messages that the nodes would publish, and to a table.
 
 A table has the same columns and units as the bag's tables.
 """
@@ -60,10 +60,12 @@ _GOAL_STAMP_NS = 1
 
 
 _BLOCK_NS = 60 * SECOND
-"""Time span of messages created at once, ns: a whole long flight would fill the memory."""
+"""Time span, in ns, of the messages created at once: all messages of a long flight would exhaust
+the memory."""
 
 _CHUNK_SIZE = 262_144
-"""Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
+"""Chunk size before compression, bytes: larger chunks have lower fixed costs, but make seeking
+slower."""
 
 _PUBLISHED_QOS = QosProfile(depth=100)
 """QoS offered by the nodes on topics that are not latched."""
@@ -86,7 +88,7 @@ class _Stream:
     def of(
         cls, topic: Topic, messages: Iterable[tuple[int, bytes]], stamp_ns: int | None = None
     ) -> _Stream:
-        """Return the stream for messages with their times, given in any order."""
+        """Return a stream of messages with their times; the messages may be in any order."""
         ordered = sorted(messages, key=lambda each: each[0])
         times = np.array([time for time, _ in ordered], dtype=np.int64)
         found = [message for _, message in ordered]
@@ -101,7 +103,7 @@ def save_flight(
     Raises
     ------
     RecordingError
-        The file exists and may not be replaced, or cannot be written; or a message type is not
+        The file exists and may not be replaced, or cannot be written, or a message type is not
         installed.
     """
     flight.required_robot()

@@ -1,7 +1,8 @@
 """Comparison of a recorded flight with another engine under the same commands.
 
-In each tick, the engine receives the external loads and the joint rates, or efforts and wrench,
-realised by the plant's actuators after limits and faults; its states are compared with the bag.
+In each tick, the engine receives the external loads, and the joint rates (or efforts and wrench)
+realised by the plant's actuators after limits and faults. The engine's states are compared with
+those in the bag.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from spacerobot_ros.simulation.mujoco_plant import DEFAULT_INTEGRATION_STEP, Muj
 from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 
 AGREEMENT_TOLERANCE = 1e-8
-"""Maximum deviation of an engine from a flight in agreement, m or rad."""
+"""Maximum deviation at which an engine agrees with a flight, m or rad."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class EngineComparison:
     time
         Simulated time of the largest difference, s.
     stop_reason
-        Reason why the engine stopped early; empty: the replay was completed.
+        Reason why the engine stopped early; empty if the replay was completed.
     """
 
     engine: str
@@ -66,7 +67,7 @@ class EngineFlight:
     Parameters
     ----------
     plant
-        The plant in its first state.
+        The plant in its initial state.
     period
         Duration of a tick, s.
 

@@ -16,7 +16,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatus
 
 _FLOWN_STATES = frozenset(("executing", "reached", "reached_partly", "failed", "aborted"))
-"""Status states whose goal is being or has been pursued."""
+"""Commander states in which the goal is being or has been pursued."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Commands:
     values
         (N, size) values used by the plant or the controller.
     setpoints
-        (N, 2 n) joint positions and rates in a planner's messages; None: not known.
+        (N, 2 n) joint positions and rates in a planner's messages; None if not known.
     """
 
     tick: npt.NDArray[np.int64]
@@ -78,7 +78,7 @@ class SentGoal:
 
 
 def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
-    """Return the error of the last pose relative to a goal; None without a pose or a goal."""
+    """Return the error of the last pose relative to a goal; None if there is no pose or goal."""
     if goal is None or not len(poses):
         return None
     return PoseError.between(poses.values[-1, :3], poses.values[-1, 3:], goal)
@@ -87,7 +87,7 @@ def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:
 def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
     """Return the goal in a status: the base goal as sent, and the link goals.
 
-    None for a status without a goal.
+    None if the status has no goal.
     """
     base = _reported_base_goal(status, goals)
     links = status.end_effector_goals if isinstance(status, PlannerStatus) else {}
@@ -119,7 +119,8 @@ def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | Non
 
 
 def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
-    """Return the last pursued goal, or else the last goal that was sent or reported."""
+    """Return the last pursued goal; if there is none, return the last goal that was sent or
+    reported."""
     reported = [(each, reported_goal(each, goals)) for each in statuses]
     for status, goal in reversed(reported):
         if status.state.value in _FLOWN_STATES and goal is not None:

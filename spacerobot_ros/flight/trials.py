@@ -1,4 +1,5 @@
-"""Plans evaluated in the plant without ROS: for one goal with all methods, or for random goals."""
+"""Evaluates plans in the plant without ROS: the plans of all methods for one goal, or plans for
+random goals."""
 
 from __future__ import annotations
 
@@ -62,7 +63,7 @@ class PlanningProblem:
 
     @classmethod
     def of(cls, scenario: Scenario) -> PlanningProblem:
-        """Return a scenario's planning problem, for its base goal.
+        """Return the planning problem for a scenario's base goal.
 
         Raises
         ------
@@ -115,7 +116,7 @@ class PlanEvaluation:
     pieces
         Successive schedules; only one, unless the method plans in stages.
     error
-        Final error in ``pose`` and joints.
+        Final error in ``pose`` and in the joint positions.
     pose
         (7,) final base pose in W: position (m) and quaternion.
     limited
@@ -174,14 +175,14 @@ def robot_state_of(plant: VelocityPlant) -> RobotState:
 def try_method(
     problem: PlanningProblem, name: str, method: GaitMethod | None = None
 ) -> PlanEvaluation:
-    """Plan with the named method (or a given ``method``), and fly the schedule in the plant.
+    """Plan with the named method (or the given ``method``) and fly the schedule in the plant.
 
     Raises
     ------
     PlanningError
         The method rejects the goal.
     ParameterError
-        An option does not suit the robot.
+        An option is invalid for the robot.
     """
     plant, tolerance = problem.plant(), problem.config.tolerance
     pieces: list[GaitSchedule] = []
@@ -234,13 +235,14 @@ def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotEr
 
 
 def fastest(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> PlanEvaluation | None:
-    """Return the shortest plan that ends within tolerance; None if no plan does."""
+    """Return the shortest plan that ends within tolerance; None if there is no such plan."""
     reached = [each for each in plans.values() if isinstance(each, PlanEvaluation) and each.reached]
     return min(reached, key=lambda plan: plan.duration, default=None)
 
 
 def random_goals(problem: PlanningProblem, count: int, distance: float, angle: float) -> list[Goal]:
-    """Return goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed seed.
+    """Return random goals within ``distance`` (m) and ``angle`` (rad) of the start, with a fixed
+    seed.
 
     Rotation axes are uniformly distributed; planar robots rotate about their axis.
 
@@ -251,8 +253,8 @@ def random_goals(problem: PlanningProblem, count: int, distance: float, angle: f
     """
     if not (0.0 <= distance < math.inf and 0.0 <= angle < math.inf):
         raise ParameterError(
-            f"Random goals lie within {distance:g} m and {math.degrees(angle):g} deg of the start; "
-            "both must be finite and not negative."
+            f"Random goals lie within {distance:g} m and {math.degrees(angle):g} deg of the "
+            "start; both bounds must be finite and not negative."
         )
     rng = np.random.default_rng(0)
     start = problem.plant().pose
@@ -278,7 +280,7 @@ def try_goals(
 ) -> dict[str, list[PlanEvaluation | PlanningError]]:
     """Plan every goal with every method, and return the results by method, in goal order.
 
-    ``show`` receives a line about each result.
+    ``show`` is called with one line of text for each result.
     """
     tight = replace(
         problem.config,

@@ -1,4 +1,5 @@
-"""Re-simulates the plant with the commands in a bag, and compares the published states."""
+"""Re-simulates the plant with the commands in a bag, and compares the results with the published
+states."""
 
 from __future__ import annotations
 
@@ -35,11 +36,12 @@ from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import Topic, state_topics
 
 TOLERANCE = 1e-9
-"""Accepted deviation, absolute below 1 (SI units) and relative above."""
+"""Accepted deviation: absolute for values below 1 (SI units), relative for larger values."""
 
 
 _MAX_TICKS_PER_STATE, _MAX_SILENT_TICKS = 10, 20_000
-"""A paused recorder leaves a gap; stamps that do not belong to a flight leave a larger gap."""
+"""Limits on the gaps between states, in ticks: a paused recorder leaves a gap, and stamps from
+another source leave a larger gap."""
 
 _COMPARED_FIRST = {"joint_states": 0, "odom": 1}
 """Ranks of topics to compare first: their differences explain differences in other topics."""
@@ -49,7 +51,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Difference:
-    """A value in the bag that does not follow from the commands, or has the largest deviation.
+    """A value in the bag that does not follow from the commands, or that has the largest deviation.
 
     Attributes
     ----------
@@ -58,9 +60,10 @@ class Difference:
     topic, field
         Name of the number.
     recorded, expected
-        Its value in the bag, and in the re-simulation.
+        The value in the bag, and the value in the re-simulation.
     remark
-        What is known about the commands behind it: a clause in brackets, or an empty string.
+        Remark on the commands that cause the difference: a clause in parentheses, or an empty
+        string.
     """
 
     time: float
@@ -73,7 +76,7 @@ class Difference:
     def __str__(self) -> str:
         return (
             f"{self.topic} at {self.time:.9g} s: {self.field} is {self.recorded:.12g} in the bag "
-            f"and {self.expected:.12g} by its commands{self.remark}."
+            f"and {self.expected:.12g} according to the commands{self.remark}."
         )
 
 
@@ -84,11 +87,12 @@ class Verification:
     Attributes
     ----------
     ticks, duration
-        The re-simulated part; the duration in s of simulated time.
+        Number of re-simulated ticks, and their duration in s of simulated time.
     messages, topics
         Number of compared messages, and their topics.
     missing
-        Message about states missing according to the bag's own counts; empty: none are missing.
+        Message about states that are missing according to the message counts in the bag; empty if
+        none are missing.
     second_opinion
         The differences from another engine under the same commands, if requested.
     largest, largest_at
@@ -119,16 +123,16 @@ def verify_bag(
     path
         As for :func:`~spacerobot_ros.bag.read_bag`.
     tolerance
-        Accepted deviation, absolute below 1 (SI units) and relative above.
+        Accepted deviation: absolute for values below 1 (SI units), relative for larger values.
     mujoco
         Whether MuJoCo also replays the commands realised by the plant's actuators.
 
     Raises
     ------
     RecordingError
-        There is no such bag, it is damaged, or it does not contain a lockstep flight.
+        The bag does not exist, is damaged, or does not contain a lockstep flight.
     SpaceRobotError
-        Its robot or its plant parameters are invalid, or MuJoCo is not installed.
+        The robot or the plant parameters in the bag are invalid, or MuJoCo is not installed.
     """
     flight = _RecordedPlant.of(read_bag(path))
     published = _published_topics(flight)
@@ -143,8 +147,8 @@ def verify_bag(
     if first < 0 or last - first > _MAX_SILENT_TICKS + _MAX_TICKS_PER_STATE * states:
         raise RecordingError(
             f"The states in the bag {flight.path} are stamped {first * flight.config.period_ns}"
-            f" to {last * flight.config.period_ns} ns, and there are {states} of them: a flight "
-            "has a state in every tick."
+            f" to {last * flight.config.period_ns} ns, and there are {states} of them: a complete "
+            "flight has a state in every tick."
         )
     initial, rates = _initial_state(first, published, flight)
     resimulation = _resimulate(flight, initial, rates, first, last, mujoco=mujoco)
@@ -200,7 +204,8 @@ class _RecordedPlant:
         if names != list(description.joint_names):
             # This check comes before the slow derivation of the robot's equations.
             raise RecordingError(
-                f"The joint states in the bag {bag.path} are of {', '.join(names)}; its robot has "
+                f"The joint states in the bag {bag.path} have the joints {', '.join(names)}; its "
+                "robot has "
                 f"{', '.join(description.joint_names)}."
             )
         robot = SpaceRobot(config.assumed_robot(description))
@@ -287,7 +292,7 @@ def _plant_config(recorded: FlightBag) -> PlantConfig:
         ) from error
     if config.time_mode != "lockstep":
         raise RecordingError(
-            f"The bag {bag.path} was flown in real time, and does not record the command "
+            f"The bag {bag.path} was flown in real time and does not contain the command "
             "that the plant held in each tick: only lockstep flights can be verified."
         )
     return config
@@ -304,7 +309,8 @@ class _PublishedTopic:
     labels: list[str]
 
     def after(self, tick: int) -> _PublishedTopic:
-        """Omit the messages until a tick; thruster on-times are counted from there."""
+        """Omit the messages up to and including a tick; thruster on-times are counted from that
+        tick."""
         kept = self.ticks > tick
         values = self.values[kept]
         if self.topic.array_entries_of == "thrusters" and not kept.all():
@@ -313,15 +319,15 @@ class _PublishedTopic:
         return replace(self, ticks=self.ticks[kept], values=values)
 
     def is_determined_by(self, states: dict[str, Floats]) -> bool:
-        """Whether a re-simulation has all quantities of the topic, with the same sizes."""
+        """Whether a re-simulation contains all quantities of the topic, with the same sizes."""
         names = [each.quantity for each in self.topic.state]
         if not all(name in states for name in names):
             return False
         return sum(states[name].shape[1] for name in names) == self.values.shape[1]
 
     def expected(self, states: dict[str, Floats], rows: NDArray[np.int64]) -> Floats:
-        """Return the values of the re-simulation for each message, in the shape of the bag's
-        values."""
+        """Return the re-simulated values for each message, as an array of the same shape as the
+        bag's values."""
         expected = np.hstack([states[each.quantity][rows] for each in self.topic.state])
         start = 0
         for each in self.topic.state:
@@ -638,12 +644,12 @@ class _Comparison:
             return f" (its plant had stopped: {done.stopped.rstrip('.')})"
         if done.latched is not None and tick > done.latched:
             time = self._format_time(done.latched)
-            return f" (a fault latched at {time}; rearming is not in a bag)"
+            return f" (a fault latched at {time}; rearming is not recorded)"
         if before in done.refusals:
             topic, refusal = done.refusals[before]
             name = f"{self._flight.recorded.namespace}/{topic}"
             stamp = self._format_time(before)
-            return f" (that on {name} stamped {stamp} is rejected: {refusal.clause})"
+            return f" (the command on {name} stamped {stamp} is rejected: {refusal.clause})"
         if tick > done.first and before not in done.commanded_ticks:
             name = f"{self._flight.recorded.namespace}/joint_commands"
             return f" (no message on {name} is stamped {self._format_time(before)})"

@@ -1,4 +1,4 @@
-"""Views of a flight: a figure, an animation. matplotlib is loaded here."""
+"""Views of a flight: a figure and an animation. matplotlib is loaded here."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Picture(Figure):
 
 
 class Animation:
-    """An animation as HTML, which notebooks show; :meth:`save` writes the page.
+    """An HTML animation that notebooks show; :meth:`save` writes it as a page.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Animation:
 
     def __repr__(self) -> str:
         size = len(self.html) / 1e6
-        return f"<Animation, {size:.1f} MB of HTML: show it in a notebook, or save(PATH)>"
+        return f"<Animation, {size:.1f} MB of HTML: show it in a notebook or call save(PATH)>"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the animation as a separate page; an existing file is replaced.
@@ -111,13 +111,13 @@ def _plot_lines(
 
 
 def animation(flight: FlightData, seconds: float, frames: int) -> Animation:
-    """Draw the robot in motion: its joints as points, the links between them as lines."""
+    """Draw the robot in motion, with its joints as points and the links between them as lines."""
     from matplotlib.animation import FuncAnimation
 
     if not isinstance(frames, int) or not 1 <= frames <= _MAX_FRAMES:
-        raise ParameterError(f"An animation has 1 to {_MAX_FRAMES} frames, not {frames!r}.")
+        raise ParameterError(f"An animation must have 1 to {_MAX_FRAMES} frames, not {frames!r}.")
     if not (isinstance(seconds, int | float) and 0 < seconds < math.inf):
-        raise ParameterError(f"An animation lasts more than 0 s, not {seconds!r}.")
+        raise ParameterError(f"An animation must last more than 0 s, not {seconds!r}.")
     rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
     skeleton = _Skeleton(flight.required_robot())
     shapes = skeleton.points(flight.pose[rows], flight.q[rows])
@@ -194,7 +194,8 @@ class _Skeleton:
         ]
 
     def points(self, poses: Array, q: Array) -> Array:
-        """Return the points (K, 2 L, 3) in the world, m: the frames, then the centres of mass."""
+        """Return the points (K, 2 L, 3) in the world, m: the origins of the frames, then the
+        centres of mass."""
         R_WL, r_WL = self._kinematics.poses_in_world(poses, q)
         centers = r_WL + np.einsum("klij,lj->kli", R_WL, self._com)
         return np.concatenate([r_WL, centers], axis=1)

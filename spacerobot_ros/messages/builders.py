@@ -76,7 +76,7 @@ class RobotTransforms:
     prefix
         Prefix of link names, like robot_state_publisher's ``frame_prefix``.
     links
-        Whether to include the transforms of all links or only of the base link.
+        Whether to include the transforms of all links or only that of the base link.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class StateFrames:
         self._joints = JointReader(description.joint_names, ["position"], measured=True)
 
     def accept(self, odom: bytes, joint_states: bytes) -> None:
-        """Use the serialised messages as the new state.
+        """Take the new state from the serialised messages.
 
         Raises
         ------
@@ -170,7 +170,7 @@ POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 def state_message(
     topic: Topic, names: Sequence[str], world: str, base: str, target: str = ""
 ) -> bytes:
-    """Return a state topic message with all values zero.
+    """Return a message for a state topic, with all values set to zero.
 
     Parameters
     ----------

@@ -73,9 +73,10 @@ _PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring"
 def message_definition(type_name: str) -> str:
     """Return the full definition of a message type as rosbag2 writes it to a schema.
 
-    It consists of the ``.msg`` file, followed by a separator line, ``MSG: package/Type`` and the
-    definition of each type it uses, depth first, in alphabetical order and each once (``ros2msg``).
-    Types of ROS 2 Jazzy that are not installed are defined without comments.
+    The definition consists of the ``.msg`` file and one section per nested type (the ``ros2msg``
+    encoding): a separator line, ``MSG: package/Type`` and the definition. Sections are in
+    depth-first, alphabetical order. Definitions of ROS 2 Jazzy types that are not installed contain
+    no comments.
 
     Raises
     ------
@@ -126,8 +127,8 @@ def _with_dependencies(name: _InterfaceName, seen: set[str]) -> str:
 def type_hash(type_name: str) -> str:
     """Return the type hash by which ROS 2 distinguishes message type versions.
 
-    It is ``RIHS01_`` followed by 64 hexadecimal digits; empty if the package was installed without
-    type descriptions (``share/<package>/msg/<Type>.json``). Raises as
+    The hash is ``RIHS01_`` followed by 64 hexadecimal digits; it is empty if the package was
+    installed without type descriptions (``share/<package>/msg/<Type>.json``). Raises as
     :func:`message_definition` does.
     """
 
@@ -145,9 +146,9 @@ def type_hash(type_name: str) -> str:
 
 def message_module(type_name: str) -> tuple[str, str, str]:
     """Return the Python module of an installed message type, and two class names. The first class
-    is the interface exported by the module. The second is the message itself, in the interface's
-    module; the two differ for service and action components. RecordingError: the name is not a
-    message type, or the package is not installed.
+    is the interface that the module exports. The second class is the message; the two differ for
+    service and action components. RecordingError: the name is not a message type, or the package is
+    not installed.
     """
     name = _InterfaceName.of(type_name)
     name.file()
@@ -212,7 +213,7 @@ def _share_folder(package: str) -> Path:
     if not folder.is_dir():
         raise RecordingError(
             f"The message package {package} is neither on AMENT_PREFIX_PATH nor in "
-            f"{folder.parent}: install it, or source the workspace that has it."
+            f"{folder.parent}: install it, or source the workspace that contains it."
         )
     return folder
 
@@ -275,7 +276,7 @@ class MessageType:
 
 
 message_type = lru_cache(maxsize=64)(MessageType)
-"""Return a :class:`MessageType`, with code generated once for all bags."""
+"""Return a :class:`MessageType`; its code is generated once and shared by all bags."""
 
 
 def _parsed(text: str, type_name: str) -> Any:

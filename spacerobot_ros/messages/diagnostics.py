@@ -1,4 +1,4 @@
-"""Diagnostics of a plant and its commanders as diagnostic_msgs/DiagnosticArray records."""
+"""Diagnostics of a plant and its commanders, as records in a diagnostic_msgs/DiagnosticArray."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ PROPELLANT_KEY = "propellant_kg"
 """Key of the propellant consumption."""
 
 _MOMENTUM_ROUNDING = 1e-9
-"""Largest momentum change due to rounding, divided by the mass, m/s and m^2/s."""
+"""Largest changes of linear and angular momentum due to rounding, divided by the mass, m/s and
+m^2/s."""
 
 _MILLISECONDS = 1e3
 
@@ -26,7 +27,8 @@ _OK, _WARN, _ERROR = 0, 1, 2
 
 
 def diagnostic_name(node: str, part: str) -> str:
-    """Return the name of a node component in /diagnostics, as formed by diagnostic_updater.
+    """Return the name by which a node component appears in /diagnostics, as formed by
+    diagnostic_updater.
 
     Aggregators match name prefixes and build a tree from them, so there is no leading slash.
     """
@@ -56,15 +58,15 @@ def state_diagnostics(
     Parameters
     ----------
     node, robot
-        Full node name, and robot name.
+        Full name of the node, and name of the robot.
     ignored
-        Numbers of ignored states, or ignored parts of states, by key.
+        Numbers of ignored states, or of ignored parts of states, by diagnostics key.
     last
-        The last published status; None: none yet.
+        The last published status; None if none yet.
     warning
-        A warning to publish instead of the status; empty: none.
+        A warning to publish instead of the status; empty if there is no warning.
     missing
-        Clause describing what the commander waits for; empty: nothing.
+        Clause describing what the commander waits for; empty if nothing.
     """
     level = _WARN if warning or missing else _OK
     message = warning or (f"waiting for {missing}" if missing else "responding to states")
@@ -85,7 +87,7 @@ def _record(
 class PlantDiagnostics:
     """The diagnostics of one plant.
 
-    A level is a warning if its counters have changed since the last diagnostics.
+    A record has level WARN if its counters have changed since the last diagnostics message.
 
     Parameters
     ----------
@@ -107,7 +109,7 @@ class PlantDiagnostics:
         self._node, self._real_time = node, real_time
         self.observe(commands, plant)
         self.command_timeouts = 0
-        """Number of command timeouts, counted by the owner."""
+        """Number of command timeouts, set by the caller."""
         self._last_refusal = ""
         self._reported = self._counters()
         self._unmet_reported = 0
@@ -117,8 +119,7 @@ class PlantDiagnostics:
         self._commands, self._plant = commands, plant
 
     def note_refusal(self, source: CommandSource, refusal: Refusal) -> str:
-        """Record a refused command, already counted by its validator; return a sentence about
-        it."""
+        """Record and describe a rejected command, which the validator has already counted."""
         self._last_refusal = f"A command on '{source.topic}' was refused: {refusal.clause}."
         return self._last_refusal
 
@@ -163,7 +164,7 @@ class PlantDiagnostics:
         commands = self._commands
         level, message = _WARN if refused else _OK, "commands arrive"
         if not commands.in_force:
-            message = "no command is in force"
+            message = "no command is active"
         if commands.fault:
             level = _ERROR
             message = f"{latched_text(commands.fault)}."
@@ -186,7 +187,7 @@ class PlantDiagnostics:
         return self._record(
             "actuators",
             _WARN if limited else _OK,
-            "limits of the URDF hold joints back" if limited else "within limits",
+            "joints are limited by the URDF" if limited else "within limits",
             {
                 f"{what}_limited.{joint}": count
                 for what, counts in self._plant.limit_counts.items()
@@ -248,7 +249,7 @@ class PlantDiagnostics:
         self._unmet_reported = modulator.unmet_periods
         sentences = [f"they cannot produce {modulator.missing}"] if modulator.missing else []
         if unmet:
-            sentences.append("the requested wrench exceeds their thrust")
+            sentences.append("the requested wrench exceeds the available thrust")
         force, torque = np.linalg.norm(modulator.unmet[:3]), np.linalg.norm(modulator.unmet[3:])
         return self._record(
             "thrusters",

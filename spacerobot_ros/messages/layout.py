@@ -1,9 +1,9 @@
 """Field positions in serialised messages: little-endian CDR, as exchanged by ROS 2.
 
-Most topics repeat one layout, with the same frame names and the same number of joints. A field then
-has the same position in every message, where it can be read or overwritten. Its values over many
-messages are a slice of one byte matrix, which is about a hundred times faster than decoding each
-message.
+On most topics, all messages have the same layout: the frame names and the number of joints are
+constant. A field then has the same position in every message and can be read or overwritten there.
+The values of a field in many messages are a slice of one byte matrix; reading them is about a
+hundred times faster than decoding each message.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ DTYPES = {
     "float32": np.dtype("<f4"),
     "float64": np.dtype("<f8"),
 }
-"""Number types in serialised messages, by name in definitions."""
+"""Number types in serialised messages, by their names in message definitions."""
 
 ENCAPSULATION = 4
-"""Length of the CDR header, bytes; alignment is relative to its end."""
+"""Length of the CDR header, bytes; alignment is relative to the end of the header."""
 
 BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
 """First two bytes of a CDR message in either byte order."""
@@ -54,7 +54,7 @@ class Leaf:
     Attributes
     ----------
     offset, size
-        First byte and number of bytes; for a string, without the terminating zero.
+        First byte and number of bytes; for a string, excluding the terminating zero.
     dtype
         Type of the numbers; None for a text.
     shape
@@ -70,8 +70,8 @@ class Leaf:
 class Layout:
     """Field positions in one serialised message.
 
-    Another message of the type has the same layout if its size and its ``lengths`` bytes are equal,
-    and the same strings if its ``fixed`` bytes are equal.
+    Another message of this type has the same layout if its size and its ``lengths`` bytes are
+    identical, and the same strings if its ``fixed`` bytes are identical.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Layout:
     type_name
         Such as ``nav_msgs/msg/Odometry``.
     fields
-        Definitions of the type and of all nested types; by default the installed ones.
+        Definitions of the type and of all nested types; by default, those of the installed types.
     elements
         Whether fields inside lists get paths, such as ``markers[2].pose.position.x``.
 
@@ -91,15 +91,15 @@ class Layout:
     counts
         Number of strings or messages in each list.
     starts
-        First byte after the length field of each such list.
+        First byte after the length field of each list of strings or messages.
     texts
         Byte span of each list of strings.
     ends
-        First byte after each element of such a list, if ``elements`` is set.
+        First byte after each element of a list of strings or messages, if ``elements`` is set.
     lengths
         First bytes of the length fields (uint32) of strings and lists.
     fixed
-        Byte spans of these length fields and of all strings, in message order.
+        Byte spans of all length fields and strings, in message order.
     end
         First byte after the last field.
 
@@ -130,7 +130,7 @@ class Layout:
         self._walk(type_name, "")
 
     def _walk(self, type_name: str, prefix: str | None) -> None:
-        """Add the fields of a type below ``prefix``; None: the fields get no paths."""
+        """Add the fields of a type below ``prefix``; None if the fields get no paths."""
         for name, (kind, detail) in self._fields[type_name][1]:
             path = None if prefix is None else prefix + name
             if kind == Nodetype.BASE:
@@ -188,7 +188,7 @@ class Layout:
         self.end += size
         if self.end > len(self._message):
             # Without this check a false count of 4e9 messages would be accepted.
-            raise IndexError("the message ends before its fields")
+            raise IndexError("the message ends before its last field")
 
     def _read_length(self) -> int:
         self._align(4)
@@ -257,7 +257,7 @@ def _encode_field(buffer: bytearray, fields: Fields, node: Any, value: Any) -> N
             dtype = DTYPES[element[1][0]]
             data = np.zeros(count, dtype) if value is None else np.asarray(value, dtype)
             if data.shape != (count,):
-                raise ValueError(f"{count} numbers are required, not {data.shape}")
+                raise ValueError(f"{count} numbers are required; the shape is {data.shape}")
             _append_aligned(buffer, data.tobytes(), dtype.itemsize)
         else:
             for each in [None] * count if value is None else value:
@@ -290,13 +290,13 @@ def encode_list(
     Parameters
     ----------
     type_name, values
-        The message without its list, as in :func:`encode`.
+        Values of the message without the list, as in :func:`encode`.
     name
         Field of the list.
     element
         Values common to all elements; arrays have their final lengths.
     columns
-        Numbers (N, size), one row per element, by the path in an element at which they begin.
+        Numbers (N, size), one row per element, keyed by the path of the first field in an element.
     """
     count = len(next(iter(columns.values())))
     if not count:
@@ -333,7 +333,7 @@ def stamped_copies(
     stamps_ns
         (N,) header or clock stamps, ns; ignored if the message has neither.
     columns
-        Numbers (N, size) by the path at which they begin.
+        Numbers (N, size), keyed by the path of their first field.
     """
     leaves = Layout(prototype, type_name).leaves
     table = np.tile(np.frombuffer(prototype, np.uint8), (len(stamps_ns), 1))
@@ -357,7 +357,8 @@ def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
 
 
 class Columns:
-    """Fields with the same position in all messages of a list, as arrays over the messages."""
+    """Fields with the same position in all messages of a list, as arrays with one entry per
+    message."""
 
     def __init__(
         self, matrix: NDArray[np.uint8], leaves: dict[str, Leaf], texts: dict[str, slice]
@@ -372,7 +373,7 @@ class Columns:
         return self._leaves.keys()
 
     def constant(self, path: str) -> bool:
-        """Whether a list of strings is the same in all messages."""
+        """Whether a list of strings is identical in all messages."""
         part = self._texts.get(path)
         return part is not None and bool((self._matrix[:, part] == self._matrix[0, part]).all())
 

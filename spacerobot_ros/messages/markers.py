@@ -1,6 +1,6 @@
 """Markers for a robot, its target, obstacles, goal and planned path, for viewers.
 
-All are in the world frame, so that a viewer needs no transforms.
+All markers are in the world frame, so that a viewer needs no transforms.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
     """Return markers for the base at its goal, the planned base path as a line, and an
     end-effector's goal path.
 
-    The base at its goal is drawn with the visuals of the base link and of the links fixed to it.
+    The goal pose is drawn with the visuals of the base link and of the links fixed to it.
     """
     markers: list[dict[str, Any]] = []
     base = Pose(matrix_from_quaternion(goal.quaternion), goal.position)
@@ -116,7 +116,7 @@ class RobotMarkers:
     Parameters
     ----------
     robot, target
-        The robot and the target; None: there is none.
+        The robot and the target; None for one that does not exist.
     frame
         Name of the world frame.
     """
@@ -124,11 +124,11 @@ class RobotMarkers:
     def __init__(self, robot: RobotDescription, target: RobotDescription | None, frame: str):
         self._robot, self._target, self._frame = robot, target, frame
         self._drawn: set[tuple[str, int]] = set()
-        """Namespaces and IDs of all markers so far."""
+        """Namespaces and IDs of all markers created so far."""
         self.use_obstacles(robot.world)
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Draw other obstacles from now on; None: none."""
+        """Replace the obstacles to draw; None: none."""
         robot, target, frame = self._robot, self._target, self._frame
         poses: list[tuple[int, Pose]] = []
         markers: list[dict[str, Any]] = []
@@ -137,7 +137,7 @@ class RobotMarkers:
                 markers.append(shape_marker(shape, frame, link.name, len(markers)))
                 poses.append((index, shape.pose))
         self._of_target: list[Pose] = []
-        """Poses of the target visuals in its root link frame."""
+        """Poses of the target's visuals in the frame of its root link."""
         for link in () if target is None else target.links:
             for shape in link.shapes:
                 markers.append(shape_marker(shape, frame, link.name, len(markers)))
@@ -153,7 +153,8 @@ class RobotMarkers:
         markers += [_erased(*each) for each in sorted(self._drawn - present)]
         self._drawn |= present
         self.draws_anything = bool(markers)
-        """Whether there is any marker: the robot, target and obstacles may have no visuals."""
+        """Whether there are any markers; the robot, the target and the obstacles may all lack
+        visuals."""
         self._template = MessageTemplate(MARKER_ARRAY, encode(MARKER_ARRAY, {"markers": markers}))
         moved = len(poses) + len(self._of_target)
         self._places = [

@@ -1,8 +1,10 @@
-"""Readers and writers of serialised messages that repeat one layout; values are accessed in place.
+"""Readers and writers of serialised messages that all have one layout; values are accessed in
+place.
 
 rclpy spends most of a tick converting Python objects to bytes and back. A state message has the
-same layout every tick, so it is serialised once and its values are written into the bytes; a
-command is read the same way. If a message has a different layout, the reader adapts to it.
+same layout every tick, so it is serialised once and its values are written into the bytes. A
+command is read in the same way. If the layout of a message differs from the previous one, the
+reader adapts to it.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ Quantity = Literal["position", "velocity", "effort"]
 
 
 class UnreadableError(CommandError):
-    """The bytes are not a message of their type; the error message names the type."""
+    """The bytes are not a message of the expected type; the error message names the type."""
 
 
 def read_text(raw: bytes, type_name: str, path: str) -> str:
@@ -56,7 +58,7 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
     Raises
     ------
     UnreadableError
-        The bytes are not a message of the type.
+        The bytes are not a message of this type.
     """
     try:
         leaf = Layout(raw, type_name).leaves[path]
@@ -93,7 +95,8 @@ class MessageTemplate:
         return np.frombuffer(self._buffer, np.float64, count, self._leaves[path].offset)
 
     def feed(self, path: str, source: Array) -> None:
-        """Copy ``source``, a contiguous array that stays in place, to ``path`` in every message."""
+        """Copy ``source``, a contiguous array that is updated in place, to ``path`` in every
+        message."""
         data, begin = source.data.cast("B"), self._leaves[path].offset
         self._feeds[path] = slice(begin, begin + len(data)), data
 
@@ -114,7 +117,7 @@ def joint_template(joint_names: Sequence[str]) -> MessageTemplate:
 
 
 class TemplateReader:
-    """Reads float arrays and the stamp from serialised messages that repeat one layout.
+    """Reads float arrays and the stamp from serialised messages that all have one layout.
 
     Parameters
     ----------
@@ -136,12 +139,12 @@ class TemplateReader:
         self._layout: Layout | None = None
 
     def accept(self, raw: bytes) -> bool:
-        """Read from ``raw`` from now on; return whether it has another layout, or other texts.
+        """Use ``raw`` as the current message; return whether its layout or strings have changed.
 
         Raises
         ------
         UnreadableError
-            The bytes are not a message of the type; the previous message is kept.
+            The bytes are not a message of the expected type; the previous message is kept.
         """
         if raw is self.raw:
             return False
@@ -157,7 +160,7 @@ class TemplateReader:
         return np.frombuffer(self.raw, np.float64, count, offset)
 
     def value_count(self, path: str) -> int:
-        """Return the number of values at ``path`` in messages with this layout; 0: none."""
+        """Return the number of values at ``path`` in messages with this layout; 0 if none."""
         return self._value_spans[path][1] if path in self._value_spans else 0
 
     def text(self, path: str) -> str:
@@ -212,8 +215,8 @@ class JointReader:
     """Reads quantities from JointState messages in model joint order.
 
     A command names all joints, in any order. A measured state may also name other joints, for
-    example from a broadcaster for a whole machine; these are ignored. Measured joint states may
-    arrive in several messages (:meth:`joined`).
+    example if a broadcaster publishes the joints of a whole machine; these joints are ignored. A
+    measured state may be split into several messages (:meth:`joined`).
 
     Parameters
     ----------
@@ -245,7 +248,7 @@ class JointReader:
         self._problem = ""
         self._order = _JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._missing = ""
-        """A joint missing in measured states with this layout; empty: none."""
+        """A joint missing from measured states with this layout; empty if no joint is missing."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
         """Joints received since the last complete state; their values are in ``values``."""
 
@@ -255,13 +258,15 @@ class JointReader:
         Raises
         ------
         CommandError
-            A joint is unknown or named twice, or a length is wrong; or the stamp of a measured
-            state is too large for a command to carry.
+            A joint is unknown or named twice, a length is wrong, or the stamp of a measured state
+            is too large for a command.
         """
         self.require(raw)
         stamp = self._reader.stamp_ns
         if stamp > LATEST_NS and self._measured:
-            raise UnreadableError(f"no command can carry its stamp of {stamp / SECOND:.10g} s")
+            raise UnreadableError(
+                f"its stamp of {stamp / SECOND:.10g} s is too large for a command"
+            )
         self._copy_values()
         return stamp
 
@@ -281,7 +286,7 @@ class JointReader:
     def joined(self, raw: bytes) -> bytes | None:
         """Return a measured state of all joints: this message, or one merged from several messages.
 
-        None: some joints are missing since the last complete state.
+        Returns None if joints are still missing since the last complete state.
 
         Raises
         ------
@@ -367,19 +372,19 @@ class JointReader:
             raise CommandError(f"a joint is named twice in {list(named)}")
         if whole and len(named) < len(joints):
             missing = next(name for name in joints if name not in named)
-            raise CommandError(f"joint '{missing}' is missing: a message must name all joints")
+            raise CommandError(f"joint '{missing}' is missing: each message must name all joints")
         return _JointOrder(
             np.array(places, dtype=np.intp),
             np.array([joints[named[i]] for i in places], dtype=np.intp),
             tuple(
-                f"joint '{name}' {'follows another' if name in self._followers else 'is unknown'}"
+                f"joint '{name}' {'mimics another' if name in self._followers else 'is unknown'}"
                 for name in others
             ),
         )
 
 
 class MissingJointError(CommandError):
-    """A measured state lacks a joint, which another message may contain."""
+    """A measured state lacks a joint; another message may contain it."""
 
 
 @dataclass(frozen=True)
@@ -396,7 +401,7 @@ class _JointOrder:
 class MessageDecoder:
     """Reads measured states and references for one robot from serialised messages.
 
-    It is the :class:`~spacerobot_ros.commanding.host.StateDecoder` of the nodes.
+    The nodes use this class as their :class:`~spacerobot_ros.commanding.host.StateDecoder`.
 
     Parameters
     ----------
@@ -420,7 +425,7 @@ class MessageDecoder:
 
     @property
     def incomplete(self) -> str:
-        """Clause describing the joints still missing in joint states."""
+        """Clause describing the joints that are still missing from joint states."""
         return self._joints.incomplete
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:
@@ -463,7 +468,7 @@ class CommandReader:
             self._values = self._reader.values[source.quantity]
 
     def offer(self, commands: CommandValidator, raw: bytes, now_ns: int) -> Refusal | None:
-        """Pass a command message to the validator; return the refusal, None if accepted."""
+        """Pass a command message to the validator; return the refusal, or None if accepted."""
         try:
             stamp_ns, command = self.read(raw)
         except UnreadableError as error:
@@ -473,8 +478,8 @@ class CommandReader:
     def read(self, raw: bytes) -> tuple[int, Array | CommandError]:
         """Return a message's stamp, ns, and its values, or the reason why it is malformed.
 
-        The values are overwritten by the next message. Raises UnreadableError for bytes that are
-        not a message of the type.
+        The values are overwritten by the next message. Raises UnreadableError if the bytes are not
+        a message of the expected type.
         """
         try:
             return self._reader.accept(raw), self._values
@@ -485,7 +490,8 @@ class CommandReader:
 
 
 def actuation_of(message: Any) -> str:
-    """Return the command type of a JointState, ``velocity`` or ``effort``; empty: joints at rest.
+    """Return the command type of a JointState, ``velocity`` or ``effort``; empty if it cannot be
+    determined, as at rest.
 
     The nodes in this package fill both arrays, one of them with zeros.
     """

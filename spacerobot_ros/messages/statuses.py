@@ -19,7 +19,7 @@ class StatusRecord:
     Attributes
     ----------
     name
-        Name of the node or of a component of it.
+        Name of the node, or of one of its components.
     level
         0 OK, 1 WARN, 2 ERROR, 3 STALE.
     message
@@ -53,7 +53,7 @@ class StatusRecord:
 
 
 def key_values(pairs: Iterable[Any]) -> dict[str, str]:
-    """Return diagnostic_msgs/KeyValue messages as a dictionary of printable strings."""
+    """Return diagnostic_msgs/KeyValue messages as a dictionary whose strings are printable."""
     return {printable(pair.key): printable(pair.value) for pair in pairs}
 
 

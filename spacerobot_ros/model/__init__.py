@@ -1,4 +1,5 @@
-"""From a robot description (URDF) to its equations: kinematics, momentum, connection, dynamics."""
+"""Derives the equations of a robot from its description (URDF): kinematics, momentum, connection,
+dynamics."""
 
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters

@@ -35,8 +35,8 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.termination import tool
 
 _FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off")
-"""Compiler flags for all objects: with fused multiply-adds, results would depend on the
-processor."""
+"""Compiler flags for all objects; fused multiply-adds are disabled, because with them results would
+depend on the processor."""
 
 announcement_listeners: list[Callable[[str], None]] = []
 """Functions called with a message when a long computation begins, which the log has too."""
@@ -60,7 +60,7 @@ class BufferedFunction:
     ``inputs`` and ``outputs`` are numpy arrays with the shapes of the function's arguments (vectors
     are 1-D), allocated once. The overhead of a call is well under a microsecond.
 
-    ``held`` is the constant value of the last argument, if that is not among ``inputs``.
+    ``held`` is the constant value of the last argument, if that argument is not among ``inputs``.
     """
 
     evaluate: Callable[[], None]
@@ -139,7 +139,7 @@ def compiled(function: ca.Function) -> ca.Function:
         return load_library(name, str(generator.dump()), lambda path: ca.external(name, path))
     except NoLibraryError as reason:
         warn_once(
-            "Functions run in CasADi's virtual machine, slower but with the same formulas "
+            "Functions run in CasADi's virtual machine, which is slower but uses the same formulas "
             f"(SPACEROBOT_COMPILE=0 selects it): {reason}."
         )
         return function
@@ -159,13 +159,13 @@ def load_library(
     Parameters
     ----------
     name
-        Prefix of the cached file's name.
+        Prefix of the name of the cached file.
     source, language
         Source code and its language.
     load
         Loads an object from its path; raises ``OSError`` or ``RuntimeError`` on failure.
     flags, libraries
-        Compiler arguments before and after the source. They are part of the key, so flags
+        Compiler arguments before and after the source. The arguments are part of the key, so flags
         may select processor-specific instructions.
 
     Returns
@@ -176,7 +176,7 @@ def load_library(
     Raises
     ------
     NoLibraryError
-        The object cannot be built or loaded; the message is a clause that says why.
+        The object cannot be built or loaded; the message is a clause that states the reason.
     """
     compiler = c_compiler() if language == "c" else cxx_compiler()
     if compiler is None:
@@ -250,7 +250,8 @@ def source_hash(*names: str) -> str:
 
 
 def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca.Function:
-    """Return an expensive function from the cache, or derive and cache it; results are identical.
+    """Return an expensive function from the cache, or derive and cache it; both ways yield the same
+    function.
 
     Parameters
     ----------
@@ -299,7 +300,7 @@ def _compiler(*candidates: str | None) -> str | None:
 
 
 def cache_directory() -> Path:
-    """Return the cache folder of compiled objects; it may not exist."""
+    """Return the cache folder of compiled objects; the folder may not exist."""
     chosen = os.environ.get("SPACEROBOT_CACHE_DIR")
     if chosen:
         return Path(chosen)

@@ -1,24 +1,24 @@
 """Fast forward dynamics by composite rigid bodies, with the base eliminated analytically.
 
-``z0ddot`` of paper 4, eq. (19), with 44 to 84 % of the operations of its barycentric vectors,
-depending on the robot. Spatial vectors as in Featherstone, Rigid Body Dynamics Algorithms (2008),
-angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All are in base components at one
-common point, the system's centre of mass, so that no body needs a transform and the inertia of the
-whole system is ``diag(D, M 1)``.
+Computes ``z0ddot`` of paper 4, eq. (19), with 44 to 84 % of the operations that barycentric vectors
+require, depending on the robot. Spatial vectors follow Featherstone, Rigid Body Dynamics Algorithms
+(2008), with the angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All these vectors
+are in base components at one common point, the system's centre of mass, so that no body needs a
+transform and the inertia of the whole system is ``diag(D, M 1)``.
 
 Because that inertia is block-diagonal, the base can be eliminated joint by joint. A unit rate of
-joint j gives its composite (all bodies that it carries) the momentum ``P_j = I^c_j S_j``; to cancel
-it, the whole system moves by ``-B_j``, ``B_j = diag(D, M 1)^-1 P_j``. So ``S_j - B_j`` is the
-motion of the bodies outboard of joint j if the base is free, and
+joint j gives the joint's composite (all bodies that the joint carries) the momentum ``P_j = I^c_j
+S_j``; to cancel this momentum, the whole system moves by ``-B_j``, ``B_j = diag(D, M 1)^-1 P_j``.
+So ``S_j - B_j`` is the motion of the bodies outboard of joint j if the base is free, and
 
-* ``K_ij = (S_i - B_i)' P_j``: joint inertia matrix at given momentum (i carries j;
-  without the ``S_i`` term if neither carries the other);
+* ``K_ij = (S_i - B_i)' P_j``: joint inertia matrix at a given momentum (if joint i carries joint j;
+  without the ``S_i`` term if neither joint carries the other);
 * ``omega = D^-1 L - sum_j B_j qdot_j`` (angular parts): the base rate at angular momentum L;
 * ``K qddot = Q``, ``Q_j = tau_j - S_j' f_j + B_j' (f_0 - f_external)``, where ``f_j`` is the force
 on composite j required by the motion alone, at ``qddot = 0``.
 
-For chains of up to about eight joints this takes fewer operations than the articulated-body
-algorithm, whose cost grows only linearly.
+For chains of up to about eight joints, this method takes fewer operations than the articulated-body
+algorithm, although the cost of the latter grows only linearly.
 
 :func:`state_rate` computes the motion under joint efforts and a base wrench, with the total momenta
 as part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
@@ -28,16 +28,16 @@ in W. The base twist is not a state: it follows from the momenta and joint rates
 the momenta are therefore constant to the last bit, for any step size:
 
 * ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
-* ``K qddot = Q`` at the ``omega_WB_B`` that the momenta imply.
+* ``K qddot = Q`` with the ``omega_WB_B`` that follows from the momenta.
 
 The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (N) and torque (N m)
-at the base link origin, base components. The attitude is integrated in R^4 and normalised
+at the base link origin, in base components. The attitude is integrated in R^4 and normalised
 after each Runge-Kutta step.
 
-Under external loads (:mod:`spacerobot_ros.model.external_loads`), the last entry of the state is
-the time (s), and that of the command the load vector. For the load ``F_k`` on composite k and the
-friction d, ``S_j' F_j - B_j' F_0 - d (K qdot)_j`` is added to ``Q_j``; both momenta change due to
-``F_0``, uniform gravity and friction.
+Under external loads (:mod:`spacerobot_ros.model.external_loads`), the state ends with the time (s),
+and the command ends with the load vector. For the load ``F_k`` on composite k and the friction d,
+``S_j' F_j - B_j' F_0 - d (K qdot)_j`` is added to ``Q_j``; both momenta change due to ``F_0``,
+uniform gravity and friction.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class SymmetricFactor:
                     rest[i][k] = rest[i][k] - self._L[i][j] * rest[k][j]
 
     def solve(self, right: ca.SX) -> ca.SX:
-        """Return x (n,) of ``matrix x = right``."""
+        """Solve ``matrix x = right`` for x (n,)."""
         x = [right[i] for i in range(self._n)]
         for i in range(self._n):
             for j in range(i):
@@ -108,13 +108,14 @@ class SymmetricFactor:
 
 @dataclass(frozen=True)
 class Composites:
-    """Composite rigid bodies outboard of each joint, base components; see the module for symbols.
+    """Composite rigid bodies outboard of each joint, in base components; see the module docstring
+    for the symbols.
 
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
-    the unit-rate motion of the joint that carries body j, ``P[j]`` (6,) the momentum of its
-    composite (both zero for the base); ``D`` (3, 3) is the locked inertia about the system's centre
-    of mass, kg m^2 (paper 4, eq. 16a).
-    ``composite[k]`` is the inertia of body k and of all bodies that it carries.
+    the unit-rate motion of the joint that carries body j, and ``P[j]`` (6,) is the momentum of the
+    joint's composite (both zero for the base); ``D`` (3, 3) is the locked inertia about the
+    system's centre of mass, kg m^2 (paper 4, eq. 16a). ``composite[k]`` is the inertia of body k
+    and of all bodies that it carries.
     """
 
     kin: TreeKinematics
@@ -128,8 +129,8 @@ class Composites:
     def D_q(self) -> ca.SX:
         """Angular momentum (3, n) about the centre of mass per unit joint rate (paper 4, eq. 16a).
 
-        This momentum does not depend on the motion of the centre of mass, so it equals the
-        composites' momenta at the common point.
+        This momentum does not depend on the motion of the centre of mass, so it equals the momentum
+        of the composites at the common point.
         """
         return self.kin.gather(ca.horzcat(ca.SX(3, 0), *(P[:3] for P in self.P[1:])).T).T
 
@@ -178,10 +179,10 @@ def composites(kin: TreeKinematics) -> Composites:
 
 @dataclass(frozen=True)
 class ShapeSystem:
-    """Shape inertia with the free base eliminated; see the module for the symbols.
+    """Shape inertia with the free base eliminated; see the module docstring for the symbols.
 
-    ``B[j]`` (6,) is for the joint that carries body j (zero for the base); ``D`` is the factor
-    of the system's rotational inertia, ``K`` (n, n) the shape inertia matrix.
+    ``B[j]`` (6,) belongs to the joint that carries body j (zero for the base); ``D`` is the
+    factorised rotational inertia of the system, ``K`` (n, n) the shape inertia matrix.
     """
 
     parts: Composites
@@ -216,14 +217,15 @@ def shape_system(kin: TreeKinematics) -> ShapeSystem:
 def motion_forces(
     parts: Composites, omega: ca.SX, qdot: ca.SX, qddot: ca.SX | None = None
 ) -> tuple[ca.SX, ...]:
-    """Return ``f_k`` (6,) for every composite k: the force required by its motion at the rates
-    ``omega_WB_B`` (3,) and ``qdot`` (n,), constant ``omega``, and joint accelerations ``qddot``
-    (n,), by default zero.
+    """Return ``f_k`` (6,) for every composite k: the force required by the composite's motion at
+    the rates ``omega_WB_B`` (3,) and ``qdot`` (n,), constant ``omega``, and joint accelerations
+    ``qddot`` (n,), by default zero.
 
-    Recursive Newton-Euler (Featherstone, table 5.1). If body k rotates at ``omega_k`` and
-    ``alpha_k``, its point x accelerates by ``A_k x``, ``A_k = hat(alpha_k) + hat(omega_k)^2``,
-    relative to the body's origin. The base origin is assumed unaccelerated: the terms of a common
-    acceleration in ``S_j' f_j`` and ``B_j' f_0`` cancel in ``Q_j``.
+    This is the recursive Newton-Euler algorithm (Featherstone, table 5.1). If body k rotates at
+    ``omega_k`` and ``alpha_k``, its point x accelerates by ``A_k x``,
+    ``A_k = hat(alpha_k) + hat(omega_k)^2``, relative to the body's origin. The base origin is
+    assumed not to accelerate: in ``Q_j``, a common acceleration cancels between ``S_j' f_j`` and
+    ``B_j' f_0``.
     """
     kin, qdot = parts.kin, parts.kin.spread(qdot)
     qddot = None if qddot is None else kin.spread(qddot)
@@ -272,7 +274,7 @@ def shape_forces(
 ) -> tuple[ca.SX, ca.SX]:
     """Return ``Q`` (n,) of ``K qddot = Q`` and the remaining moment (3,) on the base.
 
-    ``external`` (6,) is the external moment (N m) over force (N) on the base, base components,
+    ``external`` (6,) is the external moment (N m) and force (N) on the base, in base components,
     about the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
     """
     f = motion_forces(system.parts, omega, qdot)
@@ -305,10 +307,10 @@ def joint_efforts(
     accelerations ``qddot`` (n,): inverse dynamics.
 
     ``L_B`` (3,) is the angular momentum about the system's centre of mass, kg m^2/s in base
-    components; None: zero. The base rotates and accelerates such that both momenta are constant: by
-    ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the external force that the joint motion alone would
-    require. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no joint inertia
-    matrix is needed. At zero momentum, the same path in half the time requires four times
+    components; None: zero. The base rotates and accelerates such that both momenta are constant:
+    its acceleration is ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the external force that the joint
+    motion alone would require. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no joint
+    inertia matrix is needed. At zero momentum, the same path in half the time requires four times
     the efforts. ``loads`` are external loads, if any.
     """
     parts = composites(kin)
@@ -330,9 +332,9 @@ def joint_efforts(
 
 
 def external_force(kin: TreeKinematics, wrench_B: ca.SX) -> ca.SX:
-    """Return a base wrench as moment over force (6,) about the system's centre of mass.
+    """Return a base wrench as moment and force (6,) about the system's centre of mass.
 
-    ``wrench_B`` is force (N) over torque (N m) at the base link origin.
+    ``wrench_B`` is force (N) and torque (N m) at the base link origin.
     """
     force, torque = wrench_B[:3], wrench_B[3:]
     return ca.vertcat(torque - ca.cross(kin.r_BC_B, force), force)
@@ -371,8 +373,8 @@ def shape_equations(kin: TreeKinematics, *, loaded: bool = False) -> ca.Function
 def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = False) -> ca.Function:
     """Return the function ``(x, command) -> x_dot``.
 
-    If ``holding``, it takes a third argument ``free`` (n,): 1 for a moving joint, 0 for a joint
-    held at its current rate. If ``loaded``, external loads act.
+    If ``holding``, the function takes a third argument ``free`` (n,): 1 for a moving joint, 0 for a
+    joint held at its current rate. If ``loaded``, external loads are included.
     """
     x, command = _state_symbols(kin, loaded=loaded)
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)

@@ -33,7 +33,7 @@ class JointKind(str, Enum):
 
 @dataclass(frozen=True)
 class JointLimits:
-    """Joint position, rate and effort limits (m or rad, /s, N or N m); infinite: no limit."""
+    """Joint position, rate and effort limits (m or rad, /s, N or N m); infinite if unlimited."""
 
     lower: float = -np.inf
     upper: float = np.inf
@@ -55,15 +55,16 @@ class Pose:
 
 @dataclass(frozen=True)
 class Inertia:
-    """Mass (kg), centre of mass (3,) in m and inertia about it (3, 3) in kg m^2, in a given
-    frame."""
+    """Mass (kg), centre of mass (3,) in m, and inertia (3, 3) about the centre of mass in kg m^2,
+    in a given frame."""
 
     mass: float = 0.0
     com: Array = field(default_factory=lambda: np.zeros(3))
     about_com: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     def moved(self, pose: Pose) -> Inertia:
-        """Return the inertia in another frame; ``pose`` is the pose of the current frame in it."""
+        """Return the inertia in another frame, in which the pose of the current frame is
+        ``pose``."""
         return Inertia(self.mass, pose.r + pose.R @ self.com, pose.R @ self.about_com @ pose.R.T)
 
     def __add__(self, other: Inertia) -> Inertia:
@@ -117,8 +118,8 @@ class Joint:
     """A joint between two links; ``origin`` is the child's pose at joint position zero, ``axis`` a
     unit vector.
 
-    A joint with ``mimic`` follows another joint: its position is not a coordinate. If
-    ``wheel`` is set, the child link is a reaction wheel.
+    A joint with ``mimic`` follows another joint, so the position of the mimic joint is not a
+    coordinate. If ``wheel`` is set, the child link is a reaction wheel.
     """
 
     name: str
@@ -155,9 +156,9 @@ class Joint:
 class Body:
     """A rigid body: links connected by fixed joints, in the frame of the first link.
 
-    ``joint`` is the movable joint that carries the body (None for the base), ``parent`` the index
-    of the parent body, ``origin`` the pose of the body frame in the parent body's frame at
-    joint position zero.
+    ``joint`` is the movable joint that carries the body (None for the base), ``parent`` is the
+    index of the parent body, and ``origin`` is the pose of the body frame in the parent body's
+    frame at joint position zero.
     """
 
     name: str
@@ -171,11 +172,11 @@ class Body:
 class RobotDescription:
     """A free-floating link tree; the root link is the base body (the spacecraft).
 
-    ``bodies`` are in topological order, the base first; the movable joints are those of
+    ``bodies`` are in topological order, with the base first; the movable joints are those of
     ``bodies[1:]`` that are not mimic joints, in that order. ``frames`` maps every link to its body
     and its pose in that body. ``disabled_collisions`` are link pairs excluded from collision
-    checks. ``world`` contains the obstacles around the robot; its root link is the frame W;
-    None: none.
+    checks. ``world`` contains the obstacles around the robot; its root link is the frame W; None if
+    there are no obstacles.
     """
 
     name: str
@@ -209,7 +210,8 @@ class RobotDescription:
 
     @property
     def coupling(self) -> tuple[Array, Array]:
-        """``G`` (m, n) and ``b`` (m,): positions of the moving joints are ``G q + b``, m or rad."""
+        """``G`` (m, n) and ``b`` (m,), with which the positions of the moving joints are ``G q +
+        b``, m or rad."""
         names, moving = self.joint_names, self.moving_joints
         G, b = np.zeros((len(moving), len(names))), np.zeros(len(moving))
         for row, joint in enumerate(moving):
@@ -250,7 +252,7 @@ class RobotDescription:
     def limits(self, kind: str) -> Array:
         """Return one kind of joint limit (n,): lower, upper, velocity or effort.
 
-        Except for effort, limits of mimic joints also restrict the joint they follow.
+        Except for effort, the limits of a mimic joint also restrict the joint that it follows.
         """
         values: list[Any] = [getattr(joint.limits, kind) for joint in self.movable_joints]
         for joint in self.moving_joints:
@@ -262,7 +264,8 @@ class RobotDescription:
 
     @property
     def shape_box(self) -> tuple[Array, Array]:
-        """Finite bounds (n,), (n,) of the shapes: one revolution or 2 m for unlimited joints."""
+        """Finite lower and upper bounds (n,) of the shapes: one revolution or 2 m for unlimited
+        joints."""
         joints = self.movable_joints
         half = np.array([1.0 if x.kind is JointKind.PRISMATIC else np.pi for x in joints])
         lower, upper = self.limits("lower"), self.limits("upper")
@@ -270,14 +273,14 @@ class RobotDescription:
         return lower, np.where(np.isfinite(upper), upper, lower + 2 * half)
 
     def end_effector(self, link: str = "") -> str:
-        """Return the name of the end-effector link: ``link`` if given, else ``end_effector`` if the
-        robot has such a link, else an empty string.
+        """Return the name of the end-effector link: ``link`` if it is given; otherwise
+        ``end_effector`` if the robot has such a link; otherwise an empty string.
         """
         names = [each.name for each in self.links]
         return link or (DEFAULT_END_EFFECTOR if DEFAULT_END_EFFECTOR in names else "")
 
     def with_links(self, links: tuple[Link, ...]) -> RobotDescription:
-        """Return the robot with links replaced by others of the same names; ``urdf`` is
+        """Return the robot with links replaced by other links with the same names; ``urdf`` is
         unchanged."""
         return self._with_tree(links, self.joints)
 
@@ -309,9 +312,10 @@ class RobotDescription:
     def with_model_error(self, error: float, seed: int) -> RobotDescription:
         """Return the robot with random errors in all masses and inertias.
 
-        Each is multiplied by an independent factor, drawn uniformly from
-        ``[1 - error, 1 + error]``, two per link in link order. Inertia tensors stay
-        physical, since their principal moments keep their ratios; centres of mass do not change.
+        Each value is multiplied by an independent factor, drawn uniformly from
+        ``[1 - error, 1 + error]``. There are two factors per link, in link order. Inertia tensors
+        remain physical, because the ratios of their principal moments are preserved; centres of
+        mass do not change.
         """
         factors = np.random.default_rng(seed).uniform(1 - error, 1 + error, (len(self.links), 2))
         links = []
@@ -404,13 +408,13 @@ def weld_links(
         lost = sorted(set(links) - set(frames))
         raise RobotDescriptionError(
             f"Link '{lost[0]}' is not connected to the root: its joints form a loop. Remove one "
-            "of them, and connect the remaining links to the robot."
+            "of the joints, and connect the remaining links to the robot."
         )
     return bodies, frames
 
 
 def plane_normal(description: RobotDescription) -> Array | None:
-    """Return the unit normal (3,) of a planar robot's plane of motion, base components; None:
+    """Return the unit normal (3,) of a planar robot's plane of motion, in base components; None:
     spatial.
 
     A robot is planar if it has a revolute joint, the axes of all such joints are parallel, and the

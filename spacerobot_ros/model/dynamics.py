@@ -1,13 +1,13 @@
 """The papers' equations in closed form: dynamics (paper 4), connection (papers 1 and 2).
 
 Equations of motion ``H+ zddot + C+ = Q`` (paper 4, eqs 8-10 and 18-21). The independent velocities
-are ``z0dot = [v_cm; omega; qdot]``, the first two in base components (eq. 8), so that nothing
-depends on the robot pose. Inertias are composite-rigid-body inertias
+are ``z0dot = [v_cm; omega; qdot]``, of which the first two are in base components (eq. 8), so that
+the equations do not depend on the robot pose. Inertias are composite-rigid-body inertias
 (:mod:`.composite_rigid_body`).
 
 Momentum, and the resulting base motion. At zero total momentum, the base moves only if the
 shape changes: ``[v; omega]_B = -A(q) qdot``, the mechanical connection (paper 1). A closed shape
-loop leaves a net base motion: to first order, the curvature times the loop area (paper 2).
+loop causes a net base motion: to first order, the curvature times the loop area (paper 2).
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from spacerobot_ros.model.kinematics import TreeKinematics
 def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
     """Return ``0J+`` (6, 6 + n) for the origin of a link frame, eq. (10), in base components.
 
-    It maps ``[v_cm; omega; qdot]`` to the linear velocity of the point over the angular velocity
-    of its body. ``J_12`` is the shape derivative of ``rho = sum_i v_ik,m``, which for revolute
-    joints is the paper's ``-sum_i skew(v_ik,m) F_i``.
+    The matrix maps ``[v_cm; omega; qdot]`` to the linear velocity of the point and the angular
+    velocity of its body. ``J_12`` is the shape derivative of ``rho = sum_i v_ik,m``, which for
+    revolute joints is the paper's ``-sum_i skew(v_ik,m) F_i``.
     """
     _, point, body = kin.frame(link)
     rho = point - kin.r_BC_B
@@ -34,11 +34,12 @@ def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
 
 
 def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
-    """Return ``C+`` (6 + n,) by d'Alembert: the generalised force that keeps ``z0ddot`` at zero.
+    """Return ``C+`` (6 + n,) according to d'Alembert's principle: the generalised force that keeps
+    ``z0ddot`` at zero.
 
-    Outward recursion for the velocity-product accelerations, inward sum of their inertia forces.
-    Accelerations are relative to the system's centre of mass, which itself accelerates by
-    ``omega x v_cm``.
+    An outward recursion yields the velocity-product accelerations, and an inward recursion sums the
+    inertia forces. Accelerations are relative to the system's centre of mass, which itself
+    accelerates by ``omega x v_cm``.
     """
     M, qdot = kin.total_mass, kin.spread(qdot)
     omegas, alphas, accelerations = [omega], [ca.SX(3, 1)], [ca.SX(3, 1)]
@@ -107,7 +108,7 @@ def momentum_of_bodies(
     """Return the linear momentum (3,), the angular momentum about the system's centre of mass (3,)
     and the kinetic energy, in base components, summed body by body.
 
-    This does not use ``H+``: it is an independent check of the motion.
+    ``H+`` is not used: the result is an independent check of the motion.
     """
     linear, angular, energy = ca.SX(3, 1), ca.SX(3, 1), ca.SX(0)
     qdot = kin.spread(qdot)
@@ -154,7 +155,8 @@ def base_twist(
 
 
 def connection(kin: TreeKinematics, inertia: Composites) -> ca.SX:
-    """Return ``A(q)`` (6, n) of ``[v_WB_B; omega_WB_B] = -A(q) qdot``, zero momentum (paper 1, 3).
+    """Return ``A(q)`` (6, n) of ``[v_WB_B; omega_WB_B] = -A(q) qdot`` at zero momentum (papers 1,
+    3).
 
     The lower half is ``D^-1 D_q``; the upper half keeps the system's centre of mass at rest:
     ``v = -omega x c - dc/dq qdot`` with ``c = r_BC_B``.
@@ -169,7 +171,7 @@ def curvature(A: ca.SX, q: ca.SX) -> list[list[ca.SX]]:
 
     ``K_ij = dF_j/dq_i - dF_i/dq_j + [F_i, F_j]``. A small counter-clockwise loop in the plane
     (q_i, q_j) moves the base by ``exp(K_ij * area)`` in body coordinates (paper 2, plus the bracket
-    that its flat surface integral omits).
+    that the paper's flat surface integral omits).
     """
     F = -A
     n = q.shape[0]

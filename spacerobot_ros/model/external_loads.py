@@ -1,17 +1,17 @@
-"""External loads on robot links: wrenches, a gravity gradient, a tilted air table.
+"""External loads on robot links: wrenches, a gravity gradient, and a tilted air table.
 
-All loads on a robot form one vector (:class:`LoadLayout`); times are plant times. Frame W is
-in free fall on a circular orbit with mean motion n, without rotating. The orbital frame O has
-its x axis radially outward and its z axis along the orbit normal, as in the equations of
-Clohessy and Wiltshire; ``R_WO`` is the attitude of O at time zero. With the unit vector o along the
-radius, a mass element at r from the origin of W accelerates by ``n^2 (3 o o' - 1) r``, to first
-order in an inverse-square field (Hughes, Spacecraft Attitude Dynamics, chapter 8). The force on
-body k and the moment about its centre of mass r_k are ::
+All loads on a robot form one vector (:class:`LoadLayout`); all times are in plant time. Frame W is
+in free fall on a circular orbit with mean motion n and does not rotate. The orbital frame O has its
+x axis radially outward and its z axis along the orbit normal, as in the equations of Clohessy and
+Wiltshire; ``R_WO`` is the attitude of O at time zero. With the unit vector o along the radius, a
+mass element at r from the origin of W accelerates by ``n^2 (3 o o' - 1) r``, to first order in an
+inverse-square field (Hughes, Spacecraft Attitude Dynamics, chapter 8). The force on body k and the
+moment about its centre of mass r_k are ::
 
     f_k = m_k n^2 (3 o o' - 1) r_k,    n_k = 3 n^2 o x I_k o
 
-Their sum over the bodies is the moment ``3 n^2 o x D o`` about the system's centre of mass, where D
-is the locked inertia, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
+Summed over the bodies, these loads are the moment ``3 n^2 o x D o`` about the system's centre of
+mass, where D is the locked inertia, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
 
 On an air table, all bodies have the same acceleration, and friction is proportional to momentum:
 ``f_k = -d m_k v_k``, ``n_k = -d I_k omega_k``.
@@ -31,21 +31,21 @@ from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
 class LoadLayout:
-    """Slices of a vector of loads of a robot with L links.
+    """Slices of the load vector for a robot with L links.
 
     Attributes
     ----------
     in_link, in_world
-        Force (N) over torque (N m) at the origin of every link, in its frame and in components of
-        W: (6 L,) each.
+        Force (N) and torque (N m) at the origin of every link, in link components and in W
+        components: (6 L,) each.
     mean_motion
-        Mean motion of the orbit, rad/s; zero: no gravity gradient.
+        Mean motion of the orbit, rad/s; zero if there is no gravity gradient.
     quaternion_WO
         Attitude (x, y, z, w) of the orbital frame in W at time zero.
     gravity_W
         Uniform acceleration (3,), m/s^2.
     friction
-        Viscous friction of every body over its momentum, 1/s.
+        Viscous friction force on a body divided by the body's momentum, 1/s.
     time
         Time at the beginning of the tick, s.
     size
@@ -68,10 +68,10 @@ class ExternalLoads:
     Attributes
     ----------
     composites
-        Moment over force (6,) about the system's centre of mass on every composite (a body and all
+        Moment and force (6,) about the system's centre of mass on every composite (a body and all
         bodies that it carries), due to the wrenches and the gravity gradient.
     gravity_W, friction
-        Uniform acceleration (3,) in W, m/s^2, and friction per momentum, 1/s. Both are
+        Uniform acceleration (3,) in W, m/s^2, and friction divided by momentum, 1/s. Both loads are
         proportional to mass, so they affect momenta and joints independently.
     """
 
@@ -105,7 +105,7 @@ def external_loads(
     kin
         The kinematics.
     second_moments
-        (3, 3) second moment of mass of every body about its own centre, base components.
+        (3, 3) second moment of mass of every body about its own centre, in base components.
     quaternion
         (4,) of ``R_WB``.
     r_WC_W

@@ -1,8 +1,9 @@
 """Grasp of a floating body by a floating robot, modelled as an inelastic impact.
 
-With ``z = [v_WB_B; omega_WB_B; qdot]`` (6 + n,) of the robot, ``nu`` (6,) of the body (velocity of
-its centre of mass and angular velocity) and ``L`` (6,) the grasp impulse on the robot, force over
-torque at the grasp point, all in components of the base frame B,
+Let ``z = [v_WB_B; omega_WB_B; qdot]`` (6 + n,) be the robot's velocity, ``nu`` (6,) the body's
+velocity (the linear velocity of its centre of mass, and its angular velocity) and ``L`` (6,) the
+grasp impulse on the robot (force and torque at the grasp point), all in components of the base
+frame B. Then
 
     H (z+ - z) = J' L,    M (nu+ - nu) = -G' L,    J z+ = G nu+,
 
@@ -13,8 +14,8 @@ brake exerts an impulse. So
     L = (J H^-1 J' + G M^-1 G')^-1 (G nu - J z),
 
 and the energy ``(G nu - J z)' L / 2`` is lost (Carnot). Momentum is conserved, because L acts on
-both with opposite signs. The formulation follows Yoshida and Nenchev, and Dimitrov and Yoshida; see
-the theory page on captures.
+the robot and the body with opposite signs. The formulation follows Yoshida and Nenchev, and
+Dimitrov and Yoshida; see the theory page on captures.
 """
 
 from __future__ import annotations
@@ -123,7 +124,7 @@ class TargetBody:
 
     @classmethod
     def of(cls, target: RobotDescription, grapple_frame: str) -> TargetBody:
-        """Return the body from a robot description, with one of the links as grapple frame.
+        """Return the body from a robot description, with one of the links as the grapple frame.
 
         Raises
         ------
@@ -166,7 +167,7 @@ class RobotMotion:
 
     @classmethod
     def at_rest(cls, pose: Array, q: Array) -> RobotMotion:
-        """Return a state without velocities."""
+        """Return a state at rest."""
         return cls(pose, np.zeros(6), q, np.zeros(len(q)))
 
     @property
@@ -194,12 +195,12 @@ class BodyMotion:
 
     @classmethod
     def of(cls, pose: Array, twist: Array) -> BodyMotion:
-        """Return the motion from a pose (7,) in W and a twist (6,) in T, linear over angular."""
+        """Return the motion from a pose (7,) in W and a twist (6,) in T, linear part first."""
         R = matrix_from_quaternion(pose[3:])
         return cls(R, pose[:3].copy(), R @ twist[:3], R @ twist[3:])
 
     def at(self, frame: Pose) -> BodyMotion:
-        """Return the motion of a frame fixed to the body at this pose in T."""
+        """Return the motion of a frame fixed to the body at the given pose in T."""
         arm = self.R_WT @ frame.r
         return BodyMotion(
             self.R_WT @ frame.R, self.r_WT + arm, self.v + cross(self.omega, arm), self.omega
@@ -220,7 +221,7 @@ class RelativeMotion:
     Attributes
     ----------
     distance, angle
-        Distance (m) between the origins, and angle (rad) between the attitudes, of the two frames.
+        Distance (m) between the frame origins, and angle (rad) between the frame attitudes.
     speed, rate
         Relative speed of the origins (m/s), and relative angular rate (rad/s).
     """
@@ -251,10 +252,10 @@ class GraspImpact:
     twist, qdot
         Base twist (6,) and joint rates (n,) after the grasp, as in :class:`RobotMotion`.
     impulse
-        (6,) on the robot at the end-effector origin: N s over N m s, in W.
+        (6,) impulse on the robot at the end-effector origin: N s and N m s, in W.
     joint_impulses
-        (n,) on the joints, ``J_q' L``, which motors or brakes would have to apply to keep the joint
-        rates constant; N s or N m s.
+        (n,) ``J_q' L``, the impulses that motors or brakes would have to apply to the joints to
+        keep their rates constant; N s or N m s.
     energy_before, energy_lost
         Total kinetic energy before the grasp, and the energy lost, J.
     """
@@ -287,7 +288,7 @@ def grasp_impact(
     robot
         The robot.
     link
-        The end-effector; the impulse is given at its frame's origin.
+        The end-effector; the impulse is given at the origin of the end-effector frame.
     motion, body
         The motions before it.
     inertia
@@ -329,9 +330,9 @@ def combined_momenta(
     masses
         Of the two, kg.
     centers
-        Their centres of mass in W (3,), m.
+        Centres of mass of the two systems in W (3,), m.
     momenta
-        Linear over angular momentum (6,) of each system about its own centre of mass, in W; the
+        Linear and angular momentum (6,) of each system about its own centre of mass, in W; the
         result is about the combined centre of mass.
     """
     first, second = momenta
@@ -345,9 +346,10 @@ def combined_momenta(
 def separated_momenta(
     masses: tuple[float, float], centers: tuple[Array, Array], together: Array, second: Array
 ) -> Array:
-    """Return the first system's momenta (6,) from the combined momenta and the second system's.
+    """Return the momenta (6,) of the first system from the combined momenta and the momenta of the
+    second system.
 
-    The inverse of :func:`combined_momenta`, with the same arguments.
+    This is the inverse of :func:`combined_momenta`, with the same arguments.
     """
     share = masses[0] / (masses[0] + masses[1])
     linear = together[:3] - second[:3]

@@ -1,9 +1,9 @@
 """Masses, centres of mass and inertias of a robot's bodies.
 
-:class:`InertialParameters` holds their values for one robot, or for a batch of robots that differ
-only in these values. In expressions they are either constants (:class:`MassProperties`: fewest
-operations, one compilation per set of values) or entries of an argument ``p``
-(:class:`SymbolicMassProperties`: one compilation for all sets).
+:class:`InertialParameters` holds the values of these quantities for one robot, or for a batch of
+robots that differ only in these values. In expressions, these quantities are either constants
+(:class:`MassProperties`: fewest operations, one compilation per set of values) or entries of an
+argument ``p`` (:class:`SymbolicMassProperties`: one compilation for all sets).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ INERTIA_ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def symmetric_of_entries(entries: Iterable[float]) -> Array:
-    """Return the symmetric matrix (3, 3) of its six :data:`INERTIA_ENTRIES`."""
+    """Return the symmetric matrix (3, 3) with the six given :data:`INERTIA_ENTRIES`."""
     matrix = np.zeros((3, 3))
     for (i, j), value in zip(INERTIA_ENTRIES, entries, strict=True):
         matrix[i, j] = matrix[j, i] = float(value)
@@ -42,14 +42,14 @@ def symmetric_of_entries(entries: Iterable[float]) -> Array:
 class InertialParameters:
     """Mass properties of the ``bodies`` in a :class:`RobotDescription`, for one robot or a batch.
 
-    Leading dimensions (...) are the batch: none for one robot, (N,) for N robots.
+    The leading dimensions (...) index the batch: none for one robot, (N,) for N robots.
 
     Attributes
     ----------
     masses
         (..., B) kg.
     centers
-        (..., B, 3) centres of mass in the body frames (those of their first links), m.
+        (..., B, 3) centres of mass in the body frames (the frames of their first links), m.
     inertias
         (..., B, 3, 3) about the centres of mass, along the axes of the body frames, kg m^2.
     """
@@ -91,8 +91,9 @@ class InertialParameters:
     ) -> InertialParameters:
         """Return the parameters with masses and inertias multiplied by factors (..., B).
 
-        Inertias use the mass factors (a change of density) unless given factors of their own.
-        Factors of shape (N, B), or (N, 1) if equal for all bodies, turn one robot into a batch.
+        Inertias are multiplied by the mass factors (as for a change of density) unless separate
+        inertia factors are given. Factors of shape (N, B), or (N, 1) if common to all bodies, turn
+        one robot into a batch.
         """
         by_mass = np.asarray(masses, dtype=float)
         by_inertia = by_mass if inertias is None else np.asarray(inertias, dtype=float)
@@ -178,7 +179,8 @@ class InertialParameters:
     def apply_to_description(self, robot: RobotDescription) -> RobotDescription:
         """Return a robot description with these parameters; its ``urdf`` is unchanged.
 
-        The first link of each body gets the body's mass properties; links fixed to it get none.
+        The first link of each body receives the mass properties of the body; links fixed to this
+        link receive none.
         """
         of_body = {
             body.name: Inertia(float(mass), center, inertia)
@@ -202,7 +204,7 @@ class MassProperties:
     centers
         Centres of mass (3,) in the body frames, m.
     inputs
-        Mass property symbols by name, the last function arguments; none for constants.
+        Mass property symbols by name, which are the last function arguments; empty for constants.
     """
 
     def __init__(self, robot: RobotDescription) -> None:
@@ -222,7 +224,7 @@ class MassProperties:
         """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k rotated by R, kg m^2.
 
         Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. If ``lambda``
-        is the middle moment, a body with a symmetry axis needs only that axis.
+        is the middle moment, only the symmetry axis is needed for a body that has one.
         """
         about = self._inertias[k].about_com
         moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
@@ -240,7 +242,7 @@ class SymbolicMassProperties(MassProperties):
     ----------
     free
         (10 B,) mask of the entries of :attr:`.InertialParameters.vector` that are in ``p``; the
-        others are zero.
+        other entries are zero.
     """
 
     def __init__(self, free: npt.NDArray[np.bool_]) -> None:
@@ -262,8 +264,8 @@ class SymbolicMassProperties(MassProperties):
     def second_moment(self, k: int, R: ca.SX) -> ca.SX:
         """Return the second moment of mass (3, 3) of body k, rotated by R, kg m^2.
 
-        Computed as for constants, with the columns of R as axes, plus terms for products of
-        inertia.
+        The matrix is computed as for constants, with the columns of R as axes, plus terms for
+        products of inertia.
         """
         xx, yy, zz, xy, xz, yz = ca.vertsplit(self._moments[k])
         x, y, z = ca.horzsplit(R)
@@ -277,7 +279,8 @@ class SymbolicMassProperties(MassProperties):
 
 
 def possibly_nonzero_entries(nominal: InertialParameters) -> npt.NDArray[np.bool_]:
-    """Return a mask (10 B,) of the vector entries that can be nonzero for robots of this structure.
+    """Return a mask (10 B,) of the vector entries that can be nonzero for robots with the given
+    structure.
 
     All masses may. Centre coordinates and products of inertia that are zero stay zero; principal
     moments are either all zero (a point mass) or all free.

@@ -17,8 +17,8 @@ DEFAULT_INTEGRATION_STEP = 0.01
 
 
 def count_steps(control_period: float, integration_step: float) -> int:
-    """Return the smallest number of equal steps of at most ``integration_step`` s per control
-    period.
+    """Return the smallest number of equal steps per control period, each of at most
+    ``integration_step`` s.
 
     Raises
     ------
@@ -34,7 +34,8 @@ def count_steps(control_period: float, integration_step: float) -> int:
 def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     """Return one Runge-Kutta 4 step ``(x, held arguments of rate, h) -> x``.
 
-    If ``p`` (mass properties) is the last argument of the rate, it stays last, after ``h``.
+    If ``p`` (mass properties) is the last argument of the rate, it remains the last argument, after
+    ``h``.
 
     ``attitude`` is the slice of ``x`` that holds the quaternion, which is integrated in R^4 and
     normalised after the step. The four stages call one function: inlined code would be 6 % faster
@@ -54,9 +55,11 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
 
 
 def repeat_step(step: ca.Function, count: int) -> ca.Function:
-    """Return ``step`` applied ``count`` times to its first argument; other arguments are held.
+    """Return ``step`` applied ``count`` times to its first argument; the other arguments are held
+    constant.
 
-    Each half is one function called twice: code size grows with the logarithm of ``count``.
+    A function that computes half of the steps is called twice, so the code size grows with the
+    logarithm of ``count``.
     """
     if count == 1:
         return step
@@ -71,7 +74,7 @@ def repeat_step(step: ca.Function, count: int) -> ca.Function:
 def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     """Return one Runge-Kutta step ``(x, qdot, L_W, h) -> x`` of ``x = [q; quaternion_WB]``.
 
-    This reconstructs the base motion from the joint motion, one held command at a time. Joint
+    This step reconstructs the base motion from the joint motion, one held command at a time. Joint
     velocities are constant over the step (servos hold them), so the configuration is exact; the
     base position follows from the centre of mass. Only the attitude is integrated:
     ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3, with an

@@ -1,7 +1,9 @@
-"""Inverse kinematics of an arm on a fixed base: from the current configuration, and by a search.
+"""Inverse kinematics of an arm on a fixed base: starting from the current configuration, or by a
+search.
 
-A controller that holds its base follows a path with the arm alone; the web page checks whether the
-arm can reach a goal. Both use the same errors and the same Jacobian.
+A controller that keeps its base in place follows a path with the arm alone. The web page checks
+whether the arm can reach a goal. The controller and the page use the same errors and the same
+Jacobian.
 """
 
 from __future__ import annotations
@@ -23,10 +25,12 @@ REACHED_DISTANCE = 1e-3
 _MAX_ITERATIONS = 30
 _DAMPING = 0.02
 _LARGEST_STEP = 0.2
-"""Iterations from the current configuration, damping, and largest joint step, m or rad."""
+"""Number of iterations from the current configuration, damping, and largest joint step, m or
+rad."""
 
 _SEARCH_STARTS = 8
-"""Number of start configurations of a search: the current one and random ones."""
+"""Number of start configurations of a search: the current configuration and random
+configurations."""
 
 _MAX_EVALUATIONS = 30
 
@@ -59,9 +63,9 @@ class FixedBaseArm:
         self._rows = [AXES.index(axis) for axis in axes]
 
     def error(self, q: Array, goal: Pose) -> tuple[Array, Array]:
-        """Return the end-effector error (m,) along the controlled axes, m over rad, in W.
+        """Return the end-effector error (m,) along the controlled axes, m and rad, in W.
 
-        Also return minus its derivative with respect to the joint positions (m, n).
+        Also return the negative derivative of the error with respect to the joint positions (m, n).
         """
         robot, R_WB = self._robot, self.base.R
         R_BE, r_BE = robot.link_pose(self._link, q)
@@ -75,7 +79,8 @@ class FixedBaseArm:
         return error[self._rows], J_W[self._rows]
 
     def nearest_shape(self, q: Array, goal: Pose) -> tuple[Array, float]:
-        """Return the configuration (n,) closest to a pose found by a search from ``q``.
+        """Return the configuration (n,) whose end-effector is closest to a pose, found by a search
+        from ``q``.
 
         Also return the largest remaining error, m or rad. The search uses damped least squares
         with steps short enough to stay on one solution branch.
@@ -93,11 +98,12 @@ class FixedBaseArm:
         return q, distance
 
     def search_shape(self, q: Array, goal: Pose) -> tuple[Array, float, float]:
-        """Return the configuration (n,) within the joint limits that is closest to a pose.
+        """Return the configuration (n,) within the joint limits whose end-effector is closest to a
+        pose.
 
         Also return the remaining distance and angle along the controlled axes, m and rad.
         The search starts at
-        ``q`` and at random configurations; equal arguments give equal results.
+        ``q`` and at random configurations; identical arguments yield identical results.
         """
         # Imported here because scipy.optimize loads slowly.
         from scipy.optimize import least_squares
@@ -132,5 +138,5 @@ class FixedBaseArm:
 
 
 def is_reached(distance: float, angle: float) -> bool:
-    """Whether an arm reaches its goal, given its error after a search, m and rad."""
+    """Whether an arm reaches its goal, given the remaining error after a search, m and rad."""
     return distance <= 2 * _SEARCH_TOLERANCE and angle <= 4 * _SEARCH_TOLERANCE

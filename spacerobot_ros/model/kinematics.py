@@ -100,7 +100,8 @@ class TreeKinematics:
         return self.mass_properties.centers[k]
 
     def second_moment(self, k: int) -> ca.SX:
-        """Return the second moment of mass (3, 3) of body k about its centre, base components."""
+        """Return the second moment of mass (3, 3) of body k about its centre, in base
+        components."""
         return self.mass_properties.second_moment(k, self.R[k])
 
     def parent(self, k: int) -> int:
@@ -159,7 +160,7 @@ def tree_kinematics(
     robot
         The robot.
     mass_properties
-        Mass properties of the bodies; None: constants from the description.
+        Mass properties of the bodies; by default, constants from the description.
     """
     mass_properties = mass_properties or MassProperties(robot)
     q = ca.SX.sym("q", len(robot.joint_names))
@@ -190,7 +191,8 @@ def tree_kinematics(
 
 
 def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX:
-    """Return the quaternion (4,) of ``R_BL``, smooth in q because not computed from a matrix."""
+    """Return the quaternion (4,) of ``R_BL``, smooth in q because it is not converted from a
+    matrix."""
     index, pose = description.frames[link]
     quaternion, theta = _to_constant(pose.R), joint_positions(description, q)
     while index > 0:
@@ -212,8 +214,8 @@ def _to_constant(R: Array) -> ca.DM:
 class LinkPlacement:
     """Poses in W of frames fixed to links, from the base pose and the link poses.
 
-    Evaluated in CasADi's virtual machine: its few hundred operations take less time than one matrix
-    product in numpy.
+    The poses are evaluated in CasADi's virtual machine: the few hundred operations take less time
+    than one matrix product in numpy.
 
     Parameters
     ----------
@@ -273,8 +275,8 @@ def joints_outward(robot: RobotDescription) -> list[Joint]:
 class ForwardKinematics:
     """Link poses of a robot from its joint positions.
 
-    Transforms are positions (m) and quaternions (x, y, z, w) side by side: (k, 7). A quaternion
-    rotates by half the joint angle, so it is continuous over several revolutions.
+    Transforms consist of a position (m) and a quaternion (x, y, z, w), side by side: (k, 7).
+    Quaternions depend on half the joint angle, so they are continuous over several revolutions.
 
     Parameters
     ----------
@@ -284,12 +286,12 @@ class ForwardKinematics:
     Attributes
     ----------
     links
-        Link names, the base link first, each after its parent.
+        Link names, with the base link first and each link after its parent.
     moving, fixed
         Parent and child of each moving joint, and of each fixed joint.
     transforms, fixed_transforms
-        Poses of these children in their parents: (k, 7), updated in place by :meth:`update`, and
-        (m, 7).
+        Poses of the moving and of the fixed children in their parents: (k, 7), updated in place by
+        :meth:`update`, and (m, 7).
     """
 
     def __init__(self, robot: RobotDescription) -> None:

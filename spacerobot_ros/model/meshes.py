@@ -8,8 +8,9 @@
                 mesh = shape_mesh(shape, most=20_000)   # MeshError: a message for the user
                 draw(mesh.vertices, mesh.faces, shape.rgba)
 
-STL and OBJ are read here; COLLADA, glTF and PLY by trimesh, if it is installed. Files, also those
-in bags, may be untrusted: sizes are bounded, and messages do not quote file content.
+STL and OBJ are read here; COLLADA, glTF and PLY are read by trimesh, if it is installed. Files,
+including those in bags, may be untrusted: sizes are bounded, and messages do not quote file
+content.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ _MAX_MESH_BYTES = 100_000_000
 _MAX_TRIANGLES = 2_000_000
 
 _STL_HEADER_BYTES = 84
-"""Header size of a binary STL file, bytes: 80 of text, and the number of triangles."""
+"""Header size of a binary STL file, bytes: 80 bytes of text, followed by the number of
+triangles."""
 
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -98,9 +100,9 @@ def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
     Parameters
     ----------
     text
-        URDF; a string that is not XML is returned unchanged.
+        URDF string; a string that is not XML is returned unchanged.
     find
-        Returns the file for a mesh name in the URDF; None: the name stays.
+        Function that returns the file for a mesh name in the URDF; None keeps the name.
     """
     try:
         root = editable_root(text)
@@ -115,7 +117,7 @@ def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
 
 
 def mesh_beside(resource: str, folder: Path) -> Path | None:
-    """Return the file of a mesh given by a path relative to a folder; None: the URI is absolute."""
+    """Return the file of a mesh given relative to a folder; None if the path is absolute."""
     scheme, mark, rest = resource.partition("://")
     if not mark:
         found = folder / resource
@@ -128,10 +130,11 @@ def mesh_beside(resource: str, folder: Path) -> Path | None:
 
 
 def mesh_file(resource: str) -> Path | None:
-    """Return the file of a mesh given its URI (``file://``, ``package://``) or path; None: not
-    there.
+    """Return the file of a mesh given its URI (``file://``, ``package://``) or path; None if not
+    found.
 
-    Packages are looked up in the ROS environment, which meshes of this package do not need.
+    Packages are looked up in the ROS environment; the meshes in this package do not require a ROS
+    environment.
     """
     url = urlparse(resource)
     if url.scheme == "package":
@@ -285,7 +288,7 @@ def _read_stl(data: bytes) -> TriangleMesh:
 
 
 def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
-    """Return a mesh from triangle corners (3 M, 3); equal corners are merged."""
+    """Return a mesh from triangle corners (3 M, 3); identical corners are merged."""
     if not len(corners):
         return TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
     # Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bytes.

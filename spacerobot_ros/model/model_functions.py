@@ -1,7 +1,7 @@
 """Named functions of a robot model, built on demand and compiled once.
 
-A model's mass properties are constants, or the last argument ``p`` of all its functions: then one
-compilation serves all robots that differ only in mass properties.
+The mass properties of a model are either constants or the last argument ``p`` of all its functions.
+In the latter case, one compilation serves all robots that differ only in mass properties.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class ModelFunctions:
     robot
         The robot.
     mass_properties
-        Mass properties of the bodies as symbols; None: as constants.
+        Mass properties of the bodies as symbols; by default, they are constants.
     """
 
     def __init__(
@@ -80,12 +80,12 @@ class ModelFunctions:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> ModelFunctions:
-        """Return the model with a robot's mass properties as constants; equal robots in a process
-        share it."""
+        """Return the model with a robot's mass properties as constants; identical robots in a
+        process share the model."""
         return _model_of_key(_RobotKey.of(robot, robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
-        """Return a model function by name (the keys of ``_builders``).
+        """Return a model function by name (one of the keys of ``_builders``).
 
         ``compile=False`` returns the symbolic function, for building larger functions.
         """
@@ -107,17 +107,17 @@ class ModelFunctions:
 
     @property
     def total_mass(self) -> float:
-        """System mass, kg; only for models with constants."""
+        """System mass, kg; only for models with constant mass properties."""
         return float(self._kin.total_mass)
 
     @property
     def mass_inputs(self) -> dict[str, ca.SX]:
-        """The symbol ``p`` by name; empty if the model has constants."""
+        """The symbol ``p`` by name; empty if the mass properties are constants."""
         return self._kin.mass_properties.inputs
 
     @cached_property
     def equations_key(self) -> str:
-        """Hash of the equations at zero momentum, equal for robots with the same motion."""
+        """Hash of the equations at zero momentum, identical for robots with the same motion."""
         digest = hashlib.sha256()
         for name in ("locked_inertia", "center_of_mass"):
             digest.update(self.function(name, compile=False).serialize().encode())
@@ -318,7 +318,7 @@ class ModelFunctions:
 
 
 _MAX_SYMBOLIC_MODELS = 8
-"""Number of models per cache; the least recently used is dropped first."""
+"""Number of models per cache; the least recently used model is dropped first."""
 
 
 @dataclass(frozen=True)
@@ -341,15 +341,15 @@ def _model_of_key(equal: _RobotKey) -> ModelFunctions:
 class Composition:
     """Composes larger functions from model functions, in symbols of one kind (MX or SX).
 
-    It passes the mass properties on: calls of model functions are written without ``p``, and
-    :meth:`function` adds it as the last input.
+    The composed functions use the model's mass properties: model functions are called without
+    ``p``, and :meth:`function` adds it as the last input.
     """
 
     def __init__(self, model: ModelFunctions, kind: type[ca.MX] | type[ca.SX]) -> None:
         self.n, self.link_names = model.n, model.link_names
         self._model = model
         self.inputs = {name: kind.sym(name, p.numel()) for name, p in model.mass_inputs.items()}
-        """The symbol ``p`` by name; empty if the model has constants."""
+        """The symbol ``p`` by name; empty if the mass properties are constants."""
 
     def __call__(self, name: str, *arguments: ca.MX | ca.SX | ca.DM) -> ca.MX | ca.SX:
         """Call a function of the model."""
@@ -388,7 +388,7 @@ class SymbolicModels:
         """Return the model for inertial parameters (..., B), and its argument ``p`` (..., k).
 
         Entries that are zero in the nominal robot are usually zero in all robots, and are omitted
-        from ``p``. If one of them is nonzero, all entries are in ``p``.
+        from ``p``. If any of these entries is nonzero, all entries are in ``p``.
         """
         vector = parameters.vector
         usual = not vector[..., ~self._free].any()

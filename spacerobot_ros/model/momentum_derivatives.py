@@ -10,9 +10,9 @@ motion of body k at ``omega`` and ``qdot``. Spatial vectors and inertias are as 
 Joint i moves all bodies that it carries. Seen from those bodies, the rest of the system moves in
 the opposite direction: V1 changes by ``a_i = V1 x S_i``, and the motion V2 of the carrier of joint
 i by
-``b_i = V2 x S_i``. With the momenta ``h1_i = I^c_i V1`` and ``h2_i = sum_k I_k V2_k`` of the bodies
-that joint i carries, ``S x*`` the cross product of motion and force, and P_j the momentum of a unit
-rate of joint j, the momenta change by
+``b_i = V2 x S_i``. Let ``h1_i = I^c_i V1`` and ``h2_i = sum_k I_k V2_k`` be the momenta of the
+bodies that joint i carries, ``S x*`` the cross product of motion and force, and P_j the momentum
+due to a unit rate of joint j. Then the momenta change by
 
 * ``y1_i = S_i x* h1_i + I^c_i a_i`` and ``y2_i = S_i x* h2_i + I^c_i b_i``,
 
@@ -22,13 +22,14 @@ and if joint i carries joint j or is joint j, the second derivatives are
 * by q_i and qdot_j: ``a_i' P_j``; by q_j and qdot_i: ``S_i' y1_j``;
 * by q_i and omega: the angular part of ``y1_i``.
 
-They are zero for joints on different branches. All of this holds for a given motion of the centre
-of mass. To keep it at rest, subtract ``(f1_x' f2_y + f2_x' f1_y) / M``, where f1_x and f2_x are the
-derivatives of both motions' linear momenta with respect to the variables x and y.
+The second derivatives are zero for joints on different branches. All derivatives are for a given
+motion of the centre of mass. To keep the centre of mass at rest, subtract
+``(f1_x' f2_y + f2_x' f1_y) / M``, where f1 and f2 are the linear momenta of the two motions, and
+subscripts denote derivatives by the variables x and y.
 
-These formulas need a tenth of the operations of CasADi's derivatives. They are derived here; the
-derivative of a subtree's momentum with respect to its joint is from R. Featherstone, Rigid Body
-Dynamics Algorithms, 2008, section 2.9.
+These formulas need a tenth of the operations of CasADi's derivatives. The formulas are derived
+here; the derivative of a subtree's momentum with respect to its joint is from R. Featherstone,
+Rigid Body Dynamics Algorithms, 2008, section 2.9.
 """
 
 from __future__ import annotations
@@ -42,15 +43,15 @@ def momentum_derivatives(
     parts: Composites, omega: ca.SX, qdot: ca.SX, eta: ca.SX
 ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
     """Return the derivatives in a configuration, at zero linear momentum: ``dL/dq`` (3, n) of the
-    angular momentum L, and those of ``eta' L`` by q and q (n, n), q and qdot (n, n), and q and
-    omega (n, 3).
+    angular momentum L, and the second derivatives of ``eta' L`` with respect to q and q (n, n), q
+    and qdot (n, n), and q and omega (n, 3).
 
     Parameters
     ----------
     parts
         The composites at the configuration.
     omega, qdot
-        Base rate (3,) in base components, and joint rates (n,).
+        Angular velocity (3,) of the base, in base components, and joint rates (n,).
     eta
         (3,) weights of the momentum components.
     """

@@ -7,13 +7,13 @@ than the known impulse J since the first state, where the total momentum is P_0,
 
     P_r(t) + A(t) phi = P_0 + J(t),
 
-for linear over angular momentum about a fixed point. P_0 is unknown, too. If columns of A
-are constant along a motion (such as a planar one), it does not determine all parameters; the
-undetermined ones are reported. The others are physically consistent: a rigid body with these
-parameters exists. This
-holds if and only if the pseudo-inertia matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive
-definite (Wensing, Kim and Slotine, 2018), which a Cholesky factor with logarithms on the diagonal
-ensures (Rucker and Wensing, 2022). The sources are cited from memory.
+for linear and angular momentum about a fixed point. P_0 is unknown, too. If columns of A
+are constant along a motion (such as a planar motion), that motion does not determine all
+parameters; the undetermined parameters are reported. The estimated parameters are physically
+consistent: a rigid body with these parameters exists. This holds if and only if the pseudo-inertia
+matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive definite (Wensing, Kim and Slotine, 2018),
+which a Cholesky factor with logarithms on the diagonal ensures (Rucker and Wensing, 2022). The
+sources are cited from memory.
 """
 
 from __future__ import annotations
@@ -33,10 +33,12 @@ PAYLOAD_PARAMETERS = ("m", "m cx", "m cy", "m cz", "Ixx", "Iyy", "Izz", "Ixy", "
 """Parameter names: kg, kg m, and kg m^2 about the origin of L."""
 
 _SMALLEST_SINGULAR_VALUE = 1e-7
-"""Smallest singular value of a direction determined by the motion, relative to the largest."""
+"""Smallest singular value, relative to the largest, at which a direction is considered determined
+by the motion."""
 
 _MIN_SIGNAL_TO_NOISE = 10.0
-"""Smallest signal power that determines a direction, relative to the error power."""
+"""Smallest signal power, relative to the error power, at which a direction is considered
+determined."""
 
 _MIN_JERK_RATIO = 3.0
 """Second difference, relative to the median, above which it is attributed to jerk."""
@@ -48,7 +50,8 @@ _ROUNDS = 4
 """Number of fits, alternating between the parameters and the scatter of the momenta."""
 
 _MIN_UNDETERMINED_SHARE = 0.2
-"""Fraction of undetermined directions above which a parameter is undetermined."""
+"""Fraction of a parameter in the undetermined directions above which the parameter is
+undetermined."""
 
 _ROUNDING = 1e-11
 """Smallest relative momentum error; impulses are sums over ticks."""
@@ -71,10 +74,10 @@ class PayloadEstimate:
     parameters
         (10,) of :data:`PAYLOAD_PARAMETERS`; A parameter that the motion does not determine is NaN.
     deviations
-        (10,) standard deviations, from the scatter of the momenta.
+        (10,) standard deviations, estimated from the scatter of the momenta.
     directions
-        (k, 10) orthonormal undetermined combinations, each parameter in units of the
-        robot's mass and radius of gyration.
+        (k, 10) orthonormal combinations of parameters that are not determined, with each parameter
+        in units of the robot's mass and radius of gyration.
     corrected
         Whether the best fit was not physical, so that the nearest physical parameters are returned.
     """
@@ -108,7 +111,7 @@ def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
     Parameters
     ----------
     motion
-        Motion of the parameters' frame L.
+        Motion of the parameter frame L.
     about
         (3,) reference point of the angular momentum in W, m.
     """
@@ -137,7 +140,7 @@ def estimate_payload(
 
     Errors of successive states are not independent: impulse errors accumulate. In a cosine
     transform over time, the modes of white noise and of a random walk are independent; each mode is
-    weighted by its inverse variance, and the mean, which contains the unknown P_0, is omitted.
+    weighted by its inverse variance. The mean, which contains the unknown P_0, is omitted.
 
     Parameters
     ----------

@@ -98,7 +98,8 @@ def matrices_from_quaternions(quaternions: Array) -> Array:
 
 
 def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
-    """Return the product of two quaternions (x, y, z, w): the rotation b followed by a.
+    """Return the product of two quaternions a and b (x, y, z, w): the rotation b followed by the
+    rotation a.
 
     If either is an array (N, 4), so is the product.
     """
@@ -154,7 +155,7 @@ def rotvecs_from_quaternions(quaternions: Array) -> Array:
 
 
 def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
-    """Return the rotation vector (3,), rad, body components, from an attitude to its target."""
+    """Return the rotation vector (3,), rad, in body components, from one attitude to another."""
     return rotvec_from_quaternion(quaternion_multiply(quaternion_inverse(quaternion), target))
 
 
@@ -175,8 +176,8 @@ def swing_angle(quaternion: npt.ArrayLike, axes: Array) -> float:
     """Return the angle, rad, between a rotation and the nearest rotation about axes (k, 3).
 
     The rotation is a unit quaternion (x, y, z, w); the axes are orthonormal. With one axis, this is
-    the swing angle that remains after the twist about it; without axes, the angle of the whole
-    rotation.
+    the swing angle that remains after the twist about it; without axes, it is the angle of the
+    whole rotation.
     """
     q = np.asarray(quaternion, dtype=float)
     about = axes @ q[:3]

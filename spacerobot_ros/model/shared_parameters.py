@@ -21,7 +21,8 @@ DEFAULT_TICK_RATE = 20.0
 _MIN_RATE = 0.001  # Hz
 
 _MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS = 1.0, 10
-"""Longest gap between two states, s, and in control periods; longer gaps are time jumps."""
+"""Longest gap between two states, in s and in control periods; longer gaps are considered time
+jumps."""
 
 DEFAULT_POSITION_TOLERANCE = 1e-3
 """Automatic position tolerance if no robot is known, m."""
@@ -43,7 +44,7 @@ def automatic_tolerance(robot: RobotDescription) -> float:
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """The robot of a node."""
+    """The robot used by a node."""
 
     robot_description: str = parameter(
         "", "URDF string of the robot; takes precedence over 'robot'"
@@ -77,22 +78,23 @@ class RobotConfig:
 
 @dataclass(frozen=True)
 class AssumedRobotConfig(RobotConfig):
-    """The robot as modelled by flight software, which may differ from the plant's."""
+    """The robot model used by flight software; it may differ from the plant's model."""
 
     model_error: float = nonnegative(
         0.0, "largest relative error in masses and inertias", maximum=0.9
     )
-    model_error_seed: int = nonnegative(0, "random seed for these errors")
+    model_error_seed: int = nonnegative(0, "random seed for the mass and inertia errors")
 
     def assumed_robot(self, robot: RobotDescription) -> RobotDescription:
-        """Return the robot with random mass and inertia errors of up to ``model_error``."""
+        """Return the robot with random relative mass and inertia errors of at most
+        ``model_error``."""
         if self.model_error > 0.0:
             return robot.with_model_error(self.model_error, self.model_error_seed)
         return robot
 
 
 def robot_of(config: RobotConfig) -> SpaceRobot | None:
-    """Return the robot named in a configuration; None: it names none.
+    """Return the robot named in a configuration; None if no robot is named.
 
     Raises
     ------
@@ -113,7 +115,7 @@ def robot_of(config: RobotConfig) -> SpaceRobot | None:
 
 
 def robot_from_text(text: str, config: RobotConfig) -> SpaceRobot:
-    """Return the robot from a URDF string with the mass properties assumed by the node.
+    """Return the robot described by a URDF string, with the mass properties assumed by the node.
 
     Raises
     ------
@@ -146,33 +148,39 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     """Parameters of nodes that command a plant: rate, goals, tolerances."""
 
     tick_rate: float = nonnegative(
-        0.0, "commands per second; 0: the plant's rate", "Hz", maximum=100000.0
+        0.0, "number of commands per second; 0: the tick rate of the plant", "Hz", maximum=100000.0
     )
     world_frame: str = parameter("world", "frame assumed for goals without a known frame")
     state_reliability: str = parameter(
         "auto",
         "reliability of the subscriptions to odom and joint_states; auto: reliable, or best "
-        "effort if a publisher offers no more",
+        "effort if a publisher offers nothing else",
         choices=("auto", "reliable", "best_effort"),
     )
     diagnostics_period: float = nonnegative(
         1.0,
-        "simulated time between diagnostics; 0: ignored states only. Also published once per "
-        "second of wall time, except in single-process runs",
+        "simulated time between diagnostics; 0: only when states are ignored. Also published once "
+        "per second of wall time, except in single-process runs",
         "s",
     )
     position_tolerance: float = nonnegative(
         0.0,
-        "largest position error for a goal to be reached; 0: a thousandth of the robot's diameter "
-        "of gyration",
+        "largest position error at which a goal is considered reached; 0: a thousandth of the "
+        "robot's diameter of gyration",
         "m",
         read_only=False,
     )
     attitude_tolerance: float = nonnegative(
-        0.001, "largest attitude error for a goal to be reached", "rad", read_only=False
+        0.001,
+        "largest attitude error at which a goal is considered reached",
+        "rad",
+        read_only=False,
     )
     joint_tolerance: float = nonnegative(
-        0.001, "largest joint error for a goal to be reached", "m or rad", read_only=False
+        0.001,
+        "largest joint error at which a goal is considered reached",
+        "m or rad",
+        read_only=False,
     )
     resume_file: str = parameter(
         "", "file with the current goals, from which a restarted node resumes; '': none"
@@ -180,10 +188,10 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
     plan_in_background: bool = parameter(
         True,
         "plan in a thread while the robot keeps moving; if false, or with a lockstep plant, "
-        "states wait for the plan",
+        "states are not processed until the plan is ready",
     )
     stop_when_decided: bool = parameter(
-        False, "send no commands once a goal has ended: a lockstep plant stays at that tick"
+        False, "send no commands once a goal has finished; a lockstep plant then stays at that tick"
     )
     watchdog_action: str = parameter(
         "report",
@@ -199,14 +207,14 @@ class CommanderConfig(WatchdogConfig, AssumedRobotConfig):
             )
 
     def for_robot(self: Config, robot: RobotDescription) -> Config:
-        """Return the configuration with the automatic tolerance replaced by the robot's value."""
+        """Return the configuration with the automatic tolerance resolved for the robot."""
         if self.position_tolerance:
             return self
         return replace(self, position_tolerance=automatic_tolerance(robot))
 
     @property
     def longest_gap(self) -> float:
-        """Largest time between two states that is no jump of time, s."""
+        """Largest time between two states that is not considered a time jump, s."""
         return max(_MAX_STATE_GAP, _MAX_STATE_GAP_PERIODS * self.control_period)
 
     @property

@@ -1,8 +1,8 @@
 """Model of one robot: its compiled equations as methods.
 
 Frames: world W, base link B. Vectors with the suffix ``_B`` are in base components. The shape ``q``
-(n,) is ordered as ``joint_names``. The methods return new arrays; code that runs every control
-period takes a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
+(n,) is in the order of ``joint_names``. The methods return new arrays; code that runs every control
+period uses a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from spacerobot_ros.model.rotations import hat
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 
 _MIN_RELATIVE_INERTIA = 1e-6
-"""Largest joint component that counts as zero in a motion without inertia."""
+"""Largest joint component that is considered zero in a motion without inertia."""
 
 _MIN_RELATIVE_COUPLING = 1e-9
-"""Smallest singular value of the connection that counts as a base rotation, rad per rad."""
+"""Smallest singular value of the connection that is considered a base rotation, rad per rad."""
 
 
 class SpaceRobot:
@@ -39,9 +39,9 @@ class SpaceRobot:
     description
         The robot, as returned by :func:`load_robot` or :func:`parse_robot`.
     build
-        Model set for all robots that differ only in mass properties: :meth:`buffered` and
-        :meth:`composed` functions take these as an argument and are compiled once for all of them.
-        If None, the mass properties are compiled in.
+        Set of models for all robots that differ only in mass properties: :meth:`buffered` and
+        :meth:`composed` functions take the mass properties as an argument and are compiled once for
+        all these robots. If None, the mass properties are compiled as constants.
 
     Raises
     ------
@@ -78,8 +78,8 @@ class SpaceRobot:
     def with_inertial(self, parameters: InertialParameters) -> SpaceRobot:
         """Return the robot with other masses, centres of mass and inertias.
 
-        All such robots share their compiled functions. If the values are equal, the robot itself is
-        returned.
+        All variants of the robot with different values share their compiled functions. If the
+        values are unchanged, the robot itself is returned.
 
         Raises
         ------
@@ -97,10 +97,11 @@ class SpaceRobot:
         return SpaceRobot(description, self._build)
 
     def derived(self, description: RobotDescription) -> SpaceRobot:
-        """Return a robot from a description derived from this robot's, such as its gyrostat.
+        """Return a robot from a description that is derived from this robot's description, such as
+        the description of its gyrostat.
 
         If this robot shares its compiled functions with robots that differ only in mass
-        properties, so does the new one.
+        properties, so does the new robot.
         """
         shared = None if self._p is None else SymbolicModels.of(description)
         return SpaceRobot(description, shared)
@@ -133,7 +134,7 @@ class SpaceRobot:
         return R[:, 3 * index : 3 * index + 3], r.reshape((3, -1), order="F")[:, index]
 
     def inertia_matrix(self, q: npt.ArrayLike) -> Array:
-        """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, base components (eq. 15)."""
+        """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, in base components (eq. 15)."""
         return self._call_function("inertia_matrix", q)[0]
 
     def bias(
@@ -155,10 +156,10 @@ class SpaceRobot:
         wrench_B: npt.ArrayLike,
         tau: npt.ArrayLike,
     ) -> Array:
-        """Return ``z0ddot`` (6 + n,): derivatives of ``[v_cm; omega; qdot]``, base components (eq.
-        19).
+        """Return ``z0ddot`` (6 + n,): derivatives of ``[v_cm; omega; qdot]``, in base components
+        (eq. 19).
 
-        ``wrench_B`` (6,) is force (N) over torque (N m) at the base origin, ``tau`` (n,) efforts.
+        ``wrench_B`` (6,) is force (N) and torque (N m) at the base origin, ``tau`` (n,) efforts.
         """
         return self._call_function("forward_dynamics", q, v_cm_B, omega_WB_B, qdot, wrench_B, tau)[
             0
@@ -178,8 +179,8 @@ class SpaceRobot:
 
         ``d/dt dx = A dx + B du`` to first order, with ``dx = [dr; dtheta; dq; dv; domega; dqdot]``:
         position (m) and rotation vector (rad) of the base relative to its motion in that state,
-        joint positions, base twist, and joint velocities, with vectors in base components,
-        and ``du = [f; n; tau]``, the change in force, torque and efforts.
+        joint positions, base twist, and joint velocities. ``du = [f; n; tau]`` is the change in
+        force, torque and efforts. All vectors are in base components.
         """
         n = self.n
         given = zip((3, 3, n, 6, n), (v_WB_B, omega_WB_B, qdot, wrench_B, tau), strict=True)
@@ -215,16 +216,16 @@ class SpaceRobot:
         return ca.Function("linearised", [q, v, omega, qdot, wrench, tau], results)
 
     def joint_efforts(self, q: npt.ArrayLike, qdot: npt.ArrayLike, qddot: npt.ArrayLike) -> Array:
-        """Return the efforts (n,), N or N m, for a joint motion at zero momentum.
+        """Return the efforts (n,), N or N m, required for a joint motion at zero momentum.
 
         No wrench acts on the base; its motion follows from the momenta.
         """
         return self._call_function("joint_efforts", q, qdot, qddot)[0]
 
     def jacobian(self, link: str, q: npt.ArrayLike) -> Array:
-        """Return ``0J+`` (6, 6 + n) for a link frame origin (paper 4, eq. 10), base components.
+        """Return ``0J+`` (6, 6 + n) for a link frame origin (paper 4, eq. 10), in base components.
 
-        It maps ``[v_cm; omega; qdot]`` to linear over angular velocity.
+        The matrix maps ``[v_cm; omega; qdot]`` to linear and angular velocity.
 
         Raises
         ------
@@ -235,9 +236,9 @@ class SpaceRobot:
         return self._call_function(f"jacobian:{link}", q)[0]
 
     def generalised_jacobian(self, link: str, q: npt.ArrayLike) -> Array:
-        """Return ``J*`` (6, n) for a link frame origin at zero momentum, base components.
+        """Return ``J*`` (6, n) for a link frame origin at zero momentum, in base components.
 
-        It maps ``qdot`` to linear over angular velocity in the world, while the base moves
+        The matrix maps ``qdot`` to linear and angular velocity in the world, while the base moves
         according to the momenta (Umetani and Yoshida's generalised Jacobian).
 
         Raises
@@ -256,9 +257,10 @@ class SpaceRobot:
     def reaction_null_space(self, q: npt.ArrayLike) -> Array:
         """Return an orthonormal basis (n, k) of joint rates that do not rotate the base.
 
-        They are the null space of the coupling inertia ``D_q`` (Nenchev, Umetani and Yoshida, 1992,
-        from memory): at zero angular momentum, the base keeps its attitude while the joints move at
-        these rates. The projection ``N N'`` maps any rates to the nearest such rates.
+        These rates span the null space of the coupling inertia ``D_q`` (Nenchev, Umetani and
+        Yoshida, 1992, cited from memory): at zero angular momentum, the base keeps its attitude
+        while the joints move at these rates. The projection ``N N'`` maps any rates to the nearest
+        such rates.
         """
         _, s, Vt = np.linalg.svd(self.connection(q)[3:])
         rank = int(np.count_nonzero(s > _MIN_RELATIVE_COUPLING * max(1.0, s.max(initial=0.0))))
@@ -327,8 +329,8 @@ class SpaceRobot:
     def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
         """Return a buffered function that ``build`` composes from MX model functions.
 
-        It is compiled once per name for all robots that differ only in mass properties, for
-        evaluation at every tick.
+        The function is compiled once per name for all robots that differ only in mass properties,
+        for evaluation at every tick.
         """
         model = self._model
         function = model.composed(name, lambda: build(Composition(model, ca.MX)))
@@ -357,12 +359,13 @@ class SpaceRobot:
 
     @property
     def mass_arguments(self) -> dict[str, Array]:
-        """The last argument of functions from :meth:`expressions`, by name; empty: none."""
+        """The last argument of functions from :meth:`expressions`, by name; empty if there is
+        none."""
         return {} if self._p is None else {"p": self._p}
 
     @property
     def equations_key(self) -> str:
-        """Hash of the equations at zero momentum, equal for robots with equal equations."""
+        """Hash of the equations at zero momentum, identical for robots with identical equations."""
         return self._numeric_model.equations_key
 
     @cached_property
@@ -398,7 +401,7 @@ class SpaceRobot:
         if values[0] > 1e-12 * self.total_mass:
             return
         moved = np.abs(vectors[6:, 0])
-        box = "an <inertia>, for a box of sides a, b, c ixx = m (b^2 + c^2) / 12 and so on"
+        box = "an <inertia> (for a box with sides a, b and c: ixx = m (b^2 + c^2) / 12, and so on)"
         if not moved.size or moved.max() < _MIN_RELATIVE_INERTIA:
             mend = (
                 f"it can rotate without moving any mass. Give '{self.description.base_link}' {box}."

@@ -1,7 +1,7 @@
 """SRDF files as written by MoveIt: pairs of links whose contacts are ignored.
 
 A robot's URDF contains these pairs as SRDF elements ``<disable_collisions>``, which other
-URDF readers ignore. So nodes and bags need only the URDF.
+URDF readers ignore. Nodes and bags therefore need only the URDF.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from spacerobot_ros.resources import suggestion
 
 
 def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
-    """Return a robot with its disabled pairs replaced by those in an SRDF file.
+    """Return a robot with its disabled pairs replaced by the pairs in an SRDF file.
 
     The elements ``<disable_collisions link1="..." link2="..."/>``,
     ``<disable_default_collisions link="..."/>`` and
-    ``<enable_collisions link1="..." link2="..."/>`` are read; the last one takes precedence.
+    ``<enable_collisions link1="..." link2="..."/>`` are read; the last element takes precedence.
 
     Raises
     ------

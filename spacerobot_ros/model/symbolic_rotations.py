@@ -24,7 +24,8 @@ def matrix_from_quaternion(quaternion: ca.SX) -> ca.SX:
 
 
 def quaternion_from_matrix(R: ca.SX) -> ca.SX:
-    """Return the unit quaternion (4,) of a rotation matrix (3, 3), like the numeric counterpart."""
+    """Return the unit quaternion (4,) of a rotation matrix (3, 3), in the same way as the numeric
+    counterpart."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (ca.horzsplit(row) for row in ca.vertsplit(R))
     trace = xx + yy + zz
     squares = [1 + 2 * xx - trace, 1 + 2 * yy - trace, 1 + 2 * zz - trace, 1 + trace]
@@ -48,7 +49,8 @@ def matrix_about_axis(axis: np.ndarray, angle: ca.SX) -> ca.SX:
 
 
 def quaternion_multiply(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Return the product (4,) of two quaternions: the rotation b followed by a."""
+    """Return the product (4,) of two quaternions a and b: the rotation b followed by the rotation
+    a."""
     vector = a[3] * b[:3] + b[3] * a[:3] + ca.cross(a[:3], b[:3])
     return ca.vertcat(vector, a[3] * b[3] - ca.dot(a[:3], b[:3]))
 
@@ -59,11 +61,12 @@ def relative_vector(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 _HALF_TURN_ROUNDING = 1e-9
-"""Keeps the half-angle derivatives finite at a rotation by pi."""
+"""Small number that keeps the half-angle derivatives finite at a rotation by pi."""
 
 
 def half_angle_vector(R: ca.SX) -> ca.SX:
-    """Return the axis of a rotation (3, 3) times twice the sine of half its angle (3,)."""
+    """Return the axis of a rotation (3, 3), multiplied by twice the sine of half the rotation
+    angle, (3,)."""
     vector = ca.inv_skew((R - R.T) / 2) * 2
     return vector / ca.sqrt(ca.fmax(1 + ca.trace(R), 0) + _HALF_TURN_ROUNDING)
 
@@ -86,7 +89,7 @@ def quaternion_from_rotvec(rotvec: ca.SX) -> ca.SX:
 def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
     """Return the quaternion (4,) of a rotation vector (3,) much shorter than a radian.
 
-    A power series with sixth-order error, smooth at zero and without a square root.
+    The result is a power series with sixth-order error, smooth at zero and without a square root.
     """
     square = ca.sumsqr(rotvec)
     return ca.vertcat(
@@ -96,10 +99,10 @@ def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
 
 
 def rotation_error(quaternion: ca.SX, target: ca.SX) -> ca.SX:
-    """Return the rotation vector (3,), rad, world components, from an attitude to its target.
+    """Return the rotation vector (3,), rad, in world components, from one attitude to another.
 
-    It is the shortest such vector: its length is at most pi for either sign of the quaternions. For
-    a rotation by pi, either of the two shortest vectors is returned.
+    The result is the shortest such rotation vector: its length is at most pi for either sign of the
+    quaternions. For a rotation by pi, either of the two shortest vectors is returned.
     """
     inverse = ca.vertcat(-quaternion[:3], quaternion[3])
     error = quaternion_multiply(target, inverse)

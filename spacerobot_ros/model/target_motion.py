@@ -1,7 +1,8 @@
 """Predicted motion of a free target, and of a frame approaching it.
 
 If no force or torque acts on a target, its centre of mass moves at constant velocity and its
-angular momentum ``L_W`` about it is constant, so that its attitude obeys Euler's equations,
+angular momentum ``L_W`` about the centre of mass is constant, so that its attitude obeys Euler's
+equations,
 
     omega_T = I^-1 R_WT' L_W,    dR_WT/dt = R_WT hat(omega_T).
 
@@ -63,11 +64,11 @@ class FrameMotion:
         return FrameMotion(*(getattr(self, each.name)[chosen] for each in fields(self)))
 
     def body_motion(self) -> BodyMotion:
-        """Return the motion at the first time without accelerations."""
+        """Return the motion at the first time, without accelerations."""
         return BodyMotion(self.R[0], self.r[0], self.v[0], self.omega[0])
 
     def with_relative_motion(self, path: RelativeMotionOverTime) -> FrameMotion:
-        """Return the motion of a frame that moves relative to this one."""
+        """Return the motion of a frame that moves relative to this frame."""
         R, omega, alpha = self.R, self.omega, self.alpha
         arm, v_rel, a_rel = (_rotate_vectors(R, each) for each in (path.x, path.xdot, path.xddot))
         w_rel, wdot_rel = (_rotate_vectors(R, each) for each in path.rotation)
@@ -92,7 +93,7 @@ class RelativeMotionOverTime:
     Attributes
     ----------
     x, xdot, xddot
-        Position (K, 3), m, and its derivatives.
+        Position (K, 3), m, and the derivatives of the position.
     phi, phidot, phiddot
         Rotation vector (K, 3) of ``R_GE``, rad, and its derivatives.
     """
@@ -106,7 +107,7 @@ class RelativeMotionOverTime:
 
     @classmethod
     def stacked(cls, motions: Sequence[RelativeMotionOverTime]) -> RelativeMotionOverTime:
-        """Return the motions concatenated in time."""
+        """Return the given motions, concatenated in time."""
         names = [each.name for each in fields(cls)]
         return cls(*(np.concatenate([getattr(each, name) for each in motions]) for name in names))
 
@@ -182,7 +183,7 @@ class RelativePath:
     start
         Initial motion (K = 1).
     position
-        (3,) at the end, m, where the attitudes of E and G are equal.
+        (3,) position at the end, m, where the attitudes of E and G coincide.
     duration
         Duration, s.
     """
@@ -250,7 +251,7 @@ class TorqueFreeMotion:
     body
         The target.
     motion
-        The state of its root link frame.
+        State of the target's root link frame.
     """
 
     def __init__(self, body: TargetBody, motion: BodyMotion) -> None:
@@ -366,8 +367,8 @@ _EXPRESSION_STEPS = 4
 
 class TargetExpression(NamedTuple):
     """A target at one time, in W: its grapple frame's attitude (3, 3), position, velocity and
-    angular velocity (3,); its mass; its centre of mass, its velocity, and the angular momentum
-    about it (3,).
+    angular velocity (3,); its mass; the position and velocity of its centre of mass, and the
+    angular momentum about that point (3,).
     """
 
     R: ca.SX
@@ -381,8 +382,8 @@ class TargetExpression(NamedTuple):
 
     @classmethod
     def at(cls, numbers: ca.SX, time: ca.SX) -> TargetExpression:
-        """Return the target at a time close to that of ``numbers``
-        (:meth:`TorqueFreeMotion.numbers`), by Euler's equations.
+        """Return the target at a time close to the time of ``numbers``
+        (:meth:`TorqueFreeMotion.numbers`), predicted by Euler's equations.
         """
         began, X, L, r, v, mass, about, arm, turn = ca.vertsplit(
             numbers, np.cumsum([0, 1, 4, 3, 3, 3, 1, 6, 3, 4]).tolist()
@@ -425,8 +426,8 @@ def _rotate_vectors(R: Array, vectors: Array) -> Array:
 class PathInWorld:
     """A path that is short in W; relative to the rotating frame G, it leads around the body.
 
-    The position is a fifth-order polynomial in W, from a given motion to that of a point fixed in
-    G; the attitude relative to G follows ``relative``.
+    The position is a fifth-order polynomial in W, from a given motion to the motion of a point
+    fixed in G; the attitude relative to G follows ``relative``.
 
     Parameters
     ----------

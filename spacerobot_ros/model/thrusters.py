@@ -1,6 +1,6 @@
 """Thrusters in flight software: table, wrench allocation, pulse modulation.
 
-A node on a real robot can use it without a plant::
+A node on a real robot can use this module without a plant::
 
     table = find_thrusters("urdf", robot.description)
     modulator = ThrusterModulator(table, control_period=0.01)
@@ -45,21 +45,21 @@ _WRENCH_AXES = (
 _THRUSTER_KEYS = {"name", "link", "position", "rpy", "direction", "force", "min_on_time", "isp"}
 
 COST_WEIGHT = 1e-5
-"""Weight of the cost relative to the wrench. The cost changes the wrench by some 1e-10, which is
+"""Weight of the cost relative to the wrench. The cost changes the wrench by about 1e-10, which is
 corrected afterwards; a much smaller weight would be lost in solver rounding errors."""
 
 TIE_BREAK = 0.01
-"""Largest relative change of a cost. Symmetric thrusters have many allocations of equal cost, and
-machine-dependent rounding errors would select one."""
+"""Largest relative change made to a cost. Symmetric thrusters have many allocations of equal cost,
+and machine-dependent rounding errors would select one."""
 
 _ACHIEVED_TOLERANCE = 1e-9
-"""Largest relative error for a wrench to count as achieved."""
+"""Largest relative error at which a wrench is considered achieved."""
 
 _WRENCH_WEIGHT = 1e4
 """Weight, relative to the cost, of the achieved part of a wrench that exceeds the thrust."""
 
 _ROUNDING = 1e-9
-"""Fractions of a time below this value count as zero."""
+"""Fractions of a time below this value are considered zero."""
 
 _MIN_UNMET_WRENCH = 1e-6
 """Shortfalls of a wrench below this value are ignored, N or N m."""
@@ -67,7 +67,7 @@ _MIN_UNMET_WRENCH = 1e-6
 
 @dataclass(frozen=True)
 class ThrusterTable:
-    """Thrusters on the base, m of them.
+    """The m thrusters on the base.
 
     ``r_B`` (m, 3) are the points of application relative to the base link origin, m;
     ``direction_B`` (m, 3) unit vectors of the forces on the base, opposite to the plumes;
@@ -84,7 +84,7 @@ class ThrusterTable:
 
     @property
     def wrenches(self) -> Array:
-        """Wrenches (6, m) at full thrust, force (N) over torque (N m) at the base link origin, in
+        """Wrenches (6, m) at full thrust, force (N) and torque (N m) at the base link origin, in
         base components.
         """
         thrust_B = self.direction_B * self.force[:, None]
@@ -105,16 +105,16 @@ class ThrusterTable:
         """
         if name not in self.names:
             raise ParameterError(
-                f"There is no thruster '{name}'; there are {', '.join(self.names)}."
+                f"There is no thruster '{name}'; available: {', '.join(self.names)}."
             )
         return self.names.index(name)
 
     def missing(self, without: Sequence[str] = ()) -> str:
-        """Return the names of wrenches that the thrusters cannot produce without ``without``; or
-        "".
+        """Return the names of wrenches that the thrusters other than ``without`` cannot produce;
+        empty if there are none.
 
-        They produce every wrench if they produce both directions along all six axes, because their
-        wrenches form a convex cone.
+        Thrusters can produce every wrench if they can produce both directions along all six axes,
+        because their wrenches form a convex cone.
         """
         # Imported where it is used: scipy.optimize loads slowly.
         from scipy.optimize import linprog
@@ -142,7 +142,7 @@ def find_thrusters(source: str, robot: RobotDescription) -> ThrusterTable:
     ParameterError
         The file or a thruster in it is invalid.
     RobotDescriptionError
-        A thruster in the URDF is invalid, or there is none.
+        A thruster in the URDF is invalid, or the URDF has no thrusters.
     """
     return thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
 
@@ -153,7 +153,7 @@ def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:
     Raises
     ------
     RobotDescriptionError
-        There are no thrusters, or one is invalid.
+        There are no thrusters, or a thruster is invalid.
     """
     entries = []
     for element in ET.fromstring(robot.urdf.encode("utf-8")).findall("thruster"):
@@ -179,7 +179,8 @@ def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:
 
 
 def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
-    """Read a YAML file: a list ``thrusters`` and, for common values, ``defaults``.
+    """Read a YAML file that contains a list ``thrusters`` and, for common values, a mapping
+    ``defaults``.
 
     Raises
     ------
@@ -207,11 +208,11 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
 
 
 def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription) -> ThrusterTable:
-    """Check thrusters and express them in the base link.
+    """Check thrusters and express their data in the base link frame.
 
-    Each has ``name``, ``position`` (m) in the frame of ``link`` (default: the base link), force
-    ``direction`` (default: x, as for joint axes) in that frame rotated by ``rpy`` (rad), ``force``
-    (N), ``isp`` (s) and ``min_on_time`` (s, default: 0).
+    Each thruster has ``name``, ``position`` (m) in the frame of ``link`` (default: the base link),
+    force ``direction`` (default: x, as for joint axes) in that frame rotated by ``rpy`` (rad),
+    ``force`` (N), ``isp`` (s) and ``min_on_time`` (s, default: 0).
 
     Raises
     ------
@@ -311,18 +312,18 @@ class Allocation:
 class ThrusterAllocation:
     """Distributes wrenches over push-only thrusters at minimal cost.
 
-    The levels solve ``wrenches @ levels = wanted`` with ``0 <= levels <= most``. They are found by
-    non-negative least squares (Lawson and Hanson) with an extra row for the cost: as its weight
-    tends to zero, the solution tends to the cheapest exact one. If a level would exceed its
-    upper bound, a linear programme finds the largest achievable fraction of the wrench and its
-    cheapest allocation: the wrench keeps its direction, as in
+    The levels solve ``wrenches @ levels = wanted`` with ``0 <= levels <= most``. The levels are
+    found by non-negative least squares (Lawson and Hanson) with an extra row for the cost: as the
+    weight of this row tends to zero, the solution tends to the cheapest exact solution. If a level
+    would exceed its upper bound, a linear programme finds the largest achievable fraction of the
+    wrench and its cheapest allocation: the wrench keeps its direction, as in
     :class:`spacerobot_ros.control.ActuatorLimits`. If a wrench is outside the thrusters' cone, the
-    nearest wrench in the cone is allocated, with torques weighted by the mean lever.
+    nearest wrench in the cone is allocated, with torques weighted by the mean lever arm.
 
     Parameters
     ----------
     wrenches
-        (6, m) force (N) over torque (N m) of each thruster at level one.
+        (6, m) force (N) and torque (N m) of each thruster at level one.
     cost
         (m,) cost of each thruster at level one, positive.
     """
@@ -353,7 +354,7 @@ class ThrusterAllocation:
         self._extended = np.vstack([self._columns, COST_WEIGHT * self._cost[usable]])
 
     def allocate(self, wanted: Array, most: Array) -> Allocation:
-        """Return levels (m,), each within ``most`` (m,), for a wrench ``wanted`` (6,), or for its
+        """Return levels (m,), each at most ``most`` (m,), for a wrench ``wanted`` (6,), or for its
         achievable part.
         """
         levels = np.zeros(self._cost.size)
@@ -395,14 +396,14 @@ class ThrusterAllocation:
 class ThrusterModulator:
     """Converts a desired wrench into thruster on-times, one control period at a time.
 
-    The modulation is sigma-delta with minimum pulse lengths. ``pending_impulse`` grows by the
+    Sigma-delta modulation with minimum pulse lengths is used. ``pending_impulse`` grows by the
     desired
-    wrench times the period and shrinks by the impulse of each fired pulse. It is reallocated every
-    period, so that opposite contributions cancel. The pending impulse is therefore at most
-    one shortest pulse of each thruster: for ``t`` the shortest on-time and ``h`` the period,
-    ``allocation <= t + h - (remaining part of a shortest pulse)`` holds in every period if the
-    desired wrench is achievable. Wrench beyond the available thrust is dropped, not
-    compensated for later.
+    wrench times the period and shrinks by the impulse of each fired pulse. The pending impulse is
+    reallocated every period, so that opposite contributions cancel. The pending impulse is
+    therefore at most one shortest pulse of each thruster: with the shortest on-time ``t`` and the
+    period ``h``, ``allocation <= t + h - (remaining part of a shortest pulse)`` holds in every
+    period if the desired wrench is achievable. A wrench beyond the available thrust is dropped and
+    not compensated for later.
 
     A pulse begins at the start of a period and may end at any time within a period.
 
@@ -418,7 +419,7 @@ class ThrusterModulator:
     Raises
     ------
     ParameterError
-        An excluded name is not that of a thruster.
+        There is no thruster with the name of an excluded thruster.
     """
 
     def __init__(
@@ -434,7 +435,7 @@ class ThrusterModulator:
         self._remaining = np.zeros(count)
         """Remaining time of minimum pulses (m,), s."""
         self._open = np.zeros(count, dtype=np.bool_)
-        """Whether each thruster (m,) is open between the last and the next period."""
+        """Whether each thruster (m,) remains open from the last period into the next."""
         self._excluded: list[str] = []
         for name in excluded:
             self.exclude(name)
@@ -452,7 +453,8 @@ class ThrusterModulator:
 
     @property
     def missing(self) -> str:
-        """Names of the wrenches that the thrusters in use cannot produce; empty: none."""
+        """Names of the wrenches that the thrusters in use cannot produce; empty if they can produce
+        all."""
         return self.table.missing(self._excluded)
 
     @property
@@ -461,7 +463,7 @@ class ThrusterModulator:
         return float(self.table.mass_flow @ self.on_time)
 
     def exclude(self, name: str) -> None:
-        """Stop using a (broken) thruster; the others produce the wrench if possible.
+        """Stop using a (broken) thruster; the other thrusters produce the wrench if possible.
 
         Raises
         ------
@@ -488,7 +490,7 @@ class ThrusterModulator:
     def fire(self, wrench: Array) -> Array:
         """Return the on-time of each thruster (m,) in the next period, s.
 
-        ``wrench`` (6,) is force (N) over torque (N m) at the base link origin, base components.
+        ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, base components.
         """
         h = self._control_period
         wanted = self.pending_impulse + h * wrench

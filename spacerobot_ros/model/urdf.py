@@ -55,7 +55,8 @@ from spacerobot_ros.model.wheels import require_reaction_wheels
 from spacerobot_ros.resources import suggestion
 
 _MAX_NUMBER = 1e12
-"""Largest value (kg, m, kg m^2): larger ones are typing errors, and their squares overflow."""
+"""Largest value (kg, m, kg m^2): larger values are typing errors, and their squares would
+overflow."""
 
 _MAX_LINKS = 200
 
@@ -67,7 +68,7 @@ XACRO_ARGUMENTS_VARIABLE = "SPACEROBOT_XACRO_ARGS"
 
 
 def load_robot(path: str | Path) -> RobotDescription:
-    """Read a robot from a URDF file, or from a xacro file (by its suffix), which is expanded.
+    """Read a robot from a URDF file, or from a xacro file, which is identified by its suffix.
 
     Mesh paths that are relative to the file, or in a package that is not installed and contains the
     file, become absolute in the robot's URDF. If the folder contains an SRDF of the same name,
@@ -226,14 +227,14 @@ def parse_robot(text: str) -> RobotDescription:
 
 
 def with_held_joints(robot: RobotDescription, positions: Array | None = None) -> RobotDescription:
-    """Return a robot with locked joints: one rigid body, also in its URDF.
+    """Return a robot with locked joints as one rigid body; its URDF is changed accordingly.
 
     Parameters
     ----------
     robot
         The robot.
     positions
-        (n,) m or rad, in joint order; None: zero, or the nearest limit.
+        (n,) m or rad, in joint order; by default zero, or the nearest limit.
 
     Raises
     ------
@@ -566,7 +567,8 @@ def _read_inertia(moments: Element | None, where: str) -> Array:
 
 
 def describe_inertia_flaw(about: Array) -> str:
-    """Return a clause that describes impossible moments of inertia (3, 3), kg m^2; empty: none.
+    """Return a clause that describes impossible moments of inertia (3, 3), kg m^2; empty if the
+    moments are possible.
 
     The clause completes a message that begins with the owner of the inertia.
     """
@@ -585,8 +587,8 @@ def describe_inertia_flaw(about: Array) -> str:
 def nearest_inertias(path: Path) -> tuple[str, dict[str, float]]:
     """Return a file's URDF with a physically possible inertia for every link.
 
-    An impossible inertia is replaced by the nearest possible one in the Frobenius norm. Also return
-    the relative change in inertia of each such link, in that norm.
+    An impossible inertia is replaced by the nearest possible inertia in the Frobenius norm. Also
+    return the relative change in inertia of each such link, in that norm.
 
     Raises
     ------
@@ -785,7 +787,7 @@ def _without_contradicting_limits(joints: list[Joint]) -> list[Joint]:
 
 
 _NO_LIMIT = 1e4
-"""Position, m or rad, from which a joint limit means no limit."""
+"""Position, m or rad, beyond which a limit is treated as no limit."""
 
 
 def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:

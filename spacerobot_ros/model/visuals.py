@@ -33,7 +33,7 @@ from spacerobot_ros.model.meshes import (
 _FACETS_AROUND = 24
 
 _ROD_THICKNESS_RATIO = 0.05
-"""Ratio of thickness to length below which a box counts as a rod, drawn as a line."""
+"""Ratio of thickness to length below which a box is treated as a rod, which is drawn as a line."""
 
 _SHARP_EDGE_COSINE = math.cos(math.radians(30.0))
 _MAX_FACES_IN_BAG = 20_000
@@ -50,7 +50,8 @@ _BOX_FACES = (
 
 @dataclass(frozen=True)
 class Edges:
-    """Line segments (K, 2, 3), and the normals of the two faces adjacent to each (K, 2, 3)."""
+    """Line segments (K, 2, 3), and the normals of the two faces adjacent to each segment (K, 2,
+    3)."""
 
     lines: Array
     normals: Array
@@ -65,11 +66,11 @@ class Visual:
     link
         Name of its link.
     body
-        Index of the body that contains the link; 0: the base.
+        Index of the body that contains the link; 0 for the base.
     shape
         Its URDF description.
     mesh
-        Its triangles in the link frame.
+        Triangles in the link frame.
     """
 
     link: str
@@ -91,8 +92,8 @@ class Visual:
 
     @property
     def outline(self) -> Array:
-        """Outline of the visual in the link frame, line segments (K, 2, 3), which hide no other
-        part."""
+        """Outline of the visual in the link frame: line segments (K, 2, 3) that do not hide any
+        other part."""
         shape = self.shape
         if self.is_rod:
             longest = int(np.argmax(shape.size))
@@ -112,7 +113,7 @@ def visuals_of(
 ) -> tuple[Visual, ...]:
     """Return all drawable visuals of a robot.
 
-    If there are none, links are drawn as balls and joint offsets as bars.
+    If the robot has no visuals, links are drawn as balls and joint offsets as bars.
 
     Parameters
     ----------
@@ -227,7 +228,7 @@ def meshes_from_files(
     most
         Largest number of faces per mesh; finer meshes are simplified.
     on_error
-        Called with a message for each mesh that cannot be read.
+        Function that is called with a message for each mesh that cannot be read.
     """
     found = {}
     for resource in _mesh_uris(robot):
@@ -240,7 +241,7 @@ def meshes_from_files(
 
 
 def meshes_for_bag(robot: RobotDescription) -> dict[str, bytes]:
-    """Return a robot's meshes for a bag, by attachment name, as STL of at most 1 MB each."""
+    """Return a robot's meshes for a bag, by attachment name, as STL files of at most 1 MB each."""
     meshes = meshes_from_files(robot, _MAX_FACES_IN_BAG)
     return {f"{_ATTACHMENT_PREFIX}{resource}": stl_of(mesh) for resource, mesh in meshes.items()}
 
@@ -263,7 +264,8 @@ def meshes_from_attachments(
 
 
 class MeshFolder:
-    """A folder with meshes from a bag that are not on this machine, for programs that read files.
+    """A folder with those meshes of a bag that are not on this machine, for programs that read
+    files.
 
     Parameters
     ----------

@@ -1,18 +1,18 @@
 """Reaction wheels: bodies of revolution on the base that spin about their axes.
 
-A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>`` gives
-the largest rate and torque. Since a wheel is a body of revolution, its angle has no effect; only
-its spin matters. With ``A`` (3, k) the axes in base components, ``J`` (k,) the moments of inertia
-about them
-and the spins ``h = J (A' omega + qdot_w)`` (k,), the momenta of the wheels about their axes in
-inertial space, the base and the arm obey the equations of a robot without wheels (a gyrostat)
+A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>``
+specifies the largest rate and torque. Since a wheel is a body of revolution, its angle has no
+effect; only its spin matters. Let ``A`` (3, k) be the wheel axes in base components, ``J`` (k,) the
+moments of inertia about them, and ``h = J (A' omega + qdot_w)`` (k,) the spins: the wheel momenta
+about their axes in inertial space. Then the base and the arm obey the equations of a robot without
+wheels (a gyrostat)
 
     M(q) z0ddot + C(q, z0dot) = Q,    base torque n = n_thrusters - A tau_w - omega x (A h),    (1)
     hdot = tau_w,                                                                              (2)
 
-where M has the wheels' masses but not their moments J about their axes (Hughes, Spacecraft Attitude
-Dynamics, chapter 3). So a control law for the base and the arm also works for a robot with wheels,
-which produce part of its base torque.
+where M includes the wheels' masses but not their moments J about their axes (Hughes, Spacecraft
+Attitude Dynamics, chapter 3). A control law for the base and the arm therefore also works for a
+robot with wheels, which produce part of its base torque.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from spacerobot_ros.model.description import Array, Body, JointKind, RobotDescri
 _MAX_OFFSET = 1e-4  # m, of the centre of mass from the axis
 
 _MOMENTUM_ROUNDING, _LEAST_MOMENTUM = 1e-9, 1e-12
-"""Largest angular momentum that the wheels may leave to the base, relative and in kg m^2/s."""
+"""Largest angular momentum that the wheels may leave to the base: as a relative value, and in kg
+m^2/s."""
 
 _REST_SHARE = 1e-9
 
@@ -52,11 +53,11 @@ class ReactionWheels:
     other
         (n - k,) coordinates of the other joints in q.
     axes_B
-        (3, k) unit vectors of the wheel axes, base components.
+        (3, k) unit vectors of the wheel axes, in base components.
     inertia
         (k,) moments of inertia about the axes, kg m^2.
     rate, torque
-        (k,) largest rates relative to the base, rad/s, and motor torques, N m.
+        (k,) largest rates relative to the base, rad/s, and largest motor torques, N m.
     """
 
     description: RobotDescription
@@ -70,7 +71,7 @@ class ReactionWheels:
 
     @classmethod
     def of(cls, description: RobotDescription) -> ReactionWheels:
-        """Return the wheels of a robot, which may have none."""
+        """Return the wheels of a robot, possibly none."""
         names = description.wheel_names
         joints = list(description.joint_names)
         index = np.array([joints.index(name) for name in names], dtype=np.int64)
@@ -100,23 +101,24 @@ class ReactionWheels:
     def rates_for(
         self, L_B: Array, near: Array | None = None, largest: Array | None = None
     ) -> Array:
-        """Return rates (k,), rad/s, at which the wheels store an angular momentum while the base
-        and the arm are at rest. For redundant wheels, these are nearest to ``near``, or the
-        smallest within the limits.
+        """Return rates (k,), rad/s, at which the wheels store a given angular momentum while the
+        base and the arm are at rest. For redundant wheels, these are the rates nearest to ``near``,
+        or the smallest within the limits.
 
         Parameters
         ----------
         L_B
             (3,) in the base, kg m^2/s.
         near
-            (k,) preferred rates of redundant wheels, rad/s; None: zero.
+            (k,) preferred rates of redundant wheels, rad/s; by default zero.
         largest
-            (k,) largest rates, rad/s; None: the wheel limits.
+            (k,) largest rates, rad/s; by default, the wheel limits.
 
         Raises
         ------
         UnreachableError
-            No rates within the limits store it; the message is a clause that says why.
+            No rates within the limits store the momentum; the message is a clause that states the
+            reason.
         """
         rate = self.rate if largest is None else largest
         near = np.zeros(len(self)) if near is None else near
@@ -207,7 +209,7 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
 
 
 def _imbalance_clause(body: Body, axis: Array) -> str:
-    """Return a clause on a wheel that is no body of revolution; empty: it is one."""
+    """Return a clause on a wheel that is no body of revolution; empty if it is one."""
     inertia = body.inertia
     offset = float(np.linalg.norm(np.cross(axis, inertia.com)))
     if offset > _MAX_OFFSET:
@@ -221,7 +223,7 @@ def _imbalance_clause(body: Body, axis: Array) -> str:
     if np.abs(inertia.about_com - symmetric).max() > _MAX_ASYMMETRY * max(spin, across):
         return (
             "is not balanced: its inertia is not rotationally symmetric about its axis; "
-            "give it equal moments across the axis, and no products of inertia"
+            "give it equal moments about the two transverse axes, and no products of inertia"
         )
     return ""
 

@@ -1,7 +1,8 @@
 """Obstacles fixed in the world.
 
 A robot's URDF contains the obstacles around it in an element ``<world>``, which holds the URDF of
-the obstacles and is ignored by other URDF readers. So nodes and bags need only the robot's URDF.
+the obstacles and is ignored by other URDF readers. Nodes and bags therefore need only the robot's
+URDF.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from spacerobot_ros.model.urdf import parse_world, require_found_meshes
 
 
 def with_world(robot: RobotDescription, world: RobotDescription | None) -> RobotDescription:
-    """Return a robot with its obstacles replaced by those of a world (:func:`.load_world`).
+    """Return a robot with its obstacles replaced by the obstacles of a world (:func:`.load_world`).
 
     If the world is None, there are no obstacles.
     """
@@ -31,9 +32,9 @@ def with_world(robot: RobotDescription, world: RobotDescription | None) -> Robot
 
 
 def obstacles_from_topic(text: str) -> RobotDescription | None:
-    """Return the obstacles from a string on the topic ``obstacles``; None if it is empty.
+    """Return the obstacles from a string on the topic ``obstacles``; None if the string is empty.
 
-    The string is plain URDF: nothing in it is expanded.
+    The string is plain URDF; xacro expressions in it are not expanded.
 
     Raises
     ------
@@ -52,5 +53,5 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
 
 
 def links_with_shapes(world: RobotDescription) -> list[str]:
-    """Return the names of the obstacle links, which are those with a shape."""
+    """Return the names of the obstacle links, which are the links with a shape."""
     return [each.name for each in world.links if each.collisions or each.shapes]

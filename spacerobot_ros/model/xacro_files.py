@@ -1,7 +1,7 @@
 """Program that expands one xacro file: ``python xacro_files.py FILE SECONDS [NAME:=VALUE ...]``.
 
-The time and memory limits guard against mistakes, such as a macro that calls itself. They do not
-sandbox the file: xacro expressions are Python, so only files that the user names ``.xacro`` are
+The time and memory limits guard against mistakes, such as a macro that calls itself. The limits do
+not sandbox the file: xacro expressions are Python, so only files that the user names ``.xacro`` are
 expanded.
 
 No module of the package is imported here, so the program starts quickly.
@@ -20,10 +20,11 @@ _MAX_MEMORY = 2**30
 
 
 def package_around(name: str, folder: Path) -> Path | None:
-    """Return the folder of the package around ``folder``, or of a package next to it, by name.
+    """Return the folder of the package with the given name that contains ``folder`` or is next to
+    it.
 
-    The package name is taken from ``package.xml``, or else from the folder. None: no such
-    package.
+    The package name is taken from ``package.xml``, or else from the folder. Returns None if no
+    package has this name.
     """
     folder = folder.resolve()
     for parent in (folder, *folder.parents):
@@ -45,7 +46,8 @@ def _package_name(folder: Path) -> str:
 
 
 def main(file: str, seconds: int, arguments: Sequence[str]) -> int:
-    """Print the URDF from a xacro file; on failure print the reason to standard error and return 1.
+    """Print the URDF from a xacro file; on failure, print the reason to standard error and return
+    1.
 
     ``$(find NAME)`` finds the package around the file without a ROS environment.
     ``seconds`` is the CPU time limit; ``arguments`` for the file are NAME:=VALUE.

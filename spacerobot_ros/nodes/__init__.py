@@ -1,4 +1,4 @@
-"""ROS 2 nodes around the modules of the stack, with their parameters, topics and services."""
+"""ROS 2 nodes that wrap the modules of the stack, with their parameters, topics and services."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The coordinated-control node: goal poses and references in, thruster wrench and efforts out."""
+"""The coordinated-control node: converts goal poses and references to thrust and efforts."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class CoordinatedControlNode(CommanderNode):
     ``goal_pose`` is the base goal, ``end_effector/goal_pose`` the end-effector goal, and
     ``goal_path`` a base goal with waypoints.
     If a planner publishes ``joint_reference`` (or ``base_reference``), the node tracks it. Until
-    there is a goal, the robot holds the pose of its first state. The node converts messages; a
+    a goal arrives, the robot holds the pose of its first state. The node converts messages; a
     :class:`ControllerCommander` and its :class:`~spacerobot_ros.control.executive.ControlExecutive`
     evaluate the goals.
     """
@@ -66,7 +66,7 @@ class CoordinatedControlNode(CommanderNode):
     # -- life ---------------------------------------------------------------------------------
 
     def make_commander(self) -> ControllerCommander:
-        """Return the ROS-independent controller behind this node."""
+        """Return the ROS-independent controller used by this node."""
         self._published: Any = None
         """State and goal in the last status."""
         self._busy: set[str] = set()
@@ -174,7 +174,7 @@ class CoordinatedControlNode(CommanderNode):
             self.get_logger().info(status.message)
 
     def publish_start(self, start: ScheduleStart) -> None:
-        """Ignore schedules, which a controller does not have."""
+        """Ignore schedules, because a controller has none."""
 
     def publish_path(self, path: BasePath, stamp_ns: int) -> None:
         """Publish the path of a planned reference."""

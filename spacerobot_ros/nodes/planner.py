@@ -1,4 +1,6 @@
-"""The planner node: goal poses in, joint velocities out. It only converts messages."""
+"""The planner node, which converts goal poses to joint velocities. The node itself only converts
+messages.
+"""
 
 from __future__ import annotations
 
@@ -50,13 +52,13 @@ from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
 
 
 class PlannerNode(CommanderNode):
-    """Converts goal poses to gaits and publishes their velocities, one command for every state.
+    """Converts goal poses to gaits and publishes the gait velocities, one command for every state.
 
-    A goal is planned from the next measured state. When its schedule has ended, the measured pose
-    is compared with the goal, and the remaining motion is replanned until the goal is reached
-    within tolerance or ``max_corrections`` is reached. The segments of a gait planned segment by
-    segment (*partial* schedules) are not corrections. A new goal replaces the current one. If a
-    joint does not follow, the remaining motion is planned with the other joints.
+    A goal is planned from the next measured state. When the schedule has ended, the measured pose
+    is compared with the goal. If it is not within tolerance, the remaining motion is replanned, at
+    most ``max_corrections`` times. The later segments of a gait that is planned segment by
+    segment (*partial* schedules) do not count as corrections. A new goal replaces the current one.
+    If a joint does not follow, the remaining motion is planned with the other joints.
 
     A :class:`PlannerCommander` and its
     :class:`~spacerobot_ros.planning.execution.executive.Executive` make these decisions.
@@ -73,13 +75,13 @@ class PlannerNode(CommanderNode):
 
     @property
     def statistics(self) -> PlannerStatistics:
-        """Number and computation time of plans and commands so far."""
+        """Numbers and computation times of plans and commands so far."""
         return self.commander.statistics
 
     # -- life ---------------------------------------------------------------------------------
 
     def make_commander(self) -> PlannerCommander:
-        """Return the ROS-independent planner behind this node."""
+        """Return the ROS-independent planner used by this node."""
         return PlannerCommander(self.config, self, long_work=self.long_work)
 
     def configure(self) -> None:
@@ -122,7 +124,7 @@ class PlannerNode(CommanderNode):
             self._announcement.join(MAX_THREAD_END_TIME)
 
     def destroy_node(self) -> None:
-        """Destroy the node and its trajectory clients, in any state."""
+        """Destroy the node, whatever its state, and its trajectory clients."""
         self._await_announcement()
         if self._trajectories is not None:
             self._trajectories.destroy()
@@ -145,7 +147,7 @@ class PlannerNode(CommanderNode):
         self.commander.use_robot(robot, self.decoder_of(robot))
         self._message = joint_template(robot.joint_names)
         self._setpoint: Setpoint | None = None
-        """The setpoint whose arrays feed the message."""
+        """The setpoint whose arrays provide the values of the message."""
 
     # -- inputs -------------------------------------------------------------------------------
 
@@ -208,7 +210,7 @@ class PlannerNode(CommanderNode):
         self._announcement.start()
 
     def publish_path(self, path: BasePath, stamp_ns: int) -> None:
-        """Ignore reference paths, which a planner does not have."""
+        """Ignore reference paths, because a planner has none."""
 
     def _publish_schedule(self, start: ScheduleStart) -> None:
         schedule, stamp, frame = start.schedule, start.stamp_ns, self.config.world_frame

@@ -69,32 +69,38 @@ _PARAMETER_RECORD_BY_TOPIC = {
     "planner/status": "planner",
     "controller/status": "coordinated_control",
 }
-"""Record name for a node's parameters, by a topic published by the node.
+"""Name of the record with the parameters of a node, by a topic that the node publishes.
 
-If a node publishes them, it is configured: its parameters keep their values."""
+A node that publishes such a topic is configured, so its parameters are fixed."""
 
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""rmw_dds_common node name of a publisher that is discovered before its node."""
+"""Node name that rmw_dds_common gives to a publisher discovered before its node."""
 
 _QUEUE_DEPTH = 2000
 """Queue depth of subscriptions; above 5000 the events executor stops responding."""
 
 _CHUNK_SIZE = 262_144
-"""Chunk size before compression, bytes: larger chunks have lower fixed costs, but slow seeking."""
+"""Chunk size before compression, in bytes; larger chunks have less overhead, but slow down
+seeking.
+"""
 
 _SCAN_PERIOD = 0.1  # wall s
 
 _CHECK_PERIOD = 0.4
-"""Wall time between two checks that the bag file exists, s: a failure is seen within a second."""
+"""Wall time, s, between two checks that the bag file exists; a failure is detected within a
+second.
+"""
 
 _LONGEST_DRAIN = 1.2  # wall s
 
 _LOSS_LOG_PERIOD = 5.0
-"""Wall time between two log lines about lost messages, s."""
+"""Wall time, s, between two log lines about lost messages."""
 
 
 class RecorderNode(FlightNode):
-    """Records topics as raw bytes, as rosbag2 does; :class:`Recording` determines the times."""
+    """Records topics as raw bytes, as rosbag2 does; :class:`Recording` determines the time
+    stamps.
+    """
 
     Config: ClassVar = RecorderConfig
     role = Role.RECORDER
@@ -105,16 +111,16 @@ class RecorderNode(FlightNode):
 
     def __init__(self, name: str = "recorder", **kwargs: Any) -> None:
         self._parameter_requests: dict[str, RemoteParameters | None] = {}
-        """Names of the parameter records that are in the bag or requested from nodes."""
+        """Names of the parameter records that are in the bag or have been requested from nodes."""
         self._topics_without_owner: set[str] = set()
-        """Topics whose publisher was discovered before its node, and whose parameters must still be
-        requested."""
+        """Topics whose publisher was discovered before its node; the parameters of the node must
+        still be requested."""
         super().__init__(name, **kwargs)
 
     # -- life ---------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Open the bag and subscribe to topics, which are recorded once active."""
+        """Open the bag and subscribe to topics, which are recorded once the node is active."""
         config = self.config
         # What may be refused comes before the bag, which would stay open.
         descriptions = _read_descriptions(config.describe)
@@ -144,7 +150,7 @@ class RecorderNode(FlightNode):
                 map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION_TOPIC)),
             )
         self.topics: set[str] = set()
-        """Full names of the topics that are subscribed."""
+        """Full names of the subscribed topics."""
         self._unreadable_topics: set[str] = set()
         self._diagnostics: Publisher | None = None
         steady = RosClock(clock_type=ClockType.STEADY_TIME)
@@ -187,7 +193,7 @@ class RecorderNode(FlightNode):
                 self.report_event(Event(EventKind.RECORDING_PAUSED, "Recording is paused."))
 
     def drain(self, executor: EventsExecutor) -> None:
-        """Record messages in transit until none has arrived for 0.3 s of wall time."""
+        """Record messages in transit until no message has arrived for 0.3 s of wall time."""
         began = last = time.monotonic()
         recording = self.recording
         while recording is not None and recording.running and last - began < _LONGEST_DRAIN:
@@ -222,7 +228,7 @@ class RecorderNode(FlightNode):
 
     @property
     def exit_code(self) -> int:
-        """1 if an error has ended the recording."""
+        """1 if an error ended the recording."""
         return 0 if self.failure is None else 1
 
     @property
@@ -255,7 +261,7 @@ class RecorderNode(FlightNode):
                     recording.describe(name, question.values)
 
     def flush(self) -> None:
-        """Hand the recorded data to the operating system, and report lost messages."""
+        """Pass the recorded data to the operating system, and report lost messages."""
         if self.recording is not None:
             clocks = self.count_publishers(self._clock_topic)
             self.recording.flush(clock_is_published=clocks > 0)
@@ -272,8 +278,8 @@ class RecorderNode(FlightNode):
             self._steps_back_of_one_clock = recording.clock_steps_back
         elif recording.clock_steps_back - self._steps_back_of_one_clock >= publishers:
             self.get_logger().warning(
-                f"More than one clock is published on '{self._clock_topic}': times in the bag jump "
-                "between them. Give each stack its own namespace and clock "
+                f"More than one clock is published on '{self._clock_topic}': times in the bag "
+                f"jump between these clocks. Give each stack its own namespace and clock "
                 "(--ros-args -r __ns:=/NAME -r /clock:=clock).",
                 throttle_duration_sec=_LOSS_LOG_PERIOD,
             )
@@ -525,9 +531,9 @@ def _recording_callback(
 
 
 def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
-    """Return subscription event callbacks that count lost messages.
+    """Return callbacks for subscription events, which count lost messages.
 
-    The middleware reports messages that the publisher had dropped before it could resend them; it
+    The middleware reports messages that the publisher dropped before they could be resent; it
     does not report overflows of the subscription's own queue (Fast DDS).
     """
 

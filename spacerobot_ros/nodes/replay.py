@@ -37,10 +37,12 @@ _MAX_MESSAGES_AT_ONCE = 500
 _LONGEST_DELIVERY = Duration(seconds=2)
 
 _LONGEST_TIMER_PERIOD_NS = 3600 * SECOND
-"""Maximum timer period, ns; gaps between messages in a bag may be longer."""
+"""Maximum timer period, ns; intervals between messages in a bag may be longer."""
 
 _MAX_QUEUE_DEPTH = 10_000
-"""Maximum queue depth, because a bag may request any depth and the middleware allocates it."""
+"""Maximum queue depth, because a bag may request any depth, and the middleware allocates the whole
+queue.
+"""
 
 _CLOCK_TOPIC = "/clock"
 _STATUS_TOPIC, _SEEK_TOPIC = "replay/status", "replay/seek"
@@ -54,13 +56,13 @@ _BAD_BAG_EXIT_CODE = 2
 class ReplayNode(FlightNode):
     """Publishes the messages in a bag as bytes, with the recorded quality of service.
 
-    It waits until readers are matched, divides the log time intervals by ``rate``, and ends its
-    process at the end of the bag. Meshes in ``robot_description`` that are not on this machine are
-    written from the bag to temporary files.
+    The node waits until readers are matched, divides the intervals between log times by ``rate``,
+    and ends its process at the end of the bag. Meshes in ``robot_description`` that are not on
+    this machine are written from the bag to temporary files.
 
-    Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step`` (Trigger), which
-    sends the next message. A time on ``replay/seek`` sets the position, and ``replay/status``
-    reports it.
+    Services: The services are ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step``
+    (Trigger), which sends the next message. A time on ``replay/seek`` sets the position, and
+    ``replay/status`` reports it.
     """
 
     Config: ClassVar = ReplayConfig
@@ -138,7 +140,7 @@ class ReplayNode(FlightNode):
         )
 
     def deactivate(self) -> None:
-        """Pause; the replay continues from the same message when it is activated again."""
+        """Pause; the replay continues from the same message when the node is activated again."""
         if self._playing_timers:
             self._playback.pause(self._now())
         for timer in self._playing_timers:

@@ -32,7 +32,7 @@ from spacerobot_ros.planning.methods.registry import METHODS
 _CONDITION_SAMPLE_COUNT = 300
 
 _LOOP_EDGE_LENGTH = 1.0
-"""Loop edge length for which the nominal shape is optimised, m or rad: that of area_loop."""
+"""Loop edge length for which the nominal shape is optimised, m or rad, as in area_loop."""
 
 
 @dataclass(frozen=True)
@@ -44,21 +44,22 @@ class Analysis:
     robot
         The model.
     shape
-        (n,) examined configuration: the given, best nominal or middle configuration.
+        (n,) examined configuration: as given, the best nominal one, or the middle of the joint
+        ranges.
     nominal
-        The three joints and their M at this configuration; None if there are fewer than three
-        joints, or if no loops rotate the base about three axes.
+        The three nominal joints and their matrix M at this configuration; None if there are fewer
+        than three joints, or if no loops rotate the base about three axes.
     at_shape, anywhere
         The span of first-order brackets at ``shape``, and at the best of many configurations.
     conditions
-        (300,) condition numbers of the best three brackets, for configurations all over the shape
+        (300,) condition numbers of the best three brackets, at configurations spread over the shape
         space.
     planar, sliding
         Results of the tests in papers 3 and 1.
     objections
-        Reason why a method is unsuitable for the robot, by method name; None if it does.
+        Reason why a method is unsuitable for the robot, by method name; None if it is suitable.
     geometry
-        The robot's solids, and the pairs whose distances are checked.
+        The robot's solids, and the pairs of solids whose distances are checked.
     end_effector
         The link whose workspaces are computed; "" if not given and the default link does not exist.
     """
@@ -79,7 +80,7 @@ class Analysis:
     def workspaces(self) -> tuple[Workspaces, ...]:
         """Workspaces of the end-effector, without and with joint limits.
 
-        Empty if there are no end-effector or no joints.
+        Empty if there is no end-effector or there are no joints.
         """
         if not self.end_effector or self.robot.n == 0:
             return ()

@@ -53,29 +53,29 @@ def plan(
 ) -> GaitSchedule:
     """Plan a gait: ``plan("sliding_masses", position=(0.3, 0, 0.1), rotvec=(0.5, 0, 0))``.
 
-    With an end-effector goal, ``plan("three_joint_arm", end_effector_position=(2, 1, 0.5))``,
-    the base is free except for the given parts of its pose.
+    With an end-effector goal, as in ``plan("three_joint_arm", end_effector_position=(2, 1, 0.5))``,
+    the base is free except for the given components of its pose.
 
     Parameters
     ----------
     robot
         The model, a URDF file, or the name of a robot in this package.
     goal
-        The goal; or a base goal given by ``position`` (3,) in m (default: the origin) and
-        ``rotvec`` (3,) in rad (exponential coordinates; default: no rotation), and the final
+        The goal, or instead of it a base goal given by ``position`` (3,) in m (default: the origin)
+        and ``rotvec`` (3,) in rad (exponential coordinates; default: no rotation), and the final
         ``joint_positions`` (n,) in m or rad.
     end_effector_position, end_effector_pose
         Position (3,) in m, or position and quaternion (7,), of the link ``end_effector`` (a name;
-        empty: the default end-effector); or of several links, by name.
+        empty: the default end-effector); or a mapping from several link names to such values.
     end_effector_path
         Positions (K, 3) in m, or positions and quaternions (K, 7), through which one end-effector
-        moves along straight lines; the last position or pose is its goal.
+        moves along straight lines; the last position or pose is the goal.
     start
-        The start: a state, or the shape (n,) with the base at the origin of W; None: zero, or as
-        close to zero as the joint limits allow.
+        The start: a state, or the shape (n,) with the base at the origin of W; None: all joints at
+        zero, or as close to zero as the joint limits allow.
     linear_momentum, angular_momentum
         (3,) each in W, kg m/s and kg m^2/s; angular momentum is about the centre of mass; None: the
-        momenta of the start. Only ``optimal`` plans for drifting robots.
+        momenta of the start state. Only ``optimal`` plans for drifting robots.
     method
         Name of a gait method; ``options`` are its own. None: ``resolved_rate`` for a goal with a
         path, otherwise ``optimal``.
@@ -83,8 +83,8 @@ def plan(
         Command duration (s), largest error at the goal, and longest prediction step (s). Use the
         plant's values so that the flight ends where planned.
     clearance
-        Smallest distance between links during the motion, m; 0 disables collision checks. With
-        obstacles, 0 means 0.01 m.
+        Smallest distance between links during the motion, m; 0 disables collision checks. If there
+        are obstacles, 0 means 0.01 m.
     world
         Obstacles fixed in the world (:func:`.load_world`), or their URDF file; None: the
         obstacles in the robot description.
@@ -160,12 +160,13 @@ def end_effector_goals(
     *,
     path: EndEffectorValues | None = None,
 ) -> tuple[EndEffectorGoal, ...]:
-    """Return end-effector goals from positions, poses and paths, for one ``link`` or by name.
+    """Return end-effector goals from positions, poses and paths, either for one ``link`` or by link
+    name.
 
     Raises
     ------
     GoalError
-        A goal is not a position or a pose, a link has two goals, or the link is given twice.
+        A goal is neither a position nor a pose, a link has two goals, or the link is given twice.
     """
     goals = []
     for values, count in ((position, 3), (pose, 7), (path, None)):
@@ -174,7 +175,7 @@ def end_effector_goals(
         by_link = values if isinstance(values, Mapping) else {link: values}
         if link and isinstance(values, Mapping):
             raise GoalError(
-                f"The end-effector goals are given by name, but '{link}' is named in addition."
+                f"The end-effector goals are given by name, but '{link}' is also given as a link."
             )
         for name, numbers in by_link.items():
             if count is None:

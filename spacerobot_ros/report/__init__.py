@@ -1,4 +1,4 @@
-"""Graphical report of a bag: one HTML file that works offline, created from the bag alone."""
+"""Graphical report of a bag: one HTML file that works offline, created only from the bag."""
 
 from spacerobot_ros.report.writing import write_figures, write_picture, write_report
 

@@ -29,7 +29,7 @@ EVENT_STRIP_HEIGHT = 0.62
 """Height of an event strip with its legend below a time axis, inches."""
 
 _MAX_MARKS = 2000
-"""Largest number of marks in a strip: more would overlap."""
+"""Largest number of marks in a strip: more marks would overlap."""
 
 _STRIP_DISTANCE = 0.44
 """Distance from the axis to the strip's upper edge, inches, including space for labels."""

@@ -44,16 +44,16 @@ WIDTH = 9.6
 """Figure width on a page, inches."""
 
 _NARROW_WIDTH = 6.0
-"""Figures narrower than this are styled for one column of a paper, inches."""
+"""Width, in inches, below which a figure is styled for one column of a paper."""
 
 TRACE_TIME_SLICES = 960
-"""Number of time slices across a figure that summarise a dense trace."""
+"""Number of time slices into which a dense trace is summarised across a figure."""
 
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 
 _FONT_SIZE = 8.5
-"""Font size that the distances in these modules are designed for, points."""
+"""Font size, in points, for which the distances in the figure modules are designed."""
 
 _FONT_SIZE_RANGE = (3.0, 30.0)
 """Smallest and largest font size in a style file, points."""
@@ -88,16 +88,17 @@ def drawing(
     *,
     degrees: bool = False,
 ) -> Iterator[None]:
-    """Apply the figure style within the block.
+    """Apply the figure style within a ``with`` block.
 
     Parameters
     ----------
     width
         Figure width, inches.
     style
-        Style file in this package: ``report`` for pages, ``paper`` for papers.
+        Style file in this package: ``report`` for report pages, ``paper`` for publications.
     own
-        User style file, or name of a style in this package or in matplotlib; overrides ``style``.
+        User style file, or name of a style in this package or in matplotlib; it overrides
+        ``style``.
     degrees
         Whether angles over time are in degrees instead of rad.
 
@@ -131,7 +132,7 @@ def _apply_style(path: Path) -> None:
     warnings: list[str] = []
 
     def collect(record: logging.LogRecord) -> bool:
-        """Keep a warning from being shown, such as one of a line that matplotlib does not know."""
+        """Suppress a warning, such as one about a style line that matplotlib does not know."""
         if record.levelno < logging.WARNING:
             return True
         warnings.append(record.getMessage().strip().splitlines()[0].rstrip("."))
@@ -192,12 +193,12 @@ def narrow() -> bool:
 
 
 def inches(length: float) -> float:
-    """Return a length designed for a font size of 8.5 points, scaled to the current one, inches."""
+    """Scale a length, in inches, from a font size of 8.5 points to the current font size."""
     return length * _look.get().scale
 
 
 def angle_unit() -> tuple[float, str]:
-    """Return the angle unit, and its number per rad."""
+    """Return the angle unit, and the number of units per rad."""
     return (180.0 / np.pi, "deg") if _look.get().degrees else (1.0, "rad")
 
 
@@ -235,8 +236,8 @@ def sheet(
         room = width() - left - right - between * (len(widths) - 1)
         if room <= 0.0:
             raise SpaceRobotError(
-                f"A font size of {mpl.rcParams['font.size']:g} points leaves no room for panels "
-                f"in a figure {25.4 * width():.3g} mm wide."
+                f"A font size of {mpl.rcParams['font.size']:g} points leaves no room for the "
+                f"panels in a figure {25.4 * width():.3g} mm wide."
             )
         x, row = left, []
         for share in widths:
@@ -264,11 +265,11 @@ def letter_panels(figure: Figure) -> None:
 
 
 _LEFT_EDGE = 0.03
-"""Distance from the left edge to the labels in a figure with extended panels, inches."""
+"""Distance, in inches, from the left edge of a figure with extended panels to its labels."""
 
 
 def widen_panels(figure: Figure) -> None:
-    """Extend panels in a single column to the left as far as their labels allow."""
+    """Extend the panels of a single-column figure to the left as far as the labels allow."""
     places = [axes.get_position() for axes in figure.axes]
     if len({round(place.x0, 6) for place in places}) != 1:
         return
@@ -285,14 +286,14 @@ def widen_panels(figure: Figure) -> None:
 
 
 def new_figure(height: float) -> Figure:
-    """Return an empty figure with a height in inches."""
+    """Return an empty figure with the given height, inches."""
     figure = Figure(figsize=(width(), height), facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
 
 def panel(figure: Figure, x: float, y: float, width: float, height: float) -> Axes:
-    """Add axes to a figure, by their lower left corner and size in inches."""
+    """Add axes to a figure, given their lower left corner and their size in inches."""
     across, up = figure.get_size_inches()
     return figure.add_axes((x / across, y / up, width / across, height / up))
 
@@ -316,7 +317,7 @@ class PictureFormat(str, Enum):
         Raises
         ------
         SpaceRobotError
-            The suffix does not match any of these formats.
+            The suffix matches no supported format.
         """
         try:
             return cls(path.suffix[1:].lower())
@@ -327,7 +328,7 @@ class PictureFormat(str, Enum):
 
 
 def picture_of(figure: Figure, format: PictureFormat, pixels: int = 1600) -> bytes:
-    """Return a figure as file content; equal figures give equal bytes.
+    """Return a figure as file content; identical figures yield identical bytes.
 
     ``pixels`` is the PNG width; images in SVG and PDF have 200 pixels per inch.
     """
@@ -506,13 +507,13 @@ class TraceGroup:
     limits
         (trace, value) for each limit.
     limit_name
-        Name of the limits in the picture's legend.
+        Name of the limits in the legend.
     window
-        Lower and upper end of the axis if high peaks are clipped; None: all values are shown.
+        Lower and upper end of the axis if high peaks are clipped; None if all values are shown.
     decades
-        Number of powers of ten shown below the largest value on a logarithmic axis; 0: linear axis.
+        Number of powers of ten shown below the largest value on a logarithmic axis; 0 if linear.
     rows
-        Whether each trace has its own row of height one, for duty cycles from 0 to 1.
+        Whether each trace has a separate row of height one, as for duty cycles from 0 to 1.
     beside
         The same traces from other flights; empty signals if a flight lacks them.
     """
@@ -532,7 +533,7 @@ class TraceGroup:
 
     @property
     def signals(self) -> list[Signal]:
-        """Traces from all flights that have them."""
+        """Traces from all flights that contain them."""
         return [each for each in (self.signal, *self.beside) if len(each)]
 
     @property
@@ -566,7 +567,7 @@ class TraceGroup:
 
 @dataclass(frozen=True)
 class ReportFigure:
-    """A report figure, as a picture and, if it is over time, as chart data.
+    """A report figure, as a picture and, if it shows values over time, as chart data.
 
     Attributes
     ----------

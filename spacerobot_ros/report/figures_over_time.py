@@ -53,13 +53,13 @@ from spacerobot_ros.report.signals import Indices, thinned
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
 _MAX_MARKED_SCHEDULES = 10
-"""Largest number of schedules marked with lines; more would look like hatching."""
+"""Largest number of schedules marked with lines; more lines would look like hatching."""
 
 _LABEL_HEIGHT = 0.17
 """Label height for one of several flights, inches."""
 
 _DUTY_ROW_HEIGHT = 0.8
-"""Height of a duty cycle of 1 relative to its row."""
+"""Height of a duty cycle of 1, relative to the row height."""
 
 _EVENTS_CAPTION = (
     " Events below the time axis: goals and plans in the upper row, robot and faults below."
@@ -179,8 +179,8 @@ def time_figure(
 def figure_of_flights(
     flights: Sequence[FlightReport], draw: Callable[[FlightReport], ReportFigure | str | None]
 ) -> ReportFigure | str | None:
-    """Return a figure over time with traces from several flights; a sentence if no flight has such
-    a figure, or it is not over time.
+    """Return a figure over time with traces from several flights, or an explanatory sentence if no
+    flight has such a figure or if the figure does not show values over time.
 
     Traces with the same label, unit and name share a panel. Events, cycles and duty cycles are
     omitted, since they apply to single flights.
@@ -270,7 +270,7 @@ def _goal_lines(
 
 def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     """Return the joint positions, in groups of at most six joints with the same unit, and reaction
-    wheel rates (wheel angles are irrelevant).
+    wheel rates (the wheel angles are omitted).
     """
 
     def bounds(joint: Joint) -> list[float]:
@@ -298,7 +298,7 @@ def joint_groups(
     """Group the columns (N, n) of a signal by unit; ``units`` maps the position unit to the signal
     unit.
 
-    ``columns`` selects the columns of these joints.
+    ``columns`` selects the columns of the joints to include.
     """
     unknown = " or ".join(units.values())
     each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
@@ -324,7 +324,7 @@ def joint_groups(
 
 
 def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceGroup]:
-    """Return a group of x, y and z, which are adjacent columns, for each label and unit."""
+    """Return a group of the adjacent columns x, y and z for each label and unit."""
     columns = [signal.values[:, 3 * k : 3 * k + 3] for k in range(len(parts))]
     return [
         TraceGroup(Signal(signal.time, values), list("xyz"), label, unit, PALETTE[:3])
@@ -376,7 +376,8 @@ def _why_no_joints(flight: FlightReport) -> str:
 
 
 def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Joint velocities; None if all joints are wheels; their rates are in shape figures."""
+    """Joint velocities; None if all joints are wheels; their rates are shown instead of their
+    angles."""
     if not flight.joint_names:
         return _why_no_joints(flight)
     if not len(flight.qdot):
@@ -395,7 +396,7 @@ def _rate_bounds(joint: Joint) -> list[float]:
 def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Linear and angular velocity of the base link.
 
-    None if the base is at rest, or oscillates in a gait with many equal cycles.
+    None if the base is at rest, or if it oscillates in a gait with many equal cycles.
     """
     if flight.cycles is not None or not flight.signal("twist").values.any():
         return None
@@ -408,12 +409,14 @@ _MOMENTUM_DECADES = 4
 _MAX_BUDGET_STATES = 2000
 
 _MAX_PEAK_SHARE = 0.02
-"""Largest share of samples that may be clipped as peaks."""
+"""Largest fraction of samples that may be clipped as peaks."""
 
 _PEAK_RATIOS = (3.0, 1e4)
-"""Smallest and largest ratio of the full range to that without peaks at which peaks are clipped.
+"""Peaks are clipped if the ratio of the full range to the range without peaks is between these
+limits.
 
-Below the first, both are readable together; above the second, the robot rests except at peaks.
+Below the lower limit, all values are readable; above the upper limit, the robot is at rest except
+at peaks.
 """
 
 _EFFORT_ROUNDING = 1e-9
@@ -451,7 +454,7 @@ def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 def range_without_peaks(signal: Signal) -> tuple[float, float] | None:
-    """Return the signal range without its highest peaks; None if it has no such peaks."""
+    """Return the signal range without its highest peaks; None if there are no high peaks."""
     if not len(signal):
         return None
     low, high = (float(np.min(signal.values)), float(np.max(signal.values)))
@@ -472,12 +475,12 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     used = [k for k in range(len(names)) if whole.values[:, k].any()]
     duty = Signal(whole.time, whole.values[:, used])
     tints = [colour(k) for k in range(len(used))]
-    label, unit = "thrusters", "share of each tick during which they are on"
+    label, unit = "thrusters", "fraction of each tick during which they are on"
     groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, tints, rows=True)]
     thrust, propellant = flight.signal("thruster_force"), flight.series.get("propellant")
     total = impulse(thrust, np.ones(thrust.width))
     groups.append(TraceGroup(total, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
-    caption = "Share of each tick during which each thruster was on; below: total impulse"
+    caption = "Fraction of each tick during which each thruster was on; lower panel: total impulse"
     if propellant is not None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
@@ -511,17 +514,17 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
         ),
     ]
     caption = (
-        "The momentum balance of the whole system. Top: change of the linear momentum p and of the "
+        "The momentum balance of the whole system. Top: change in the linear momentum p and in the "
         "angular momentum L about the centre of mass since the start, minus the thruster impulse, "
-        "on a logarithmic axis; smaller changes and zero are shown at its lower edge. Bottom: "
-        "kinetic energy"
+        "on a logarithmic axis; zero and smaller changes are shown at the lower edge of the axis. "
+        "Bottom: kinetic energy"
     )
     return time_figure(flight, "momentum", "Momentum balance", caption, groups)
 
 
 def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Angular momentum of the base, arm, wheels and total; None if there are neither wheels nor a
-    capture."""
+    """Angular momentum of the base, the arm and the wheels, and their total; None if there are
+    neither wheels nor a capture."""
     robot, captured = flight.robot, flight.capture.get("captured", False)
     if robot is None or not (robot.wheel_names or captured):
         return None
@@ -537,11 +540,13 @@ def momentum_budget_figure(flight: FlightReport) -> ReportFigure | str | None:
     tints = [colour(column) for column in columns]
     group = TraceGroup(signal, parts, "angular momentum", "N m s", tints)
     caption = (
-        "Angular momentum about the centre of mass: of the base, as if it rotated with its joints "
-        "at rest; of the arm, from joint motion relative to the base, including a held body; "
+        "Components of the angular momentum about the centre of mass: that of the base, as if the "
+        "robot rotated with its joints at rest; that of the arm, due to joint motion relative to "
+        "the base, including a held body; "
     )
-    caption += "of the wheels about their axes; " if "wheels" in parts else ""
-    caption += "and the total, which only external loads change (norms; the vectors add up)"
+    caption += "that of the wheels about their axes; " if "wheels" in parts else ""
+    caption += "and the total, which only external loads change "
+    caption += "(the norms are shown; the vectors add up)"
     return time_figure(flight, "momentum_budget", "Momentum budget", caption, [group])
 
 
@@ -549,7 +554,7 @@ _MAX_CLEARANCE_SAMPLES = 2000
 
 
 def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Smallest distance between two links; None if no robot links can touch."""
+    """Smallest distance between two links; None if no links of the robot can touch."""
     clearance = flight.clearance
     if clearance is None:
         return None
@@ -591,12 +596,12 @@ _ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
     ("position", "distance", "m"),
     ("attitude", "angle", "rad"),
 )
-"""Goal components, and the names and units of their error norms."""
+"""Goal components, and the name and unit of the error norm of each."""
 
 
 def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Distance and angle between the base and its goal, and between a controller's end-effector and
-    its goal, in the controlled components.
+    its goal, counting only the controlled components.
     """
     base = flight.signal("pose")
     groups = []
@@ -614,7 +619,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
         return None
     caption = (
         "Distance and angle from the goal, in the controlled components, on logarithmic axes; "
-        "smaller values are at the lower edge; dotted: tolerance"
+        "smaller values are drawn at the lower edge; dotted line: tolerance"
     )
     if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.not_controlled]:
         caption += f"; the base {' and '.join(left_out)} is not controlled"
@@ -654,7 +659,8 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
                 groups.append(error_group(flight, signal, part, shortened(link), colour(number)))
     caption = (
         "Distance between each link and its goal position, and angle from its goal attitude if "
-        "required, on logarithmic axes; smaller values are at the lower edge; dotted: tolerance"
+        "required, on logarithmic axes; smaller values are drawn at the lower edge; dotted line: "
+        "tolerance"
     )
     if flight.base_goal is None:
         caption += "; the base is not controlled"

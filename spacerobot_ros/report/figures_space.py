@@ -59,10 +59,11 @@ PIXELS = 420
 """Width of a robot picture, pixels."""
 _MAX_SHOWN_POSES = 6
 _FOOT_SHARE = 0.1
-"""Share of a robot picture's height that is reserved for the scale bar."""
+"""Fraction of a robot picture's height that is reserved for the scale bar."""
 
 _NEAR = 2.0
-"""Largest total extent, in robot extents, at which the goal or obstacles are still fully shown.
+"""Largest total extent, as a multiple of the robot's extent, at which the goal or the obstacles are
+still fully shown.
 """
 
 
@@ -100,11 +101,11 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
         "figures."
     )
     if flight.target is not None:
-        caption += " The target is drawn at its actual pose, free or held."
+        caption += " The target is drawn at its actual pose, whether it is free or held."
     if flight.obstacles:
         caption += " Obstacles are drawn with the geometry used to measure distances."
     if flight.base_goal is not None:
-        caption += " In the last picture, the base link at its goal is dashed."
+        caption += " In the last picture, the base link at its goal is drawn with dashed lines."
     caption += flight.missing_meshes
     return ReportFigure("configurations", "Configurations", caption, figure)
 
@@ -351,12 +352,15 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str:
             axes.set_title(f"area {area:+.4g} {unit}")
             _draw_direction(axes, x, y)
     if cycles is None:
-        caption = "Joint positions in pairs; a circle marks the first shape, a dot the last."
+        caption = (
+            "Joint positions in pairs; a circle marks the first shape, and a dot the last shape."
+        )
     else:
         caption = (
             f"The last {_SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
             "ends at the circle and, to first order, displaces the base in proportion to the areas "
-            "it encloses: the areas of one cycle are given, positive if counter-clockwise."
+            "it encloses: the labels state the areas of one cycle, which are positive if "
+            "counter-clockwise."
         )
     if len(flight.shape_columns) > _LOOP_JOINTS:
         caption += f" The first three of {len(flight.shape_columns)} joints are shown."
@@ -382,13 +386,14 @@ def _draw_direction(axes: Axes, x: Array, y: Array) -> None:
 
 
 _CLOSED_LOOP_DISTANCE = 0.02
-"""Distance from the first shape at which a loop is considered closed, as a share of its size."""
+"""Distance from the first shape at which a loop is considered closed, as a fraction of the loop
+size."""
 
 _MIN_LOOPS = 4
 
 
 def cycles_figure(flight: FlightReport) -> ReportFigure | None:
-    """Attitude and remaining angle to the goal at the end of each loop in shape space.
+    """Attitude, and remaining angle to the goal, at the end of each loop in shape space.
 
     None if no method repeats cycles, or the joints do not return to the same shape several times.
     """
@@ -404,7 +409,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     groups = [TraceGroup(attitude, list("xyz"), "rotation vector", "rad", PALETTE[:3], goals)]
     caption = (
         f"Base link attitude at the {len(ends)} instants at which the joints return to the start "
-        "of a loop; number 0 is before the first loop"
+        "of a loop; number 0 is the attitude before the first loop"
     )
     if goal is not None:
         poses = zip(flight.pose[ends, :3], flight.pose[ends, 3:], strict=True)
@@ -422,10 +427,10 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
 
 
 def loop_ends(shape: Signal) -> Indices:
-    """Return the samples at which the joints return to their last shape, which closes a loop.
+    """Return the samples at which the joints return to their last shape, closing a loop.
 
-    If the joints rest there, the last sample of the rest is returned, or the first at the end of
-    the flight.
+    If the joints stop there, the last sample at rest is returned; at the end of the flight, the
+    first sample at rest is returned.
     """
     values = shape.values
     moving = np.flatnonzero((np.abs(np.diff(values, axis=0)) > 0).any(axis=1))

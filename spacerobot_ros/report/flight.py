@@ -56,7 +56,7 @@ _MAX_LINK_ERROR_STATES = 2000
 
 @dataclass(frozen=True)
 class GoalSpan:
-    """A goal and the time span, ``start`` to ``end`` in s, in which the robot flew to it."""
+    """A goal and the time span, ``start`` to ``end`` in s, during which the robot flew to it."""
 
     start: float
     end: float
@@ -80,7 +80,7 @@ class FlightReport(Flight):
 
     @classmethod
     def of(cls, bag: FlightBag, flight: Flight | None = None) -> FlightReport:
-        """Return the report data of a bag; its flight is read unless given.
+        """Return the report data of a bag; its flight is read unless it is given.
 
         Raises
         ------
@@ -170,7 +170,7 @@ class FlightReport(Flight):
 
     @property
     def target_pose(self) -> Signal:
-        """True target pose (M, 7): position, m, and quaternion; empty without a target."""
+        """True target pose (M, 7): position, m, and quaternion; empty if there is no target."""
         if self.target is None:
             return Signal.empty(7)
         return self.signal("true_target_pose") or self.signal("target_pose")
@@ -179,19 +179,19 @@ class FlightReport(Flight):
 
     @property
     def label(self) -> str:
-        """Short name to distinguish several flights: file name and method."""
+        """Short name that distinguishes several flights: the file name and the method."""
         path, method = self.bag.path, self.flown_method
         return f"{path.stem} ({method})" if method else path.name
 
     @property
     def flown_method(self) -> str:
-        """Gait method from the first schedule or from the planner's parameter, or the control
-        law."""
+        """Control law, or gait method according to the first schedule or the planner's
+        parameter."""
         named = (method for _, status in self.reports if (method := _method_of(status)))
         return next(named, str(self.parameter("planner", "method") or ""))
 
     def parameter(self, node: str, name: str) -> Any:
-        """Return a node parameter; None if it is not in the bag."""
+        """Return a node parameter; None if the bag does not contain the parameter."""
         return self.scenario.in_file.get(node, {}).get(name)
 
     @property
@@ -210,8 +210,8 @@ class FlightReport(Flight):
 
     @cached_property
     def timed_statuses(self) -> list[tuple[float, Status | str]]:
-        """Planner statuses, or else controller statuses, with their times, s. For a status
-        from another package, only the message is returned.
+        """Planner statuses or, if there are none, controller statuses, with their times, s. For a
+        status from another package, only the message is returned.
         """
         for commander in COMMANDERS:
             found = [
@@ -244,7 +244,7 @@ class FlightReport(Flight):
 
     @cached_property
     def targets(self) -> list[GoalSpan]:
-        """Base goals in the schedules; without schedules, the goals that were sent."""
+        """Base goals in the schedules; if there are no schedules, the goals that were sent."""
         return [target for target in self._all_targets if target.goal.base]
 
     @cached_property
@@ -258,7 +258,7 @@ class FlightReport(Flight):
 
     @property
     def base_goal(self) -> Goal | None:
-        """The base goal in force at the end; None: no goal, or the base is free."""
+        """The base goal that is active at the end; None if there is no goal or the base is free."""
         return self.goal if self.goal is not None and self.goal.base else None
 
     @property
@@ -274,14 +274,14 @@ class FlightReport(Flight):
 
     @cached_property
     def link_goals(self) -> dict[str, EndEffectorGoal]:
-        """The planner's link goals in force at the end."""
+        """The planner's active link goals at the end."""
         return {} if self.goal is None else {each.link: each for each in self.goal.end_effectors}
 
     @cached_property
     def link_errors(self) -> dict[str, tuple[Signal, Signal]]:
         """Distances (N, 1), m, and angles (M, 1), rad, between true link poses and their goals, at
-        up to two thousand states; no angles if any attitude is acceptable, and no links if the bag
-        lacks the robot description or states.
+        up to two thousand states. There are no angles if any attitude is acceptable. No links are
+        returned if the bag lacks the robot description or states.
         """
         return {link: self._errors_of_link(link) for link in self.link_poses}
 
@@ -317,7 +317,7 @@ class FlightReport(Flight):
 
     @property
     def tool_targets(self) -> list[GoalSpan]:
-        """End-effector goals, each until the next."""
+        """End-effector goals, each valid until the next goal."""
         return self._targets_until_next(_timed_goals(self.tool_goals))
 
     def _targets_until_next(self, goals: list[tuple[float, Goal]]) -> list[GoalSpan]:
@@ -330,9 +330,10 @@ class FlightReport(Flight):
         return "position" not in self.not_controlled
 
     def controls(self, part: str) -> list[int]:
-        """Controlled components x, y, z, rx, ry, rz (0..5) of ``base`` or ``end_effector``.
+        """Indices of the controlled components x, y, z, rx, ry, rz (0 to 5) of ``base`` or
+        ``end_effector``.
 
-        All six if no controller has reported its outputs.
+        All six components if no controller has reported its outputs.
         """
         if not self.outputs:
             return list(range(6))
@@ -351,7 +352,8 @@ class FlightReport(Flight):
 
     @property
     def hidden_links_text(self) -> str:
-        """A message about data missing for robot pictures; empty: nothing is missing."""
+        """A message about data that are missing for drawing the robot; empty if nothing is
+        missing."""
         lacking = []
         if self.robot is None:
             lacking.append("no robot description (robot_description)")
@@ -368,7 +370,8 @@ class FlightReport(Flight):
 
     @property
     def missing_meshes(self) -> str:
-        """A sentence for captions about meshes missing in the bag; empty: none."""
+        """A sentence for captions about meshes that are missing from the bag; empty if there are
+        none."""
         shapes: list[Shape] = []
         if self.robot is not None:
             shapes += [each for link in self.robot.links for each in link.shapes]
@@ -388,7 +391,7 @@ class FlightReport(Flight):
 
     @cached_property
     def joints(self) -> Array:
-        """Joint positions (N, n), in robot description order, at the base poses.
+        """Joint positions (N, n), in robot description order, at the times of the base poses.
 
         Reaction wheel angles are set to 0: a body of revolution looks the same at any angle.
         """
@@ -404,7 +407,7 @@ class FlightReport(Flight):
 
     @property
     def repeats_cycles(self) -> bool:
-        """Whether the method used repeats cycles or is unknown; false for control laws."""
+        """Whether the method repeats cycles, or is unknown; false for control laws."""
         if any(isinstance(status, ControllerStatus) for _, status in self.reports):
             return False
         flown = {status.method for _, status in self.executing if status.method}
@@ -414,7 +417,7 @@ class FlightReport(Flight):
 
     @cached_property
     def cycles(self) -> Cycles | None:
-        """The equal cycles at the end of the longest schedule; None: there are none."""
+        """The equal cycles at the end of the longest schedule; None if there are no such cycles."""
         if not self.repeats_cycles:
             return None
         starts = [0.0, *(time for time, _ in self.executing)]
@@ -445,7 +448,7 @@ class FlightReport(Flight):
 
 
 def _method_of(status: Status) -> str:
-    """Return the gait method of the schedule that begins, or the control law; empty: none."""
+    """Return the gait method of the schedule that begins, or the control law; empty if none."""
     if isinstance(status, PlannerStatus):
         return status.method
     return status.command.law if status.command is not None else ""
@@ -456,7 +459,8 @@ def _timed_goals(goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
 
 
 def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
-    """Return goal minus pose (N, 7) while there is a goal: position and rotation vector (M, 6)."""
+    """Return the goal minus the pose (N, 7) at the M times with a goal: position and rotation
+    vector (M, 6)."""
     times, values = [np.empty(0)], [np.empty((0, 6))]
     for target in targets:
         part = pose.between(target.start, target.end)

@@ -41,7 +41,8 @@ _CHART_HELP = (
     "instant shown there. Click a name to hide its trace.</p>"
 )
 _MAX_EVENT_ROWS, _MAX_UNFOLDED_ROWS = 200, 20
-"""Largest number of events in the table, and in a table that is not collapsed."""
+"""Largest number of events in the table, and the largest number for which the table is not
+collapsed."""
 
 _CHART_SLICES = 500
 """Number of time slices in a chart of a dense trace."""
@@ -61,7 +62,7 @@ def page(
     figures: Figures,
     beside: Sequence[FlightReport] = (),
 ) -> str:
-    """Return the whole page; the flights in ``beside`` each get a row in a table."""
+    """Return the whole page; each flight in ``beside`` gets a column in a table."""
     charts = charts_of(flight, figures)
     scenario = flight.scenario.described_for_other_goal() if flight.other_goal else flight.scenario
     name, description = scenario.name, scenario.description
@@ -99,7 +100,7 @@ def _facts_html(flight: FlightReport) -> str:
     if flight.bag.namespace:
         found.append(f"namespace {flight.bag.namespace}")
     if flight.other_robots:
-        found.append(f"the bag also has {', '.join(flight.other_robots)}")
+        found.append(f"the bag also contains {', '.join(flight.other_robots)}")
     return facts(found)
 
 
@@ -189,7 +190,7 @@ def _events_html(events: Sequence[tuple[float, Event]]) -> list[str]:
     rows = [(f"{time:.6g}", event_text(event), event.message, event.node) for time, event in events]
     more = len(rows) - _MAX_EVENT_ROWS
     head = ("Time (s)", "Event", "Message", "Node")
-    note = f'<p class="facts">{more} more are in the bag.</p>' if more > 0 else ""
+    note = f'<p class="facts">{more} more events are in the bag.</p>' if more > 0 else ""
     shown = table("events", head, rows[:_MAX_EVENT_ROWS], (0,)) + note
     if len(rows) > _MAX_UNFOLDED_ROWS:
         shown = f"<details><summary>{len(rows)} events</summary>{shown}</details>"
@@ -226,7 +227,7 @@ def _footer_text(flight: FlightReport) -> str:
 def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
     """Return the charts of all figures over time.
 
-    The element of a figure lists the numbers of its charts in ``data-charts``.
+    Each figure element lists its chart numbers in ``data-charts``.
     """
     groups = [group for each in figures if isinstance(each, ReportFigure) for group in each.groups]
     if not groups:

@@ -1,7 +1,7 @@
 """HTML page components: page shell and security policy, tables, figures and scripts.
 
-Flight and campaign reports are built from them. A page is self-contained: its
-Content-Security-Policy forbids loading anything and allows only its own scripts, identified by
+Flight and campaign reports are built from these components. A page is self-contained: its
+Content-Security-Policy forbids loading any resource and allows only its own scripts, identified by
 hash. Untrusted text in a bag is therefore never executed.
 """
 
@@ -62,7 +62,8 @@ def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[Page
     body
         HTML of the elements; empty strings are omitted.
     parts
-        Their scripts, styles and licences are added to the page; their markup is in ``body``.
+        Components whose scripts, styles and licences are added to the page; their markup is in
+        ``body``.
     """
     parts = (*parts, PagePart(programs=(package_file("page.js"),)))
     policy = f"{_SECURITY_POLICY}; {_script_policy(parts)}"
@@ -138,7 +139,7 @@ def table(
     """Return a table; the first cell of each row is a header, and ``numeric`` columns are
     right-aligned.
 
-    Without ``head``, the table has no header row.
+    If ``head`` is empty, the table has no header row.
     """
 
     def row(cells: Sequence[str], tag: str) -> str:

@@ -1,8 +1,8 @@
 """Pictures for the commands ``analyze`` and ``plan``: curvature maps and workspaces of a robot, and
 plans.
 
-Curvature maps over the shape space follow figures 2 and 3 in paper 3, and figures 6 to 8 in paper
-2.
+Curvature maps over the shape space are drawn as in figures 2 and 3 of paper 3, and figures 6 to 8
+of paper 2.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ from spacerobot_ros.report.figures import (
 from spacerobot_ros.report.figures_over_time import draw_group
 
 _FINE_GRID, _COARSE_GRID = 61, 37
-"""Points per side of a map, for robots with up to three joints and for those with more."""
+"""Points per side of a map, for robots with up to three joints and for robots with more joints."""
 
 _COLOUR_LEVELS = 16
 _CONDITION_LEVELS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
 _MAX_CONDITION = 300.0
-"""Larger condition numbers are drawn as this one: singular shapes are lines between grid points."""
+"""Larger condition numbers are drawn as this value: singular shapes lie between grid points."""
 
 _MIN_LIMIT_DISTANCE = 0.25
 """Smallest distance between the centre of a square and the joint limits, rad."""
@@ -107,7 +107,8 @@ def draw_workspaces(found: Analysis, format: PictureFormat = PictureFormat.PNG) 
 
 
 def draw_rings(axes: Axes, workspaces: Workspaces) -> None:
-    """Draw path-dependent and path-independent distances as rings around the centre of mass."""
+    """Draw the path-dependent and the path-independent ranges of distances as rings around the
+    centre of mass."""
     for kind, intervals in (
         ("path-independent", workspaces.path_independent),
         ("path-dependent", workspaces.path_dependent),
@@ -143,7 +144,7 @@ def _planar_figure(found: Analysis) -> Figure:
     left.set_ylim(lower[1], upper[1])
     left.set_xlabel(f"{robot.joint_names[i]} (rad)")
     left.set_ylabel(f"{robot.joint_names[j]} (rad)")
-    left.set_title("H: rotation by small clockwise loops per area (1/rad)")
+    left.set_title("H: rotation per area of small clockwise loops (1/rad)")
     _draw_colour_bar(figure, bar, norm, "RdBu_r", "H (1/rad)")
     right = panel(figure, 5.9, 0.6, WIDTH - 6.2, 3.55)
 
@@ -265,7 +266,9 @@ def _draw_condition_shares(axes: Axes, conditions: Array) -> None:
     axes.set_xlim(1.0, None)
     axes.set_ylim(0.0, 1.05)
     axes.set_xlabel("condition number of the best three brackets (1)")
-    axes.set_title(f"share of {len(conditions)} shapes across the shape space that are as good")
+    axes.set_title(
+        f"share of {len(conditions)} shapes in the shape space with at most this condition number"
+    )
 
 
 # -- parts --------------------------------------------------------------------------------------

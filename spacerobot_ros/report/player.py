@@ -1,4 +1,4 @@
-"""The 3D view on a flight's page: its scene as commands for the MeshCat viewer."""
+"""The 3D view on the page of a flight: the scene as commands for the MeshCat viewer."""
 
 from __future__ import annotations
 
@@ -62,9 +62,10 @@ _MARKUP = """<section id="animation" class="loading">
 <output id="now"></output>
 <select id="part" aria-label="Span of time"></select>
 <select id="speed" aria-label="Speed"></select></div>
-<p class="missing">The 3D view needs WebGL, which this browser does not offer; the figures below \
-do not.</p>
-<noscript><p class="missing">The 3D view needs JavaScript; the figures below do not.</p>\
+<p class="missing">The 3D view needs WebGL, which this browser does not provide; the figures \
+below work without it.</p>
+<noscript><p class="missing">The 3D view needs JavaScript; the figures below work without \
+it.</p>\
 </noscript>
 <p class="caption"><b>The flight.</b> {caption} Drag to rotate the view, with the right button to \
 move it; click it first to zoom with the wheel.</p>
@@ -118,7 +119,7 @@ _MAX_CYCLE_INSTANTS = 300
 
 @dataclass(frozen=True)
 class KeyFrames:
-    """Recorded states to show; motion between them is interpolated.
+    """Recorded states to show; the motion between these states is interpolated.
 
     Attributes
     ----------
@@ -127,8 +128,8 @@ class KeyFrames:
     error
         Largest deviation of an omitted state from the interpolation, in tolerances.
     every
-        Between the cycles shown in full, one state is shown per this number of cycles, always at
-        the same phase; 0: all cycles are shown in full.
+        Number of cycles per shown state between the cycles shown in full, always at the same phase;
+        0 if all cycles are shown in full.
     """
 
     indices: Indices
@@ -142,10 +143,10 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
     Parameters
     ----------
     motion
-        The visible motion, (N, k), each column divided by its tolerance.
+        The visible motion (N, k), with each column divided by its tolerance.
     cycles
-        Its equal cycles. All but the first and last few cycles are sampled at equal phase:
-        otherwise fast loops would look like slow ones (aliasing).
+        Its equal cycles. All but the first and last few cycles are sampled at the same phase:
+        otherwise fast loops would look like slow loops (aliasing).
     """
     shown, every = np.arange(len(motion)), 0
     if cycles is not None and cycles.count > 2 * FULL_CYCLES:
@@ -265,7 +266,7 @@ def _color_number(color: str) -> int:
 # -- the view of a flight -----------------------------------------------------------------------
 
 _POSITION_TOLERANCE = 0.001
-"""Position tolerance between key frames, as a share of the scene size."""
+"""Position tolerance between key frames, as a fraction of the scene size."""
 
 _ANGLE_TOLERANCE = 0.005  # rad
 _MAX_LINE_POINTS = 4000

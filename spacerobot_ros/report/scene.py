@@ -23,7 +23,7 @@ from spacerobot_ros.report.signals import continuous, link_poses
 _BASE_COLOUR = "#c4c9d2"
 
 _FLATNESS_STATES = 25
-"""Number of states at which links are checked to be in a horizontal plane."""
+"""Number of states in which links are checked for motion in a horizontal plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +35,12 @@ class Body:
     name
         Its unique name.
     visuals
-        Its solids, in the body frame.
+        Solids of the body, in the body frame.
     poses
-        Its world poses (K, 7) at the scene instants, m and quaternion; (1, 7): it is
-        at rest.
+        World poses (K, 7) of the body at the scene instants, m and quaternion; (1, 7) if it is at
+        rest.
     color
-        ``#rrggbb``; empty: each solid has its own color.
+        ``#rrggbb``; empty if each solid has its own color.
     """
 
     name: str
@@ -60,7 +60,7 @@ def robot_bodies(
     q: Array,
     most: int,
 ) -> list[Body]:
-    """Return the robot links that have solids, colored like the joints that move them.
+    """Return the robot links that have solids, with the colors of the joints that move them.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def robot_bodies(
 
 
 def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body]:
-    """Return the robot and the target in a flight, at some of its recorded states.
+    """Return the robot and the target in a flight, at selected recorded states.
 
     ``most``: largest number of mesh faces.
     """
@@ -118,9 +118,9 @@ def obstacles_of(flight: FlightReport) -> list[Body]:
 
 
 def goal_of_base(flight: FlightReport, most: int) -> Body | None:
-    """Return a robot's base at its goal; None: it has none.
+    """Return a robot's base at its goal; None if the base has no goal.
 
-    If only the attitude has a goal, the base is at its last position.
+    If the goal specifies only the attitude, the base is drawn at its last position.
     """
     goal, robot = flight.base_goal, flight.robot
     if goal is None or robot is None or not flight.controls("base"):

@@ -18,7 +18,8 @@ Indices = npt.NDArray[np.int64]
 
 _MIN_CYCLES = 12
 _INITIAL_STRETCHES = 64
-"""Number of parts into which a recording is split before simplification, to bound the work."""
+"""Number of parts into which a recording is split before simplification, to limit the computing
+time."""
 
 _MAX_PERIOD_SAMPLES = 1 << 14
 """Number of samples at the end of a gait that are searched for a period."""
@@ -61,18 +62,19 @@ def thinned(signal: Signal, slices: int) -> Signal:
 
 
 def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
-    """Drop samples on lines between others (Douglas-Peucker), keeping the farthest samples first.
+    """Drop samples that lie on lines between other samples (Douglas-Peucker); the farthest samples
+    are kept first.
 
     Parameters
     ----------
     motion
-        Each column divided by its tolerance.
+        The motion, with each column divided by its tolerance.
     most
         Largest number of samples to keep, in addition to a few dozen that are always kept.
 
     Returns
     -------
-    The samples kept, and the largest distance, in tolerances, of one that was dropped.
+    The kept samples, and the largest distance of a dropped sample, in tolerances.
     """
     bounds = np.unique(np.linspace(0, len(motion) - 1, _INITIAL_STRETCHES + 1).astype(int)).tolist()
     if len(bounds) < 2:
@@ -103,8 +105,8 @@ def _farthest_sample(motion: Signal, a: int, b: int) -> tuple[float, int, int, i
 def rotvecs(quaternions: Array) -> Array:
     """Return attitudes (N, 4) as rotation vectors (N, 3), continuous beyond half revolutions.
 
-    The first has a length of at most pi; each later one is the equivalent vector nearest to the
-    previous one.
+    The first vector has a length of at most pi; each later vector is the equivalent vector nearest
+    to the previous vector.
     """
     wrapped = rotvecs_from_quaternions(quaternions)
     lengths = np.linalg.norm(wrapped, axis=1)
@@ -132,7 +134,7 @@ def continuous(poses: Array) -> Array:
 
 
 def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Array]:
-    """Return the world poses (K, 7) of all links, the base link first.
+    """Return the world poses (K, 7) of all links, with the base link first.
 
     Link quaternions are continuous if the base quaternions are.
 
@@ -155,7 +157,7 @@ def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Arra
 def find_cycles(rates: Signal) -> Cycles | None:
     """Return the equal cycles at the end of a gait, detected from its joint velocities.
 
-    None unless there are at least twelve cycles, equal within a tenth of the peak velocity.
+    None if there are fewer than twelve cycles that agree to within a tenth of the peak velocity.
     """
     peak = np.abs(rates.values).max(axis=0, initial=0.0)
     moving = np.flatnonzero((np.abs(rates.values) > 1e-6 * peak).any(axis=1))

@@ -52,7 +52,7 @@ class PlacedSolid:
 
 
 def placed_solids(bodies: Iterable[Body], instant: int) -> list[PlacedSolid]:
-    """Return the solids of bodies in the world at the instant with this index."""
+    """Return the solids of bodies in the world at the instant with the given index."""
     found = []
     for body in bodies:
         pose = body.poses[min(instant, len(body.poses) - 1)]
@@ -81,8 +81,8 @@ def corner_points(solids: Iterable[PlacedSolid]) -> Array:
 
 
 class View:
-    """A parallel projection of world points to the image plane, from azimuth and elevation
-    (deg)."""
+    """A parallel projection of world points onto the image plane, for a view from a given azimuth
+    and elevation (deg)."""
 
     def __init__(self, azimuth: float = -58.0, elevation: float = 24.0) -> None:
         a, e = math.radians(azimuth), math.radians(elevation)
@@ -99,7 +99,7 @@ class View:
         return np.asarray(points @ self.paper_axes.T)
 
     def shade(self, fill: Array, normal: Array) -> Array:
-        """Return the colour (3,) of a face with an outward normal under the light of this view."""
+        """Return the colour (3,) of a face with an outward normal under the light of the view."""
         return fill * (0.72 + 0.28 * max(float(normal @ self._light), 0.0))
 
 
@@ -142,7 +142,8 @@ class Canvas:
             self._draw_edge(ends, color, pixels_nearer=1e9)
 
     def image(self) -> Image:
-        """Return the picture (rows, columns, 4), the top row first, transparent where empty."""
+        """Return the picture (rows, columns, 4), with the top row first and empty pixels
+        transparent."""
         n = _OVERSAMPLING
         total = sum(self._pixels[i::n, j::n] for i in range(n) for j in range(n))
         image = np.asarray(total, np.float32)

@@ -25,12 +25,12 @@ from spacerobot_ros.scenario import Published
 _NO_VALUE = "–"
 _LEAST_ANGLE_IN_DEGREES = 1e-4  # rad
 _EQUAL_TIME_TICKS = 1.5
-"""Largest difference between times that are considered equal, control periods."""
+"""Largest difference between times that are considered equal, in control periods."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text below a header; ``numeric`` are the columns aligned as numbers."""
+    """Rows of text below a header; ``numeric`` contains the columns that are aligned as numbers."""
 
     head: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
@@ -122,7 +122,8 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 
 
 def result_table(flight: FlightReport) -> Table:
-    """Return goals and final poses, an estimated body and the clearance, if they are in the bag."""
+    """Return goals and final poses, an estimated body and the clearance, each if it is in the
+    bag."""
     rows: list[tuple[str, ...]] = []
     last = flight.reports[-1][1].state.value if flight.reports else ""
     refused = " (refused)" if last == "refused" and not flight.executing else ""
@@ -153,7 +154,7 @@ _FREE_BASE = "of the base"
 
 
 def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
-    """Return the goal of the base by its parts, as texts; empty: there is none."""
+    """Return the goal of the base by its parts, as texts; empty if there is none."""
     goal = flight.base_goal
     if goal is None:
         return {_FREE_BASE: "not controlled"} if flight.link_goals else {}
@@ -202,9 +203,9 @@ def payload_text(estimate: PayloadEstimate) -> str:
     if (payload := estimate.payload) is not None:
         inertia = payload.inertia.about_com
         moments = ", ".join(f"{inertia[i, j]:.4g}" for i, j in INERTIA_ENTRIES)
-        parts.append(f"inertia about it ({moments}) kg m² (xx, yy, zz, xy, xz, yz)")
+        parts.append(f"inertia about the centre of mass ({moments}) kg m² (xx, yy, zz, xy, xz, yz)")
     if estimate.undetermined:
-        parts.append(f"not determined by its motion: {', '.join(estimate.undetermined)}")
+        parts.append(f"not determined by the motion: {', '.join(estimate.undetermined)}")
     if estimate.corrected:
         parts.append("corrected to the nearest physical parameters")
     return "; ".join(parts)
@@ -239,8 +240,8 @@ def joint_table(flight: FlightReport) -> Table | None:
 
 
 def published_table(flight: FlightReport) -> Table | None:
-    """Return published values next to those of this flight; None if there are none for the
-    scenario."""
+    """Return the published values and the corresponding values of this flight; None if no values
+    are published for the scenario."""
     if not flight.scenario.published:
         return None
     rows = []
@@ -278,7 +279,7 @@ def _position_text(position: Array) -> str:
 
 def _format_attitude(rotvec: Iterable[float]) -> str:
     angle = math.degrees(math.hypot(*rotvec))
-    return f"rotation vector ({numbers(rotvec)}) rad, {angle:.3f}° in all"
+    return f"rotation vector ({numbers(rotvec)}) rad, {angle:.3f}° in total"
 
 
 def _tolerance_text(flight: FlightReport, part: Literal["position", "attitude"]) -> str:

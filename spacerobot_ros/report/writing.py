@@ -60,7 +60,7 @@ FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
     "momentum_budget": over_time.momentum_budget_figure,
     "path": space.path_figure,
 }
-"""The figures of :func:`write_figures`, by name."""
+"""The figures that :func:`write_figures` can write, by name."""
 
 _REPORT_FIGURES = tuple(draw for name, draw in FIGURES.items() if name not in ("pose", "path"))
 """Report figures, with separate position and attitude figures and a figure of all paths."""
@@ -71,9 +71,10 @@ def write_report(
 ) -> None:
     """Write the report of a bag as one self-contained HTML file.
 
-    A page is created for any bag: parts without data are omitted, and the page says so. Bags in
-    ``beside``, for example from other methods for the same goal, are added as columns in a table
-    and as paths in the path figure. If the bag has several robots, ``namespace`` selects one.
+    A page is created for any bag: if data are missing, the affected sections are omitted, and the
+    page states this. Bags in ``beside``, for example from other methods for the same goal, are
+    added as columns in a table and as paths in the path figure. If the bag has several robots,
+    ``namespace`` selects one.
 
     Raises
     ------
@@ -108,20 +109,20 @@ def write_figures(
     bag
         The flight.
     folder
-        Output folder for the files, ``pose.pdf`` and so on; existing files are replaced.
+        Output folder for the files (``pose.pdf`` and so on); existing files are replaced.
     only
-        Names of :data:`FIGURES`; empty for all figures that the bag has data for, with position and
-        attitude in one figure.
+        Names of :data:`FIGURES`; empty for all figures for which the bag has data, with position
+        and attitude in one figure.
     beside
         Other flights, whose traces and paths are added to the same panels; figures that show a
         single flight are omitted.
     format
-        Format of the files. Text in PDF and SVG files remains text.
+        Format of the files. Text in PDF and SVG files remains editable text.
     width
         Figure width, mm.
     style
-        A matplotlib style file for fonts and for sizes and colours of lines and axes, the name of a
-        matplotlib style, or ``serif``.
+        A matplotlib style file (for fonts, and for sizes and colours of lines and axes), the name
+        of a matplotlib style, or ``serif``.
     events
         Whether to show events below time axes.
     degrees
@@ -144,10 +145,11 @@ def write_figures(
         raise SpaceRobotError(f"There is no figure '{unknown[0]}': the figures are {known}.{meant}")
     if not _PAPER_WIDTHS[0] <= width <= _PAPER_WIDTHS[1]:
         least, most = _PAPER_WIDTHS
-        raise SpaceRobotError(f"A figure is {least:g} to {most:g} mm wide, not {width:g} mm.")
+        raise SpaceRobotError(f"A figure must be {least:g} to {most:g} mm wide, not {width:g} mm.")
     if folder.suffix.lower() in {f".{each.value}" for each in PictureFormat}:
         raise SpaceRobotError(
-            f"Figures are written to a folder, one file each; '{folder.name}' is a file name."
+            f"Figures are written to a folder, with one file per figure; '{folder.name}' is a "
+            "file name."
         )
     flight, *others = (read_report(each, namespace) for each in (bag, *beside))
     if not events:
@@ -179,7 +181,7 @@ def write_figures(
                 made[name] = path = folder / f"{name}.{format.value}"
                 write_output(path, picture)
             else:
-                made[name] = figure or "The bag has no data for it."
+                made[name] = figure or "The bag has no data for this figure."
     return made
 
 
@@ -191,7 +193,7 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
     Raises
     ------
     SpaceRobotError
-        There is no such bag, it is damaged or contains no base poses, or the file cannot be
+        There is no such bag, the bag is damaged or contains no base poses, or the file cannot be
         written.
     """
     format = PictureFormat.of(picture)

@@ -1,1 +1,1 @@
-"""Sessions: scenarios flown without ROS, or by nodes in separate processes."""
+"""Sessions: flights of scenarios without ROS, or by nodes in separate processes."""

@@ -1,4 +1,5 @@
-"""``python -m spacerobot_ros.session.child MODULE ...``: a node that ends with its supervisor.
+"""``python -m spacerobot_ros.session.child MODULE ...``: starts a node that ends together with its
+supervisor.
 
 Signal handlers are set first, because importing a node module takes a second.
 """

@@ -1,4 +1,4 @@
-"""Flights with nodes, to a scenario's goal or until stopped; sending goals to running stacks."""
+"""Flights with nodes, to the goal of a scenario or until stopped, and goals for running stacks."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def ros() -> Iterator[None]:
 def fly_by_nodes(
     scenario: Scenario, bag: Path, progress: Callable[[float, float], None], longest: float
 ) -> dict[str, Any]:
-    """Fly a scenario with one process per node; return the object written by ``--json``.
+    """Fly a scenario with one process per node; return the result that ``--json`` writes.
 
-    For the parameters see :func:`~spacerobot_ros.session.run.run_scenario`. The flight is checked
+    For the parameters, see :func:`~spacerobot_ros.session.run.run_scenario`. The flight is checked
     five times per second of wall time.
 
     Raises
@@ -119,7 +119,7 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
 _LONGEST_DISCOVERY = 10.0  # wall s
 
 _LONGEST_STATUS_WAIT = 1.0
-"""Wall time to wait for the status of earlier goals before sending a new goal, s."""
+"""Wall time, s, to wait for the status of earlier goals before a new goal is sent."""
 
 _CHECK_PERIOD = 0.1
 
@@ -156,12 +156,12 @@ def run_until_stopped(
     If the planner or the controller dies, it is restarted, at most ``restarts`` times per minute.
     ``supervise`` is called five times per second.
 
-    Returns the bag, under a new name if the name was taken and ``when_exists`` is next.
+    Returns the bag path, with a new name if the name was in use and ``when_exists`` is next.
 
     Raises
     ------
     SpaceRobotError
-        A node cannot start, or has ended by itself.
+        A node cannot start, or has ended unexpectedly.
     """
     with ros():
         stack = MultiProcessStack(scenario, bag, namespace, restarts=restarts, show=show)
@@ -170,7 +170,7 @@ def run_until_stopped(
                 stack.start(None)
                 with suppress(OSError):
                     topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
-                    show(f"{scenario.name} is up; goals on '{topic}', Ctrl-C ends it.")
+                    show(f"{scenario.name} is up. Send goals on '{topic}'; Ctrl-C ends it.")
                 stack.client.on_message = _StatusPrinter(show)
                 stack.client.on_message(stack.client.message)
 
@@ -190,9 +190,8 @@ def send_goal(
 ) -> Outcome:
     """Send one goal pose, show its statuses, and return its outcome.
 
-    ``timeout`` is wall time in s; 0: no limit. The search for a commander ends after ``timeout``,
-    or
-    after ten seconds.
+    ``timeout`` is a wall time in s; 0 means no limit. The search for a commander ends after
+    ``timeout``, or after ten seconds.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Client that sends a flight's goals and tracks their statuses until the outcome."""
+"""Client that sends the goals of a flight and tracks their statuses until the outcome is known."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class MissionClient:
     world_frame
         Frame of the goals.
     now
-        Returns the time for goal stamps, ns: simulated time if available.
+        Function that returns the time for goal stamps, ns: simulated time if available.
     joint_names
-        Returns the robot's joints if this or an earlier goal may require joint positions; None: no
-        goal in this stack does.
+        Function that returns the robot joints if this or an earlier goal may require joint
+        positions; None if no goal in this stack requires them.
     end_effectors
         Links with goals; empty name: the default end-effector.
     paths
@@ -78,7 +78,7 @@ class MissionClient:
         self.message = ""
         """Message in the last status about this goal; empty before the first."""
         self.on_message: Callable[[str], None] = lambda message: None
-        """Called with each such message on arrival, since it may soon be replaced."""
+        """Called with each such message on arrival, because a later message may soon replace it."""
         self.decider = decider
         """The commander that decides."""
         self._done = rclpy.task.Future(executor=None)
@@ -118,7 +118,7 @@ class MissionClient:
 
     @property
     def gait(self) -> PlannerStatus | None:
-        """The planner's status when its first schedule for the goal began."""
+        """The planner status at the start of its first schedule for the goal."""
         return self._follower.gait
 
     @property
@@ -128,11 +128,14 @@ class MissionClient:
 
     @property
     def ends_at(self) -> float:
-        """Simulated time at which the planner's current schedule ends, s; 0 without a schedule."""
+        """Simulated time at which the planner's current schedule ends, s; 0 if there is no
+        schedule.
+        """
         return self.status.ends_at_s if isinstance(self.status, PlannerStatus) else 0.0
 
     def is_connected(self, readers: int = 1) -> bool:
-        """Whether goals have ``readers`` subscribers, and all known subscribers are matched.
+        """Whether the goal topics have ``readers`` subscribers, and all known subscribers are
+        matched.
 
         A commander may be known but not matched yet, while a viewer or a recorder is already
         matched. Third-party
@@ -166,9 +169,9 @@ class MissionClient:
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
         """Publish base and end-effector goal poses, if any.
 
-        All share one stamp, unique to this goal; the status identifies the goal by it. A planner
-        keeps required joint positions for later goals, so every goal is sent with its joint
-        positions, or with an empty message.
+        All messages share one stamp, unique to this goal; the status identifies the goal by this
+        stamp. A planner uses received joint positions for all later goals, so every goal is sent
+        together with its joint positions, or with an empty message.
         """
         self._sent += 1
         time_ns = self._now() + self._sent

@@ -1,4 +1,4 @@
-"""First scenario for a user's robot: notes on its URDF, a goal, and the scenario file."""
+"""First scenario for a user's robot: notes on the URDF, a goal, and the scenario file."""
 
 from __future__ import annotations
 
@@ -25,10 +25,12 @@ _LARGEST_FIRST_ROTATION = math.radians(5.0)  # rad
 _MAX_USUAL_LIMIT = 4 * math.pi  # rad; larger ones may be in degrees
 
 _LARGEST_SHARE_OF_DISTANCE_TO_LIMIT = 0.5
-"""Maximum fraction of a joint's distance to its limits used in the first rotation."""
+"""Maximum fraction of the distance between a joint and its limits that the first rotation uses."""
 
 _LARGEST_COUNTED_DISTANCE_TO_LIMIT = 1.0
-"""Maximum used distance to a joint limit, m or rad: linearisation fails beyond it."""
+"""Maximum distance, m or rad, that a joint moves towards its limit; beyond this, linearisation
+fails.
+"""
 
 _LEAST_ROTATION_WITHOUT_LOOPS = math.radians(0.2)
 """Smallest first rotation without joint loops, rad."""
@@ -45,25 +47,26 @@ _LEAST_USUAL_SPEED, _LARGEST_USUAL_SPEED = 1e-3, 50.0
 def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
     """Yield notes on unusual values in a URDF, each with a remedy.
 
-    The robot can still fly; errors are reported when the file is read.
+    The robot can still fly; errors are reported when the URDF is read.
     """
     carried = robot.total_mass - robot.bodies[0].inertia.mass
     base = robot.bodies[0].inertia
     if carried > 0 and base.mass < _LEAST_BASE_MASS_RATIO * carried:
         yield (
-            f"The base '{robot.base_link}' has {base.mass:.4g} kg and carries {carried:.4g} kg: it "
-            "moves more than its load. If it represents a mount, give it the mass and "
-            "inertia of the spacecraft."
+            f"The base '{robot.base_link}' has a mass of {base.mass:.4g} kg and carries "
+            f"{carried:.4g} kg, so the base moves more than its load. If the base represents a "
+            f"mount, "
+            "give it the mass and inertia of the spacecraft."
         )
     if carried > 0 and base.mass > _LARGEST_BASE_MASS_RATIO * carried:
         yield (
-            f"The base '{robot.base_link}' has {base.mass:.4g} kg, {base.mass / carried:.3g} times "
-            "its load: the joints hardly move it."
+            f"The base '{robot.base_link}' has a mass of {base.mass:.4g} kg, "
+            f"{base.mass / carried:.3g} times its load: the joints hardly move it."
         )
     if base.mass > 0 and not np.any(base.about_com):
         yield (
-            f"The base '{robot.base_link}' is a point mass: give it an <inertia>, for a box of "
-            "sides a, b, c ixx = m (b^2 + c^2) / 12 and so on."
+            f"The base '{robot.base_link}' is a point mass: give it an <inertia> (for a box "
+            "with sides a, b and c: ixx = m (b^2 + c^2) / 12, and so on)."
         )
     found: dict[int, list[str]] = {}
     for joint in robot.movable_joints:
@@ -74,14 +77,17 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
     for link in robot.links:
         # A body with such an inertia is refused; a welded link is not.
         if flaw := describe_inertia_flaw(link.inertia.about_com):
-            yield f"The inertia of link '{link.name}' {flaw} The links welded to it make up for it."
+            yield (
+                f"The inertia of link '{link.name}' {flaw} The links welded to it compensate for "
+                "this."
+            )
     yield from _visual_remarks(robot)
 
 
 def _other_joints_clause(count: int) -> str:
     if not count:
         return ""
-    return f" The same holds for {count} other joint{'s' if count > 1 else ''}."
+    return f" The same applies to {count} other joint{'s' if count > 1 else ''}."
 
 
 def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]:
@@ -89,7 +95,7 @@ def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]
     if speed == 0:
         yield (
             0,
-            f"The joint '{joint.name}' has the velocity limit 0, so it cannot move: give "
+            f"The joint '{joint.name}' has a velocity limit of 0, so it cannot move: give "
             f'<limit velocity="..."/> in {unit}/s.',
         )
     elif math.isinf(speed):
@@ -114,7 +120,7 @@ def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]
     if limits.effort == 0:
         yield (
             4,
-            f"The joint '{joint.name}' has the effort limit 0: it moves under velocity commands, "
+            f"The joint '{joint.name}' has an effort limit of 0: it moves under velocity commands, "
             'but not under effort commands. Give <limit effort="..."/> in N or N m.',
         )
 
@@ -142,7 +148,7 @@ def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
 
 
 def first_shape(robot: SpaceRobot) -> Array:
-    """Return joint positions (n,), m or rad, far from all limits: the middle of narrow ranges.
+    """Return joint positions (n,), m or rad, far from all limits; for narrow ranges, the middle.
 
     Joints that can move by a third of their range in both directions from zero stay at zero, the
     position in which URDFs are usually drawn.
@@ -159,9 +165,9 @@ def first_shape(robot: SpaceRobot) -> Array:
 def first_problem(
     name: str, robot: SpaceRobot, file: Path, *, clear: bool = True
 ) -> PlanningProblem:
-    """Return the problem for a small base rotation about an axis that the joints can achieve.
+    """Return the problem of a small base rotation about an axis that is accessible to the joints.
 
-    ``clear``: whether the plan avoids contacts between links, which requires their meshes.
+    If ``clear`` is true, the plan avoids contacts between links, which requires the link meshes.
 
     Raises
     ------
@@ -194,9 +200,9 @@ def first_problem(
 def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
     """Return a base rotation (3,), rad, that the joints produce without loops.
 
-    It is 5 degrees about z, y or x, or about the only axis in ``axes`` (m, 3), if to first order
-    half of the joint ranges around a configuration (n,) suffices. If light arms rotate the base
-    less, the rotation is smaller, about the axis with the largest rotation.
+    The rotation is 5 degrees about z, y or x, or about the only axis in ``axes`` (m, 3), if
+    half of the joint ranges around a configuration (n,) suffice to first order. If the arms are
+    too light for this, the rotation is smaller, about the axis with the largest rotation.
     """
     room = np.minimum(robot.upper - shape, shape - robot.lower)
     F = robot.connection(shape)[3:] * np.minimum(room, _LARGEST_COUNTED_DISTANCE_TO_LIMIT)
@@ -218,7 +224,9 @@ def first_turn(robot: SpaceRobot, shape: Array, axes: Array) -> Array:
 
 
 def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str:
-    """Return a parameter file that flies a problem with a method; see docs/own_robot.md."""
+    """Return a parameter file for a flight that solves a problem with a method; see
+    docs/own_robot.md.
+    """
     x, y, z, w = (float(value) for value in problem.goal.quaternion)
     assert problem.initial.joint_positions is not None
     shape = ", ".join(repr(float(q)) for q in problem.initial.joint_positions)
@@ -259,7 +267,9 @@ scenario:
 
 
 def thruster_scenario_text(robot: SpaceRobot, robot_path: str) -> str:
-    """Return a parameter file that moves and rotates a robot without joints with its thrusters."""
+    """Return a parameter file for a flight in which thrusters move and rotate a robot without
+    joints.
+    """
     name = robot.description.name
     return f"""\
 # The first flight of {name}, which has no joints: thrusters move and rotate it.

@@ -1,4 +1,4 @@
-"""A stack with one process per node, as users run nodes, without ros2 launch."""
+"""A stack with one process per node, as if users had started the nodes without ros2 launch."""
 
 from __future__ import annotations
 
@@ -51,10 +51,12 @@ _LONGEST_START = 60.0  # wall s
 _RESTART_PERIOD = 60.0  # wall s, over which restarts are counted
 
 _LONGEST_END = 10.0
-"""Wall time after a signal at which a running node is killed, s."""
+"""Wall time, s, after a signal at which a node that is still running is killed."""
 
 _SETTINGS_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""Settings without shared memory: Fast DDS could keep writing to a killed node's memory."""
+"""Settings without shared memory; otherwise, Fast DDS could continue to write to the memory of a
+killed node.
+"""
 
 _FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
@@ -70,10 +72,10 @@ _FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
 """
 """Fast DDS settings that make writers resend lost messages after 10 ms.
 
-With the default of 3 s a lockstep plant would wait, and other nodes would lose messages."""
+With the default of 3 s, a lockstep plant would wait, and other nodes would lose messages."""
 
 _LONGEST_RECORDING_DELAY = 1.0
-"""Wall time for the recorder to receive the plant's last messages, s."""
+"""Wall time, s, in which the recorder receives the last messages from the plant."""
 
 
 _LONGEST_ANSWER_AFTER_INTERRUPT = 0.5  # wall s
@@ -82,7 +84,7 @@ _CHILD_MODULE = "spacerobot_ros.session.child"
 
 
 def checked_namespace(name: str) -> str:
-    """Return a namespace in ROS form, with a leading slash; empty for none.
+    """Return a namespace in ROS form, with a leading slash, or an empty string for no namespace.
 
     Raises
     ------
@@ -100,9 +102,9 @@ def checked_namespace(name: str) -> str:
 class MultiProcessStack:
     """A scenario's node processes, and the mission client in this process.
 
-    The node processes end with this process, even if it is killed. In lockstep all runs are
-    identical: nothing begins until all nodes are connected, and the goal arrives before the first
-    state.
+    The node processes end with this process, even if it is killed. In lockstep, all runs are
+    identical: the flight does not start until all nodes are connected, and the goal arrives before
+    the first state.
 
     Parameters
     ----------
@@ -111,20 +113,20 @@ class MultiProcessStack:
     bag
         File to record into; None records nothing.
     namespace
-        Namespace of all nodes and topics, including the clock and the frames; empty for none.
+        Namespace of all nodes and topics, including the clock and the frames; empty: no namespace.
     restarts
-        Maximum number of restarts per minute for a planner or controller that dies; it continues
-        with its goal.
+        Maximum number of restarts per minute of a planner or controller that has died; the
+        restarted node continues with its goal.
     show
-        Shows a line about each restart to the user.
+        Function that shows the user a line about each restart.
 
     Raises
     ------
     ParameterError
         A parameter or the namespace is invalid, or the scenario kills nodes in lockstep.
     SpaceRobotError
-        A node ended at its start (the message is the last error that it wrote), or another stack
-        is active in this ROS domain and namespace.
+        A node ended during startup (the message is the last error that it reported), or another
+        stack is active in this ROS domain and namespace.
     """
 
     def __init__(
@@ -140,7 +142,7 @@ class MultiProcessStack:
         _require_flyable(scenario)
         self.scenario = scenario
         self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
-        """Reaction to an existing bag with this name; by default an error."""
+        """Reaction to an existing bag with this name; the default is an error."""
         self.bag = free_name(bag) if bag is not None and self.when_exists == "next" else bag
         recorder = () if bag is None else ("recorder",)
         self.names = ("plant", *scenario.commanders, *recorder)
@@ -178,7 +180,7 @@ class MultiProcessStack:
             self._events = node.create_publisher(DiagnosticStatus, "events", STREAM)
         node.create_subscription(Clock, f"{self.namespace}/clock", self._on_clock, 10)
         self._active_elsewhere = ""
-        """Name of a node that was active before this stack was."""
+        """Name of a node that was active before this stack was started."""
         self._heartbeats = node.create_subscription(
             DiagnosticStatus, TOPIC, self._on_heartbeat, HEARTBEAT_QOS
         )
@@ -261,7 +263,8 @@ class MultiProcessStack:
         Raises
         ------
         SpaceRobotError
-            A node has ended by itself, or a commander with a goal has failed; the bag is complete.
+            A node has ended unexpectedly, or a commander with a goal has failed; the bag is
+            complete.
         """
 
         def on_look() -> bool:
@@ -282,9 +285,9 @@ class MultiProcessStack:
             raise
 
     def finish(self) -> None:
-        """Stop time, then end all nodes; the recorder ends last and completes the bag.
+        """Stop simulated time, then end all nodes; the recorder ends last and completes the bag.
 
-        An interrupted real-time flight ends with its joints at rest.
+        An interrupted real-time flight ends with the joints at rest.
 
         Raises
         ------
@@ -338,7 +341,7 @@ class MultiProcessStack:
                 )
 
     def kill(self, name: str) -> None:
-        """Kill a node, as a crash would."""
+        """Kill a node, as if it had crashed."""
         end_child(self.processes[name], {})
 
     def _supervise(self) -> None:
@@ -484,8 +487,8 @@ def _require_flyable(scenario: Scenario) -> None:
 
 
 _NO_ERROR_TEXT = (
-    "it wrote no error. If another stack is up in this ROS domain, its nodes respond instead: set "
-    "ROS_DOMAIN_ID to another number."
+    "it wrote no error. If another stack is running in this ROS domain, the nodes of that stack "
+    "respond instead: set ROS_DOMAIN_ID to another number."
 )
 
 _LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]*\]: ")
@@ -499,7 +502,7 @@ _CRASHED_AT = re.compile(r"^Current thread .*\n  File (.*)$", re.MULTILINE)
 def last_error(log: str) -> str:
     """Return the last error in a node's log; empty if there is none.
 
-    It is an error that the node logged, or the last line of a traceback.
+    This is an error that the node logged, or the last line of a traceback.
     """
     found = ""
     for line in log.splitlines():
@@ -513,8 +516,8 @@ def last_error(log: str) -> str:
 
 
 def end_message(name: str, code: int, log: str) -> str:
-    """Return a sentence about a node's end: the signal and the crash, or the exit code and the
-    error."""
+    """Return a sentence that explains why a node has ended: the signal and the crash, or the
+    exit code and the error."""
     if code < 0:
         # Of a signal Python logs a crash alone: other errors in the log are not its cause.
         how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
@@ -526,7 +529,7 @@ def end_message(name: str, code: int, log: str) -> str:
 
 
 class RestartLimit:
-    """Limit on restarts of processes that die.
+    """Limit on the restarts of processes that have died.
 
     Parameters
     ----------
@@ -539,14 +542,16 @@ class RestartLimit:
         self._restarted: dict[str, list[float]] = {}
 
     def allows_restart(self, name: str, now: float) -> bool:
-        """Return whether a process may be restarted at a wall time, s; if so, count the restart."""
+        """Return whether a process may be restarted at a wall time in s; if so, count the
+        restart.
+        """
         recent = [each for each in self._restarted.get(name, ()) if now - each < _RESTART_PERIOD]
         allowed = len(recent) < self.most
         self._restarted[name] = [*recent, now] if allowed else recent
         return allowed
 
     def count_restart(self, name: str) -> str:
-        """Return a sentence about a process's restarts, with a leading space."""
+        """Return a sentence that states how often a process was restarted, with a leading space."""
         count = len(self._restarted.get(name, ()))
         if not count:
             return ""
@@ -586,7 +591,7 @@ class KillTimeline:
         self._away: list[Kill] = []
 
     def due(self, time: float) -> tuple[list[str], list[str]]:
-        """Return the nodes to kill and the nodes to start until a simulated time, s."""
+        """Return the nodes to be killed and the nodes to be started by a simulated time, s."""
         killed = [kill for kill in self._waiting if kill.at <= time]
         started = [kill for kill in self._away if kill.until <= time]
         self._waiting = [kill for kill in self._waiting if kill.at > time]
@@ -595,5 +600,5 @@ class KillTimeline:
 
     @property
     def away(self) -> set[str]:
-        """Names of the nodes that were killed and not restarted yet."""
+        """Names of the nodes that were killed and have not been restarted yet."""
         return {kill.node for kill in self._away}

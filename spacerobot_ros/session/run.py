@@ -1,4 +1,4 @@
-"""Flies scenarios to their goals and records bags, with or without ROS nodes."""
+"""Flights of scenarios to their goals, recorded in bags, with or without ROS nodes."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.termination import graceful_shutdown
 
 Progress = Callable[[float, float], None]
-"""Function called with simulated time and the end time of the current schedule, s."""
+"""Function called with the simulated time and the end time of the current schedule, s."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """Result of a run; ``summary`` is the object written by ``--json``."""
+    """Result of a run; ``summary`` is the data written by ``--json``."""
 
     summary: dict[str, Any]
 
@@ -34,7 +34,7 @@ class RunResult:
 
     @property
     def message(self) -> str:
-        """Sentence about the goal's outcome."""
+        """One-sentence description of the goal outcome."""
         return str(self.summary["message"])
 
     sentence = message
@@ -55,7 +55,7 @@ def run_scenario(
     flight is interrupted after ``longest`` s of simulated time.
 
     SIGINT, SIGTERM and SIGHUP end the flight early; the flight up to that time is recorded and
-    summarised. Before the flight they act as usual.
+    summarised. Before the flight, signals have their usual effect.
 
     Raises
     ------

@@ -1,4 +1,6 @@
-"""A viewer process next to a command, at lower priority so that it does not delay the plant."""
+"""A viewer process that accompanies a command, at lower priority so that the plant is not
+delayed.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ from spacerobot_ros.viewer.server import require_viser
 _LONGEST_START = 30.0  # wall s
 
 _LONGEST_END = 1.5
-"""Wall time after SIGINT at which the process is killed, s."""
+"""Wall time, s, after SIGINT at which the process is killed."""
 
 _NICENESS = 5
 
@@ -42,7 +44,7 @@ class Viewer:
     parameters, show, namespace
         As of :func:`viewing`.
     folder
-        Folder for its log and parameters.
+        Folder for the log and the parameters of the viewer.
     """
 
     def __init__(
@@ -89,7 +91,7 @@ class Viewer:
             self._parameters["port"] = port
 
     def restart_within(self, restarts: int) -> None:
-        """Allow this number of restarts per minute."""
+        """Allow up to this number of restarts per minute."""
         self._restarts = RestartLimit(restarts)
 
     def supervise(self) -> None:
@@ -105,7 +107,7 @@ class Viewer:
             self._show(f"{message} It is restarted.")
 
     def end(self) -> None:
-        """End the viewer; a line reports if it had already ended."""
+        """End the viewer; a line reports if the viewer had already ended."""
         if self._announced and self.process.poll() is not None:
             with suppress(OSError):
                 self._show(f"{self._end_message()}{self._restarts.count_restart('viewer')}")
@@ -120,16 +122,16 @@ class Viewer:
 def viewing(
     parameters: Mapping[str, Value], show: Callable[[str], None], namespace: str = ""
 ) -> Iterator[Viewer]:
-    """Run a viewer during the block; ``show`` receives the line with its address.
+    """Run a viewer during the block; ``show`` receives the line with the viewer address.
 
-    If the viewer ends early, the block continues, and a line at the end of the block reports it.
+    If the viewer ends early, the block continues, and a line at its end reports this.
 
     Parameters
     ----------
     parameters
         Viewer parameters, by name.
     show
-        Shows a line to the user.
+        Function that shows a line to the user.
     namespace
         Namespace of the stack.
 

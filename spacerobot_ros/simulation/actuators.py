@@ -37,13 +37,13 @@ from spacerobot_ros.simulation.plant import InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _FAULT_TIME_ROUNDING = 1e-6
-"""Allowed rounding error in a fault time, as a share of a tick."""
+"""Allowed rounding error in a fault time, as a fraction of a tick."""
 
 _MIN_STEP = 1e-5
-"""Shortest Runge-Kutta step, s; shorter steps add more rounding than accuracy."""
+"""Shortest Runge-Kutta step, s; shorter steps increase rounding errors more than accuracy."""
 
 _MAX_STEPS_PER_TICK = 1e6
-"""Largest number of Runge-Kutta steps in a tick; more would take minutes."""
+"""Largest number of Runge-Kutta steps in a tick; with more steps, a tick would take minutes."""
 
 
 class ThrusterPlant(WrappedPlant):
@@ -53,22 +53,22 @@ class ThrusterPlant(WrappedPlant):
     momentum balance stays exact. Attributes in addition to those of :class:`Plant`:
 
     ``wrench``
-        (6,) mean force (N) over torque (N m) of the thrusters in the last tick, at the base link
+        (6,) mean force (N) and torque (N m) of the thrusters in the last tick, at the base link
         origin, in base components.
     ``on_time``, ``duty``, ``thrust``
-        (m,) total on-time of each thruster (s), and its duty cycle and mean force (N) in the last
-        tick.
+        (m,) total on-time of each thruster (s), and its duty cycle (0 to 1) and mean force (N) in
+        the last tick.
     ``propellant``
-        Total consumption, kg. It does not change the robot mass.
+        Total consumption, kg; the robot mass does not change.
     ``modulator``
         The flight software that opens and closes the thrusters, and counts pulses and unmet
         wrenches.
     ``thruster_health``, ``stuck_on``
-        (m,) real over nominal thrust (1 unless set), and whether a thruster is stuck open. The
-        allocation ignores both; see :meth:`.ThrusterModulator.exclude`.
+        (m,) ratio of actual to nominal thrust (1 unless set), and whether a thruster is stuck open.
+        The allocation ignores both attributes; see :meth:`.ThrusterModulator.exclude`.
     ``wrench_fault``
-        Factor (6,) on the thruster wrench, and wrench (6,) added to it; None: no fault. The
-        modulation ignores it.
+        Factors (6,) by which the thruster wrench is multiplied, and wrench (6,) added to the
+        product; None if there is no fault. The modulation ignores it.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class ThrusterPlant(WrappedPlant):
     Raises
     ------
     ParameterError
-        There is no thruster with an excluded name.
+        There is no thruster with the name of an excluded thruster.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class ThrusterPlant(WrappedPlant):
         self.wrench_fault: tuple[Array, Array] | None = None
 
     def reset(self) -> None:
-        """Return to the initial state with thrusters off; totals and counters continue."""
+        """Return to the initial state with thrusters off; totals and counters are kept."""
         super().reset()
         self.modulator.reset()
         self.wrench[:] = self.duty[:] = self.thrust[:] = 0.0
@@ -148,9 +148,9 @@ class ThrusterPlant(WrappedPlant):
 class PlantWithFaults(WrappedPlant):
     """A :class:`Plant` with scheduled actuator faults and disturbances.
 
-    It shares the wrapped plant's state arrays. A reset preserves the time, the faults and the
-    disturbances. A tick without faults costs one comparison. Until the first disturbance, the plant
-    steps without external loads.
+    This plant shares the wrapped plant's state arrays. A reset preserves the time, the faults and
+    the disturbances. A tick without faults requires only one additional comparison. Until the first
+    disturbance begins, the plant steps without external loads.
 
     Bias and noise are added to a joint command, which is then scaled if the joint is slow; a
     stuck joint is held in place (:meth:`Plant.hold`). Wrench faults act on the commanded wrench, or
@@ -165,7 +165,7 @@ class PlantWithFaults(WrappedPlant):
     control_period
         Duration of a tick, s.
     wrench
-        Whether steps accept a wrench.
+        Whether the plant accepts a wrench on its base.
     seed
         Seed of the actuator noise.
     disturbances
@@ -192,10 +192,10 @@ class PlantWithFaults(WrappedPlant):
     ) -> None:
         super().__init__(plant)
         self.thrusters = plant if isinstance(plant, ThrusterPlant) else None
-        """The wrapped plant with thrusters; None: none are modelled."""
+        """The wrapped plant with thrusters; None if thrusters are not modelled."""
         inner = plant if self.thrusters is None else self.thrusters.plant
         self.capturing = inner if isinstance(inner, CapturePlant) else None
-        """The plant that captures the target; None: there is no target."""
+        """The plant that captures the target; None if there is no target."""
         nozzles = self.thrusters.table.names if self.thrusters is not None else ()
         targets = FaultTargets(plant.robot.joint_names, wrench, nozzles)
         self.timeline = Timeline(faults, lambda line, now: parse_fault(line, targets, now))
@@ -370,8 +370,8 @@ class PlantKind:
     Attributes
     ----------
     plant
-        Class; its arguments are the robot, control period (s), initial state and integration step
-        (s).
+        The plant class, whose arguments are the robot, control period (s), initial state and
+        integration step (s).
     integration_step
         Default maximum Runge-Kutta step, s.
     wrench
@@ -402,7 +402,7 @@ def build_plant(
     config
         The plant parameters.
     initial
-        Initial state, if it differs from the configuration.
+        Initial state, if it differs from the one in the configuration.
 
     Raises
     ------

@@ -1,9 +1,11 @@
-"""A free-floating target and its capture: an inelastic impact, then one body.
+"""A free-floating target and its capture: an inelastic impact, after which the target moves with
+the robot as one body.
 
 Until the capture, the robot and the target move independently, each with its own momenta. The
-capture (:mod:`spacerobot_ros.model.grasp`) occurs between two ticks. The plant then integrates
-the joined robot, whose momenta are the sum of both, unaffected by rounding errors of the impact. A
-release separates them without changing their poses or velocities.
+capture (:mod:`spacerobot_ros.model.grasp`) occurs between two ticks. The plant then integrates the
+robot and the target as one system. The total momenta are exactly the sums of the momenta of the
+robot and the target, without rounding errors from the impact. A release separates the robot and the
+target without changing poses or velocities.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ _GENERIC_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9]
 
 
 def load_target(config: TargetConfig) -> RobotDescription | None:
-    """Return the configured target; None: it has none.
+    """Return the configured target; None if there is no target.
 
     Raises
     ------
@@ -76,7 +78,7 @@ def load_target(config: TargetConfig) -> RobotDescription | None:
 
 def target_parameters(text: str) -> dict[str, Any]:
     """Return the plant's target parameters from the URDF string of a loaded target, whose joints
-    are already held.
+    are already locked.
     """
     return {"target.robot_description": text, "target.joint_positions": []}
 
@@ -89,7 +91,7 @@ class Target:
     description
         The body.
     inertia
-        Its mass properties in its root link frame T.
+        Mass properties in the root link frame T.
     grapple
         Grapple frame pose in T.
     initial
@@ -134,7 +136,7 @@ class Target:
 
     @property
     def momenta(self) -> Array:
-        """Linear over angular momentum (6,) about its centre of mass, in W."""
+        """Linear and angular momentum (6,) about its centre of mass, in W."""
         return self._plant.expected_momenta
 
     def reset(self) -> None:
@@ -147,13 +149,13 @@ class Target:
         self._plant.reset()
 
     def load(self, loads: PlantLoads) -> None:
-        """Apply the surroundings in the robot's loads from now on, at their time; wrenches on robot
-        links do not act on the target.
+        """From now on, also apply the robot's orbit or table loads to the target; wrenches on
+        robot links do not act on the target.
 
         Raises
         ------
         ParameterError
-            The target would not stay on the table.
+            The target would leave the table plane.
         """
         loads.surroundings.require_flat(self.description.name, self.motion, self.inertia)
         if loads.surroundings.has_loads:
@@ -187,10 +189,10 @@ class CaptureReport:
     R_WB
         Base link attitude (3, 3).
     momenta
-        Linear over angular momentum (6,) of the robot and the target, about their common centre of
+        Linear and angular momentum (6,) of the robot and the target, about their common centre of
         mass, in W.
     residual
-        Relative difference between these momenta and the sum over the joined bodies after the
+        Relative difference between the total momenta and the sum over the joined bodies after the
         impact.
     requested
         Whether the capture was requested rather than automatic.
@@ -207,7 +209,7 @@ class CaptureReport:
     joint_impulse_limit: float = 0.0
 
     def to_values(self) -> dict[str, Any]:
-        """Return the object ``capture`` of ``spacerobot run --json``; vectors are in W."""
+        """Return the ``capture`` object printed by ``spacerobot run --json``; vectors are in W."""
         impact = self.impact
         return {
             "captured": True,
@@ -226,7 +228,8 @@ class CaptureReport:
         }
 
     def event(self, time_s: float) -> Event:
-        """Return the capture event; it is a warning if a joint impulse exceeds its limit."""
+        """Return the capture event, which is a warning if a joint impulse exceeds the limit of its
+        joint."""
         impact, limit = self.impact, self.joint_impulse_limit
         force, moment = np.linalg.norm(impact.impulse[:3]), np.linalg.norm(impact.impulse[3:])
         message = (
@@ -264,7 +267,8 @@ class ReleaseReport:
 
 
 def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values of :meth:`CaptureReport.to_values` from its event; empty for other events.
+    """Return the values of :meth:`CaptureReport.to_values` from a capture event; empty for other
+    events.
 
     Numbers are restored exactly.
     """
@@ -277,8 +281,8 @@ def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
 class CapturePlant(WrappedPlant):
     """A plant with a target that it can capture and release.
 
-    It has its own state arrays: the robot's state, alone or joined with the target, is copied into
-    them after each tick. Links, joints and commands are unchanged.
+    This plant has its own state arrays: the robot's state, alone or joined with the target, is
+    copied into them after each tick. Links, joints and commands are unchanged.
 
     Attributes
     ----------
@@ -289,7 +293,7 @@ class CapturePlant(WrappedPlant):
     target_twist
         (6,) linear (m/s) and angular velocity (rad/s) of the root link, in its frame.
     payload
-        The held target; None: it floats freely.
+        The held target; None if the target floats freely.
     reports
         Captures and releases since the list was last cleared.
 
@@ -359,7 +363,7 @@ class CapturePlant(WrappedPlant):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial value plus all impulses."""
+        """Linear and angular momentum (6,) in W: the initial value plus all impulses."""
         return self._momenta
 
     def hold(self, joints: Flags) -> None:
@@ -368,8 +372,9 @@ class CapturePlant(WrappedPlant):
         self.plant.hold(joints)
 
     def load(self, loads: PlantLoads) -> None:
-        """Apply external loads to the robot from now on, whether or not it holds the target; their
-        values may change before each step. Surroundings also act on a free target.
+        """Apply external loads to the robot from now on, whether or not the robot holds the target;
+        the load values may change before each step. Orbit and table loads also act on a free
+        target.
         """
         self._loads = loads
         self.target.load(loads)
@@ -386,14 +391,14 @@ class CapturePlant(WrappedPlant):
         self._update()
 
     def resume(self, state: InitialState, payload: Payload | None, body: BodyMotion) -> None:
-        """Continue from a later state in a flight.
+        """Continue from a later state of a flight.
 
         Parameters
         ----------
         state
             Robot state; its momenta include the held body.
         payload
-            The body that the robot holds; None: the target floats freely.
+            The body that the robot holds; None if the target floats freely.
         body
             Target motion.
 
@@ -458,7 +463,7 @@ class CapturePlant(WrappedPlant):
     # -- captures -----------------------------------------------------------------------------
 
     def approach(self) -> RelativeMotion:
-        """Return the current grapple frame motion relative to the end-effector."""
+        """Return the current motion of the grapple frame relative to the end-effector."""
         end_effector = frame_motion(self.robot, self.link, self._motion())
         return RelativeMotion.between(end_effector, self._body().at(self.target.grapple))
 
@@ -472,7 +477,7 @@ class CapturePlant(WrappedPlant):
         """
         if self.payload is not None:
             raise CommandError(
-                f"'{self.link}' holds the target '{self.target.description.name}' already: call "
+                f"'{self.link}' already holds the target '{self.target.description.name}': call "
                 "'~/release' first."
             )
         misses = self._config.misses(self.approach())

@@ -1,6 +1,7 @@
-"""Plant clearance during flight: the smallest distance between links, and contacts.
+"""Clearance of a plant during a flight: the smallest distance between links, and contacts.
 
-An exact plant has no contact forces: it moves through contacts and reports them.
+A plant without MuJoCo has no contact forces: its robot moves through contacts, and the plant
+reports them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from spacerobot_ros.simulation.capture import CapturePlant
 _OK, _ERROR = 0, 2
 
 _OBSTACLE = "obstacle"
-"""Value of key ``second_is`` if the second of a pair is an obstacle."""
+"""Value of key ``second_is`` if the second link of a pair is an obstacle."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +98,10 @@ class ClearanceMonitor:
     Parameters
     ----------
     geometry
-        The robot's solids, with at least one pair, and exact distances.
+        The robot's solids; this geometry must contain at least one pair and compute exact
+        distances.
     links
-        The links, in pose order.
+        The links, in the order of their poses.
     has_contact_forces
         Whether bodies in contact exert forces on each other; used in event messages.
     """
@@ -128,10 +130,10 @@ class ClearanceMonitor:
         capturing: CapturePlant | None = None,
         has_contact_forces: bool = False,
     ) -> ClearanceMonitor | None:
-        """Return a robot's monitor; None: no links can touch.
+        """Return a robot's monitor; None if no links can touch.
 
-        ``before`` is the monitor of the previous obstacles, whose contacts continue or end. While
-        the target of ``capturing`` is free, only the end-effector body may touch it. If the
+        ``before`` is the monitor for the previous obstacles, whose contacts either continue or end.
+        While the target of ``capturing`` is free, only the end-effector body may touch it. If the
         package coal is not installed, a warning is logged and the result is None.
         """
         geometry = CollisionGeometry(robot)

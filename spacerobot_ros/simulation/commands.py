@@ -1,9 +1,10 @@
-"""Command validation: the rules by which a plant accepts commands, for its node and for bags.
+"""Command validation: the rules by which a plant accepts commands, used by its node and for
+checking bags.
 
-A command comes from a *source* (one topic) with values and the stamp of a state.
+A command comes from a *source* (one topic) and consists of values and the stamp of a state.
 In lockstep, the first command with a tick's stamp applies to that tick; if it is refused, the
 joints rest during the tick. In real time, a command may carry the stamp of any recent state, and
-remains in force until the timeout; only one publisher may command.
+remains active until the timeout; only one publisher may send commands.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ NO_STAMP = -math.inf
 
 
 _START_TIME = 1.0
-"""Time after the start during which a zero stamp means the first state, without a timeout, s."""
+"""Duration, in s, for which a zero stamp refers to the first state if there is no timeout."""
 
 _STAMP_ROUNDING = 1_000
 """Allowed rounding error in stamps from commanders with floating-point time, ns."""
@@ -38,7 +39,7 @@ _STAMP_ROUNDING = 1_000
 _OUTDATED_STATE_CLAUSE = "it is for a state before the last start, reset or stop of the plant"
 
 _BRAKING_RATE = 20.0
-"""Joint rates decay as exp(-20 t/s) while the motors are strong enough."""
+"""Joint rates decay as exp(-20 t), with t in s, while the motors are strong enough."""
 
 _MAX_RATE_PER_TICK = 0.5
 """A held effort must not stop a joint in less than two ticks, or the joint would swing back."""
@@ -47,10 +48,10 @@ Quantity = Literal["velocity", "effort", "wrench"]
 
 
 class Reason(str, Enum):
-    """Reason for refusing a command; parameters and diagnostics contain its value."""
+    """Reason for refusing a command; its value appears in parameters and diagnostics."""
 
     MALFORMED = "malformed"
-    """Unknown or missing joints, wrong lengths, or another frame."""
+    """Unknown or missing joints, wrong lengths, or a wrong frame."""
     NOT_FINITE = "not_finite"
     STALE = "stale"
     EARLY = "early"
@@ -58,10 +59,10 @@ class Reason(str, Enum):
     UNKNOWN_STATE = "unknown_state"
     """Stamped between two ticks."""
     OUT_OF_ORDER = "out_of_order"
-    """Stamped before the command in force."""
+    """Stamped before the active command."""
     BEYOND_LIMITS = "beyond_limits"
     SECOND_COMMANDER = "second_commander"
-    """Another node has already commanded for the same state."""
+    """Another node has already sent a command for the same state."""
     LATCHED = "latched"
     """A fault is latched: nothing moves until the plant is rearmed."""
 
@@ -75,7 +76,7 @@ class Refusal:
     reason
         Its reason.
     clause
-        The reason as text, with numbers and names; it completes "the command was refused:".
+        The reason as a clause, with numbers and names; it completes "the command was refused:".
     latches
         Whether the refusal latched a fault: nothing moves until the plant is rearmed.
     """
@@ -97,13 +98,13 @@ class CommandSource:
     limits
         (size,) maximum magnitude of each value.
     kept
-        Indices of the values that stay in force if a command is revoked: reaction wheel rates,
+        Indices of the values that stay active if a command is revoked: reaction wheel rates,
         because stopping the wheels would rotate the base.
     command
-        (size,) command in force: for the joints (m/s, rad/s, N or N m), or force (N) over torque (N
+        (size,) active command: for the joints (m/s, rad/s, N or N m), or force (N) and torque (N
         m) at the base link origin, in base components.
     stamp_ns
-        Stamp of the command in force; :data:`NO_STAMP`: there is none.
+        Stamp of the active command; :data:`NO_STAMP` if there is none.
     arrived
         Whether the command for this tick has arrived, accepted or not (lockstep).
     resting
@@ -111,7 +112,7 @@ class CommandSource:
     required
         Whether a lockstep plant waits for this source's commands.
     commanders
-        Known number of publishers on the topic.
+        Number of known publishers on the topic.
     """
 
     def __init__(
@@ -130,7 +131,7 @@ class CommandSource:
         self.commanders = 1
 
     def rest(self) -> None:
-        """Revoke the command in force."""
+        """Revoke the active command."""
         kept = self.command[self.kept]
         self.command[:] = 0.0
         self.command[self.kept] = kept
@@ -138,7 +139,7 @@ class CommandSource:
         self.resting = True
 
     def accept(self, values: Array, stamp_ns: float) -> None:
-        """Bring a command into force."""
+        """Activate a command."""
         self.command[:] = values
         self.stamp_ns = stamp_ns
         self.arrived = True
@@ -153,7 +154,7 @@ class CommandValidator:
     plant
         The commanded plant.
     config
-        Its configuration: time mode, timeout, limits, and the reasons that latch a fault.
+        The plant configuration: time mode, timeout, limits, and the reasons that latch a fault.
 
     Raises
     ------
@@ -165,7 +166,7 @@ class CommandValidator:
         robot = plant.robot
         kept = ReactionWheels.of(robot.description).index
         self.sources = [CommandSource("joint_commands", "velocity", robot.velocity_limit, kept)]
-        """Sources in the order of a step's arguments: joints first."""
+        """Sources in the order of the step arguments: joints first."""
         self._brakes: _JointBrakes | None = None
         if config.actuation == "effort":
             self.sources = [
@@ -184,9 +185,10 @@ class CommandValidator:
         self.counts: Counter[Reason] = Counter()
         """Number of refused commands by reason."""
         self.fault = ""
-        """The latched fault, as a clause; empty: none."""
+        """The latched fault, as a clause; empty if there is none."""
         self.fault_reason = ""
-        """Reason for that fault: the value of a :class:`Reason`, ``abort``, or ``watchdog``."""
+        """Reason for the latched fault: the value of a :class:`Reason`, ``abort``, or
+        ``watchdog``."""
         self.timed_out = False
         """Whether the last command was revoked because it was too old."""
         self.timeouts = 0
@@ -211,7 +213,7 @@ class CommandValidator:
 
     @property
     def in_force(self) -> bool:
-        """Whether a command from any source is in force."""
+        """Whether a command from any source is active."""
         return any(source.stamp_ns != NO_STAMP for source in self.sources)
 
     def accept_or_refuse(
@@ -226,13 +228,13 @@ class CommandValidator:
         stamp_ns
             Its stamp.
         values
-            Its values, or the error in a malformed message.
+            Its values, or the error if the message is malformed.
         now_ns
             Simulated time of the plant's state.
 
         Returns
         -------
-        Refusal or None The refusal; None: the command is in force.
+        Refusal or None The refusal; None if the command was accepted.
         """
         unset = False
         if self._lockstep:
@@ -266,8 +268,8 @@ class CommandValidator:
         return refusal
 
     def unreadable(self, source: CommandSource, error: CommandError, now_ns: int) -> Refusal:
-        """Refuse bytes that cannot be decoded as a message; without a stamp, they belong to no
-        tick."""
+        """Refuse bytes that cannot be decoded as a message; since they have no stamp, they belong
+        to no tick."""
         return self._refuse(source, Refusal(Reason.MALFORMED, str(error)), now_ns)
 
     def begin_step(self) -> list[Array]:
@@ -298,7 +300,7 @@ class CommandValidator:
             source.arrived = False
 
     def latch(self, reason: str, clause: str, now_ns: int) -> None:
-        """Bring everything to rest until :meth:`rearm`; of several faults, the first is reported.
+        """Bring everything to rest until :meth:`rearm`; the first of several faults is reported.
 
         Commands for states before the fault are refused even after :meth:`rearm`.
 
@@ -319,12 +321,12 @@ class CommandValidator:
             source.rest()
 
     def rearm(self) -> str:
-        """Accept commands again; return the latched fault; empty: there was none."""
+        """Accept commands again, and return the latched fault; empty if there was none."""
         fault, self.fault, self.fault_reason = self.fault, "", ""
         return fault
 
     def require_commanded(self) -> None:
-        """Wait for wrench commands only while a node publishes them; joint commands are always
+        """Require wrench commands only while a node publishes them; joint commands are always
         awaited."""
         for source in self.sources[1:]:
             source.required = source.commanders > 0
@@ -334,7 +336,7 @@ class CommandValidator:
                 source.arrived = False
 
     def drop_old(self, now_ns: int) -> list[CommandSource]:
-        """Revoke commands older than the timeout; return their sources."""
+        """Revoke commands older than the timeout, and return the sources of these commands."""
         silent, last = [], NO_STAMP
         for source in self.sources:
             age = now_ns - source.stamp_ns
@@ -384,11 +386,12 @@ class CommandValidator:
             )
         late = (source.stamp_ns - stamp_ns) / SECOND
         if late > 0:
-            return Refusal(Reason.OUT_OF_ORDER, f"it is {late:.3g} s older than the one in force")
+            return Refusal(Reason.OUT_OF_ORDER, f"it is {late:.3g} s older than the active command")
         if late == 0 and source.commanders > 1 and self._one_commander:
             return Refusal(
                 Reason.SECOND_COMMANDER,
-                f"a command for the same state is in force, and {source.commanders} nodes command",
+                f"a command for the same state is active, and {source.commanders} nodes send "
+                "commands",
             )
         return None
 
@@ -405,8 +408,8 @@ def _not_this_tick_clause(stamp_ns: int, now_ns: int) -> Refusal:
     early = stamp_ns > now_ns
     return Refusal(
         Reason.EARLY if early else Reason.STALE,
-        f"it is {'ahead of time' if early else 'stale'}: stamped {stamp_ns / SECOND:.9g} s, the "
-        f"plant is at {now_ns / SECOND:.9g} s",
+        f"it is {'ahead of time' if early else 'stale'}: stamped {stamp_ns / SECOND:.9g} s, while "
+        f"the plant is at {now_ns / SECOND:.9g} s",
     )
 
 

@@ -12,7 +12,7 @@ from spacerobot_ros.parameters import group, nonnegative, parameter
 from spacerobot_ros.times import SECOND
 
 _MAX_SENSOR_ERROR = 1e6
-"""Largest sensor error, m or rad (/s): the squares of much larger errors overflow."""
+"""Largest sensor error, m or rad (/s): the squares of much larger errors would overflow."""
 
 _MAX_INITIAL_VALUE = 1e9
 """Largest initial state value and longest time, SI units."""
@@ -58,39 +58,48 @@ def _time(default: float, description: str) -> Any:
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """Sensor errors: noise (1 sigma), biases, and the seed."""
+    """Sensor errors: noise standard deviations, biases, and the seed."""
 
-    position_noise: float = _noise("1 sigma per axis of odom, in world", "m")
-    attitude_noise: float = _noise("1 sigma per axis of a rotation vector, in base", "rad")
-    velocity_noise: float = _noise("1 sigma per velocity axis", "m/s")
-    angular_velocity_noise: float = _noise("1 sigma per angular velocity axis", "rad/s")
+    position_noise: float = _noise("1 sigma of the odom position, per world axis", "m")
+    attitude_noise: float = _noise(
+        "1 sigma of the attitude, per axis of a rotation vector in the base frame", "rad"
+    )
+    velocity_noise: float = _noise("1 sigma of the linear velocity, per axis", "m/s")
+    angular_velocity_noise: float = _noise("1 sigma of the angular velocity, per axis", "rad/s")
     joint_noise: float = _noise("1 sigma of every joint position", "m or rad")
-    joint_rate_noise: float = _noise("of every joint velocity", "m/s or rad/s")
-    position_bias: tuple[float, ...] = _bias("of odom, in world", "m")
-    attitude_bias: tuple[float, ...] = _bias("rotation vector in base", "rad")
-    joint_bias: tuple[float, ...] = _bias("in URDF joint order; []: none", "m or rad", ())
-    seed: int = nonnegative(0, "of the sensor and actuator noise")
+    joint_rate_noise: float = _noise("1 sigma of every joint velocity", "m/s or rad/s")
+    position_bias: tuple[float, ...] = _bias("bias of the odom position, in world axes", "m")
+    attitude_bias: tuple[float, ...] = _bias(
+        "bias of the attitude, as a rotation vector in the base frame", "rad"
+    )
+    joint_bias: tuple[float, ...] = _bias("biases in URDF joint order; []: none", "m or rad", ())
+    seed: int = nonnegative(0, "seed of the sensor and actuator noise")
 
 
 @dataclass(frozen=True)
 class TargetSensorConfig:
-    """Errors in target/odom: noise (1 sigma), biases, delay, loss and rate."""
+    """Errors in target/odom: noise standard deviations, biases, delay, loss and rate."""
 
-    position_noise: float = _noise("1 sigma per axis of target/odom", "m")
+    position_noise: float = _noise("1 sigma of the position in target/odom, per axis", "m")
     attitude_noise: float = _noise(
-        "1 sigma per axis of a rotation vector, in the root link frame", "rad"
+        "1 sigma of the attitude, per axis of a rotation vector in the root link frame", "rad"
     )
-    velocity_noise: float = _noise("1 sigma per velocity axis", "m/s")
-    angular_velocity_noise: float = _noise("1 sigma per angular velocity axis", "rad/s")
-    position_bias: tuple[float, ...] = _bias("of target/odom, in the rotating root link frame", "m")
-    attitude_bias: tuple[float, ...] = _bias("rotation vector in the same frame", "rad")
+    velocity_noise: float = _noise("1 sigma of the linear velocity, per axis", "m/s")
+    angular_velocity_noise: float = _noise("1 sigma of the angular velocity, per axis", "rad/s")
+    position_bias: tuple[float, ...] = _bias(
+        "bias of the position in target/odom, in the rotating root link frame", "m"
+    )
+    attitude_bias: tuple[float, ...] = _bias(
+        "bias of the attitude, as a rotation vector in the root link frame", "rad"
+    )
     delay: float = nonnegative(
         0.0, "age of the state in target/odom, in whole ticks", "s", maximum=60.0
     )
     loss: float = nonnegative(0.0, "fraction of measurements lost at random", maximum=1.0)
     rate: float = nonnegative(
         0.0,
-        "measurements per second, a whole number of ticks apart; 0: one every tick",
+        "number of measurements per second; the interval must be a whole number of ticks; 0: one "
+        "every tick",
         "Hz",
         maximum=100000.0,
     )
@@ -105,18 +114,20 @@ class TargetConfig:
         "", "URDF of the target as a string; takes precedence over 'target.robot'"
     )
     joint_positions: tuple[float, ...] = _initial(
-        "locked target joint positions, in its URDF joint order; []: zero",
+        "positions of the locked target joints, in the joint order of the target's URDF; []: zero",
         "m or rad",
         (),
         length=None,
     )
-    grapple_frame: str = parameter("grapple", "target link at which it is captured")
+    grapple_frame: str = parameter("grapple", "link of the target at which it is captured")
     position: tuple[float, ...] = _initial(
         "initial position of the target's root link in the world", "m"
     )
-    orientation: tuple[float, ...] = _orientation("its initial orientation, quaternion x, y, z, w")
-    velocity: tuple[float, ...] = _initial("of its root link origin, in world", "m/s")
-    angular_velocity: tuple[float, ...] = _initial("in world", "rad/s")
+    orientation: tuple[float, ...] = _orientation("initial orientation, quaternion x, y, z, w")
+    velocity: tuple[float, ...] = _initial(
+        "velocity of the origin of the target's root link, in the world frame", "m/s"
+    )
+    angular_velocity: tuple[float, ...] = _initial("angular velocity, in the world frame", "rad/s")
 
     sensors: TargetSensorConfig = group(TargetSensorConfig())
 
@@ -137,7 +148,9 @@ class CaptureConfig:
         choices=("manual", "automatic"),
     )
     end_effector: str = parameter(
-        "", "link that captures; '': end_effector_frame, or 'end_effector'"
+        "",
+        "link that captures the target; '': the link in end_effector_frame or, if that is "
+        "empty, 'end_effector'",
     )
     distance: float = nonnegative(0.05, "largest distance of the grapple frame from the link", "m")
     angle: float = nonnegative(0.2, "largest angle between the two frames", "rad")
@@ -147,12 +160,13 @@ class CaptureConfig:
     rate: float = nonnegative(0.1, "largest relative angular rate of the two frames", "rad/s")
     joint_impulse_limit: float = nonnegative(
         0.0,
-        "joint impulse above which the capture event is a warning; 0: none",
+        "joint impulse above which the capture event is a warning; 0: no limit",
         "N m s or N s",
     )
 
     def misses(self, approach: RelativeMotion) -> list[str]:
-        """Return a clause for each quantity beyond its limit; empty: a capture is possible."""
+        """Return a clause for each quantity that exceeds its limit; none if a capture is
+        possible."""
         return [
             f"{name} is {value:.4g} {unit}, {value - limit:.4g} {unit} more than "
             f"'capture.{name}', {limit:g}"
@@ -177,11 +191,11 @@ class OrbitConfig:
         maximum=_MAX_INITIAL_VALUE,
     )
     mean_motion: float = nonnegative(
-        0.0, "mean motion of the orbit, instead of altitude", "rad/s", maximum=100.0
+        0.0, "mean motion of the orbit; can be set instead of altitude", "rad/s", maximum=100.0
     )
     orientation: tuple[float, ...] = _orientation(
-        "of the orbital frame in the world at time zero (x radially outward, z along the orbit "
-        "normal), quaternion x, y, z, w"
+        "orientation of the orbital frame in the world at time zero (x radially outward, z along "
+        "the orbit normal), quaternion x, y, z, w"
     )
 
 
@@ -192,7 +206,7 @@ class TableConfig:
     tilt: float = nonnegative(0.0, "tilt of the table", "rad", maximum=1.5707963)
     direction: float = parameter(
         0.0,
-        "downhill direction in the x-y plane, from x",
+        "downhill direction in the x-y plane, as an angle from the x axis",
         "rad",
         minimum=-6.2831854,
         maximum=6.2831854,
@@ -237,7 +251,8 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     second_commander: str = parameter(
         "refuse",
-        "realtime: handling of a second command for one state while several nodes publish commands",
+        "realtime: how a second command for the same state is handled if several nodes publish "
+        "commands",
         choices=("refuse", "accept"),
     )
     latched_faults: str = parameter(
@@ -250,13 +265,22 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "reaction to a silent commander: report only, or also latch a fault",
         choices=("report", "latch"),
     )
-    integration_step: float = _time(0.0, "maximum step; 0: 0.01 (velocity), 0.001 (effort)")
-    thrusters: str = parameter("", "'urdf': the robot's URDF; or a YAML file; '': any wrench")
+    integration_step: float = _time(
+        0.0,
+        "maximum integration step; 0: 0.01 s (velocity actuation) or 0.001 s (effort actuation)",
+    )
+    thrusters: str = parameter(
+        "",
+        "source of the thruster table: 'urdf' (the robot's URDF) or a YAML file; "
+        "'': no thrusters, any wrench is realised",
+    )
     thrusters_excluded: str = parameter("", "space-separated names of disabled thrusters")
     world_frame: str = parameter("world", "name of the inertial frame")
-    end_effector_frame: str = parameter("", "link of end_effector_pose; '': 'end_effector', if any")
+    end_effector_frame: str = parameter(
+        "", "link whose pose is published on end_effector_pose; '': 'end_effector', if it exists"
+    )
     end_effectors: tuple[str, ...] = parameter(
-        (), "links with measured poses published on NAME/pose", texts=True
+        (), "links whose measured poses are published on NAME/pose", texts=True
     )
     base_pose_period: float = _time(
         0.0, "simulated time between poses; 0: every tick. Realtime: at most 0.5 s of wall time"
@@ -270,17 +294,18 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     )
     tf_links: bool = parameter(
         True,
-        "whether all links are on /tf; false: only the base, for use with robot_state_publisher",
+        "whether the transforms of all links are published on /tf; false: only that of the base, "
+        "for use with robot_state_publisher",
     )
     frame_prefix: str = parameter(
         "",
-        "prefix for the robot's frames, such as 'robot_1/', but not for world_frame. '': none, or "
-        "'robot/' if a link is named like world_frame",
+        "prefix for the names of the robot's frames, such as 'robot_1/'; world_frame gets no "
+        "prefix. '': none, or 'robot/' if a link is named like world_frame",
     )
     diagnostics_period: float = _time(
         1.0,
-        "simulated time between diagnostics; 0: none. Realtime: at least once a second of wall "
-        "time; a paused plant: once a second of wall time",
+        "simulated time between diagnostics; 0: none. Realtime: at least once per second of wall "
+        "time; a paused plant publishes once per second of wall time",
     )
     clearance_period: float = _time(
         1.0,
@@ -288,22 +313,27 @@ class PlantConfig(WatchdogConfig, RobotConfig):
         "Realtime: at most 0.5 s of wall time",
     )
     resume_bag: str = parameter(
-        "", "bag whose last state and time the plant continues from; '': the initial state"
+        "", "bag from whose last state and time the plant continues; '': the initial state"
     )
-    initial_position: tuple[float, ...] = _initial("base link in the world", "m")
+    initial_position: tuple[float, ...] = _initial("position of the base link in the world", "m")
     initial_orientation: tuple[float, ...] = _orientation("quaternion x, y, z, w")
     initial_joint_positions: tuple[float, ...] = _initial(
-        "in URDF joint order; []: zero", "m or rad", (), length=None
+        "joint positions in URDF joint order; []: zero", "m or rad", (), length=None
     )
     initial_joint_velocities: tuple[float, ...] = _initial(
-        "in URDF joint order, under efforts; []: zero", "m/s or rad/s", (), length=None
+        "joint velocities in URDF joint order, for effort actuation only; []: zero",
+        "m/s or rad/s",
+        (),
+        length=None,
     )
     initial_center_of_mass: tuple[float, ...] = _initial(
-        "of the system in the world, instead of initial_position", "m", ()
+        "position of the system's centre of mass in the world, instead of initial_position", "m", ()
     )
-    linear_momentum: tuple[float, ...] = _initial("total, in world", "kg m/s")
+    linear_momentum: tuple[float, ...] = _initial(
+        "total linear momentum, in the world frame", "kg m/s"
+    )
     angular_momentum: tuple[float, ...] = _initial(
-        "total, about the centre of mass, in world", "kg m^2/s"
+        "total angular momentum about the centre of mass, in the world frame", "kg m^2/s"
     )
     faults: tuple[str, ...] = parameter(
         (), "fault lines, e.g. 'joint_stuck joint_2 at 10 until 50'; see docs/faults.md", texts=True
@@ -323,8 +353,8 @@ class PlantConfig(WatchdogConfig, RobotConfig):
     def decided(self, actuation: str = "") -> PlantConfig:
         """Return the configuration with ``auto`` replaced by an actuation mode.
 
-        ``actuation`` is the command type; empty: velocities, unless thrusters or moving joints
-        require efforts.
+        ``actuation`` is the command type; empty selects velocities, unless thrusters or moving
+        joints require efforts.
         """
         if self.actuation != "auto":
             return self

@@ -1,24 +1,25 @@
 """The effort-driven plant: free-flying dynamics under joint efforts and a base wrench.
 
-One tick is one compiled function: limits, integration, and all published quantities. The
-total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust and
-external loads they are constant to the last bit. A tick in which a joint touches a limit is
-repeated with inelastic stops.
+Each tick is computed by one compiled function: limits, integration, and all published quantities.
+The total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust and
+external loads they are constant to the last bit. If a joint reaches a limit during a tick, the tick
+is repeated with inelastic stops.
 
-A stop acts between the two links of its joint, along the joint's coordinate: as an internal force,
-it leaves both total momenta unchanged; the other joints and the base react. With ``K`` the
-inertia matrix of the configuration, stops do two things:
+A stop acts between the two links of its joint, along the joint's coordinate. Because this force is
+internal, it leaves both total momenta unchanged; the other joints and the base react. ``K`` is the
+inertia matrix in the configuration. Stops have two effects:
 
 * Arrival: ``qdot+`` is nearest to ``qdot-``, in the metric of K, among all rates that violate no
   limit. The joint does not rebound; the energy ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` is lost
   (Carnot). The time of arrival is exact up to rounding.
-* Holding: a joint on its stop stays there through an integration step if it is pushed outwards,
-  that is, if its rate is zero in the admissible rates nearest to ``qdot + h K^-1 Q`` (Gauss's
-  principle of least constraint over a step, Moreau's time stepping). It leaves with a delay of at
-  most one step, which ends the sequence of ever shorter rebounds between joints that push each
-  other off their stops.
+* Holding: a joint that is on its stop stays there during an integration step if it is pushed
+  outwards.
+  This is the case if its rate is zero in the admissible rates nearest to ``qdot + h K^-1 Q``
+  (Gauss's principle of least constraint over a step, Moreau's time stepping). The joint leaves its
+  stop with a delay of at most one step. This delay ends the sequence of ever shorter rebounds
+  between joints that push each other off their stops.
 
-A locked joint (a brake, a jam) is brought to rest by the same kind of impulse and held.
+A locked joint (by a brake or a jam) is brought to rest by the same kind of impulse and held.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 BISECTIONS = 40
-"""Bisection steps for the arrival time: the error is 1e-12 of an integration step."""
+"""Number of bisection steps for the arrival time: the error is 1e-12 of an integration step."""
 
 _STOP_TOLERANCE = 1e-12
-"""Distance beyond a limit at which a joint is considered outside: relative, or absolute (m or rad)
-for limits below one."""
+"""Distance beyond a limit at which a joint is considered out of range: relative, or absolute (m or
+rad) for limits below one."""
 
 
 FAILURES = tuple(
@@ -61,7 +62,8 @@ strongly driven joints push each other off their stops ever more often."""
 
 
 class JointStops:
-    """Advances the state of :mod:`spacerobot_ros.model.composite_rigid_body` with stops.
+    """Advances the state of :mod:`spacerobot_ros.model.composite_rigid_body`, and enforces joint
+    stops.
 
     Parameters
     ----------
@@ -70,8 +72,8 @@ class JointStops:
     integration_step
         Longest Runge-Kutta step, s.
     loaded
-        Whether external loads act; if so, the state vector ends with the time and the command
-        vector with the loads.
+        Whether external loads act; if so, the state vector ends with the time, and the command
+        vector ends with the loads.
     """
 
     def __init__(self, robot: SpaceRobot, integration_step: float, *, loaded: bool = False) -> None:
@@ -84,8 +86,8 @@ class JointStops:
 
     @staticmethod
     def limits(robot: SpaceRobot) -> dict[str, Array]:
-        """Return the joint limits (n,), and the limits beyond which joints are considered
-        outside."""
+        """Return the joint limits (n,), and the limits beyond which joints are considered out of
+        range."""
         return {
             "LOWER": robot.lower,
             "UPPER": robot.upper,
@@ -99,7 +101,8 @@ class JointStops:
         """Return the state after ``duration`` s under a constant command, and whether each joint
         (n,) was stopped or held by its stop.
 
-        ``locked`` (n,) joints are brought to rest at once and held at any position.
+        ``locked`` (n,) joints are brought to rest immediately and held at the position where they
+        stop.
 
         Raises
         ------
@@ -184,7 +187,7 @@ class JointStops:
 
 
 def stop_joints(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Array]:
-    """Return the rates (n,) after the impulses that stop some joints, and those impulses (n,).
+    """Return the rates (n,) after the impulses that stop some joints, and the impulses (n,).
 
     ``compliance`` (n, n) is the inverse of K.
     """
@@ -199,9 +202,9 @@ def stop_joints(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, 
 def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags) -> Flags:
     """Return which joints (n,) are brought to rest by their stops, so that ``inward * rates >= 0``.
 
-    ``inward`` is 1 or -1 on a stop and 0 elsewhere. The rates after the impulses are the nearest to
-    the rates before in the metric of K. The linear complementarity problem is solved by Murty's
-    least-index pivoting, which terminates for every positive definite K from any ``guess``.
+    ``inward`` is 1 or -1 on a stop and 0 elsewhere. The rates after the impulses are those nearest
+    to the previous rates, in the metric of K. The linear complementarity problem is solved by
+    Murty's least-index pivoting, which terminates for every positive definite K from any ``guess``.
     """
     joints = guess.copy()
     tried: set[bytes] = set()
@@ -219,9 +222,9 @@ def joints_stopped(compliance: Array, rates: Array, inward: Array, guess: Flags)
 DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s.
 
-With this step, the energy of a tumbling six-joint arm with joint rates of several rad/s drifts
-by about 1e-12 in 100 s, relative; with four times the step, by 2e-10. A step
-takes a few microseconds.
+With this step, the energy of a tumbling six-joint arm at several rad/s has a relative drift of
+about 1e-12 in 100 s; with steps four times as long, the drift is 2e-10. A step takes a few
+microseconds.
 """
 
 _MAX_FINITE_STATE = 1e100
@@ -229,13 +232,13 @@ _MAX_FINITE_STATE = 1e100
 
 
 class EffortPlant:
-    """A free-flying robot under constant joint efforts and a constant base wrench per tick.
+    """A free-flying robot whose joint efforts and base wrench are constant during each tick.
 
     After :meth:`step`, the attributes are those of :class:`Plant`, where ``effort`` is the last
     tick's effort after clipping, without stop efforts, and
 
     ``wrench``
-        (6,) force (N) over torque (N m) of the last tick at the base link origin, in base
+        (6,) force (N) and torque (N m) of the last tick at the base link origin, in base
         components.
 
     Parameters
@@ -294,12 +297,12 @@ class EffortPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
+        """Linear and angular momentum (6,) in W: the initial value plus thrust and loads."""
         _, _, _, p_W, L_W, _ = state_slices(self.robot.n)
         return self._next_state[p_W.start : L_W.stop]
 
     def reset(self) -> None:
-        """Return to the initial state, with zero efforts; the limit counters continue."""
+        """Return to the initial state, with zero efforts; the limit counters are kept."""
         start, robot = self.initial, self.robot
         self._state[:] = np.concatenate(
             [
@@ -316,7 +319,7 @@ class EffortPlant:
     @property
     def state(self) -> Array:
         """The state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body` from which the
-        next step starts; it may be changed.
+        next step starts; it may be modified in place.
         """
         return self._next_state
 
@@ -342,7 +345,7 @@ class EffortPlant:
         """Advance one tick under joint efforts (n,), clipped to their limits, and under a base
         wrench.
 
-        ``wrench`` (6,) is force (N) over torque (N m) at the base link origin, in base components;
+        ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, in base components;
         it rotates with the base during the tick. A joint that reaches its limit stops
         there without rebound and is held while something pushes it outwards. Returns whether any
         joint was limited; ``effort_limited`` and ``stroke_limited`` count these ticks for each
@@ -402,7 +405,7 @@ def tick_function(
 ) -> ca.Function:
     """Compose the tick from model functions; see :class:`EffortPlant` for its results.
 
-    With ``loaded``, the external load vector is the last input.
+    If ``loaded`` is set, the external load vector is the last input.
     """
     n = robot.n
     parts = state_slices(n)

@@ -5,8 +5,8 @@ A fault is ``KIND TARGET [VALUE] [at SECONDS] [until SECONDS]``, for example
 values. A disturbance is a constant external wrench on a link,
 ``LINK [force X Y Z] [torque X Y Z] [in world|link] [at SECONDS] [until SECONDS]``, for example
 ``hand force 1 0 0 torque 0 0 0.2 in link at 10 until 50``. Force (N) and torque (N m) act at the
-link frame origin, in world or link components; the latter rotate with the link. Without ``at``, a
-fault or disturbance begins immediately; without ``until``, it never ends.
+link frame origin, in world or link components; in link components, they rotate with the link.
+Without ``at``, a fault or disturbance begins immediately; without ``until``, it never ends.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Generic, TypeVar
 from spacerobot_ros.errors import ParameterError
 
 _MAX_FAULT_VALUE = 1e6
-"""Largest fault value, in its unit: the squares of much larger values overflow."""
+"""Largest fault value, in its unit: the squares of much larger values would overflow."""
 
 WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 """Axes of the base wrench, in base components."""
@@ -48,7 +48,7 @@ class FaultKind:
     targets
         Names of targets; ``joint`` and ``nozzle`` stand for all joint and thruster names.
     value
-        Meaning of its value; empty: it takes no value.
+        Meaning of the fault's value; empty if the fault takes no value.
     minimum, maximum
         Range of that number.
     sensor
@@ -111,7 +111,7 @@ class FaultTargets:
     nozzles: Sequence[str] = ()
 
     def of(self, kind: FaultKind) -> list[str]:
-        """Return the targets of a fault kind."""
+        """Return the possible targets of a fault kind."""
         names: list[str] = []
         for target in kind.targets:
             if target == "joint":
@@ -327,7 +327,7 @@ _TIME = re.compile(r"\b(at|until) [\d.e+-]+")
 
 
 def with_seconds(line: str) -> str:
-    """Return a fault or disturbance line with units on its times, for display."""
+    """Return a fault or disturbance line with units added to its times, for display."""
     return _TIME.sub(r"\g<0> s", line)
 
 
@@ -375,7 +375,7 @@ class Timeline(Generic[Entry]):
 
     def inject(self, text: str, now: float) -> None:
         """Add the entries in a string, one per line, or remove all entries (``clear``), including
-        future ones.
+        future entries.
 
         Raises
         ------
@@ -389,7 +389,7 @@ class Timeline(Generic[Entry]):
             self.read(text.splitlines(), now)
 
     def copy_from(self, other: Timeline[Entry]) -> None:
-        """Replace the entries with those of another timeline."""
+        """Replace the entries with the entries of another timeline."""
         self.entries, self.next_change = list(other.entries), -math.inf
 
     def at(self, time: float) -> tuple[Entry, ...]:

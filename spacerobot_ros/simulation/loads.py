@@ -1,4 +1,4 @@
-"""External load values of a plant, and ticks with loads."""
+"""External loads on a plant, and plant ticks under these loads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaterni
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 
 _PLANE_TOLERANCE = 1e-9
-"""Largest component, along the table, of a planar robot's normal."""
+"""Largest component in the table plane of the normal to a planar robot's plane of motion."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Surroundings:
     Attributes
     ----------
     mean_motion
-        Mean motion of the circular orbit, rad/s; zero: no orbit.
+        Mean motion of the circular orbit, rad/s; zero if there is no orbit.
     quaternion_WO
         (4,) attitude (x, y, z, w) of the orbital frame in W at time zero.
     gravity_W
@@ -49,8 +49,8 @@ class Surroundings:
         Raises
         ------
         ParameterError
-            The orbit is specified twice, its orientation is not a quaternion, or there is a table
-            in an orbit.
+            The orbit is specified twice, its orientation is not a quaternion, or both a table and
+            an orbit are set.
         """
         if orbit.altitude and orbit.mean_motion:
             raise ParameterError(
@@ -70,14 +70,14 @@ class Surroundings:
         )
         if found.mean_motion and found.on_table:
             raise ParameterError(
-                "Parameters 'table.*' and 'orbit.*' are both set: a robot is either on a table or "
-                "in an orbit."
+                "Parameters 'table.*' and 'orbit.*' are both set: a robot can be either on a "
+                "table or in an orbit."
             )
         return found
 
     @property
     def on_table(self) -> bool:
-        """Whether table slope or friction acts."""
+        """Whether a table slope or table friction acts."""
         return bool(any(self.gravity_W) or self.friction)
 
     @property
@@ -86,12 +86,12 @@ class Surroundings:
         return bool(self.mean_motion or self.on_table)
 
     def require_suitable(self, robot: SpaceRobot, quaternion_WB: Array) -> None:
-        """Reject a robot that does not fit on the table.
+        """Reject a robot that cannot move in the table plane.
 
         Raises
         ------
         ParameterError
-            The robot is not planar, or with the attitude ``quaternion_WB`` (4,) its plane is not
+            The robot is not planar, or, with the attitude ``quaternion_WB`` (4,), its plane is not
             the table plane.
         """
         if not self.on_table:
@@ -121,8 +121,8 @@ class Surroundings:
         Raises
         ------
         ParameterError
-            It moves out of the plane, or rotates about an axis other than the plane's normal, or
-            about a non-principal axis.
+            The body moves out of the plane, or rotates about an axis other than the plane's normal,
+            or about a non-principal axis.
         """
         if not self.on_table:
             return
@@ -152,8 +152,8 @@ class PlantLoads:
     vector
         All values, in the order of :class:`.LoadLayout`.
     in_link, in_world
-        (L, 6) force (N) over torque (N m) at each link origin, in the order of
-        ``robot.link_names``: in link components, and in W.
+        (L, 6) force (N) and torque (N m) at each link origin, in the order of
+        ``robot.link_names``; one array is in link components, the other in W.
     last
         ``vector`` of the last tick.
     surroundings
@@ -199,7 +199,7 @@ class PlantLoads:
 
 
 class LoadedTick:
-    """A tick with loads, which uses the buffers of the tick without loads.
+    """A tick with loads that uses the buffers of the tick without loads.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ def body_name(link: str) -> str:
 
 
 def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
-    """Return the MuJoCo specification of a robot with a free base, without its geometries.
+    """Return the MuJoCo specification of a robot with a free base, without geometries.
 
     Raises
     ------
@@ -119,13 +119,13 @@ def build_model(
     robot
         The robot.
     target
-        The target, and the link that captures it; None: there is none.
+        The target, and the link that captures it; None if there is no target.
     step
         Step of MuJoCo's Runge-Kutta 4 integrator, s.
     contacts
-        Whether there are contact forces and joint stops, with the masses in the description, which
-        may differ from the URDF; otherwise the robot moves freely, with the model as MuJoCo reads
-        it from the URDF.
+        Whether to model contact forces and joint stops. If so, the masses are taken from the
+        description, and may differ from the masses in the URDF; otherwise, the robot moves freely,
+        and MuJoCo reads its masses from the URDF.
 
     Raises
     ------
@@ -292,7 +292,7 @@ class MujocoLoads:
         """Indices of the link bodies."""
 
     def apply(self, vector: Array, time: float) -> None:
-        """Apply a load vector at a time, s, to all bodies in their current motion.
+        """Apply the load vector at a given time (s) to all bodies, given their current motion.
 
         Body poses and velocities must belong to MuJoCo's current state.
         """
@@ -320,7 +320,7 @@ class MujocoLoads:
             data.xfrc_applied[body] = np.concatenate([force, torque])
 
     def momentum_rates(self, center: Array) -> Array:
-        """Return force and moment (6,) of the last applied loads about a point (3,), in W."""
+        """Return the force, and the moment about a point (3,), of the last loads (6,), in W."""
         F, T = self._data.xfrc_applied[self.bodies].T.reshape(2, 3, -1)
         arms = self._data.xipos[self.bodies] - center
         return np.append(F.sum(axis=1), T.sum(axis=1) + cross(arms, F.T).sum(axis=0))

@@ -1,14 +1,14 @@
-"""The plant in MuJoCo, with contact forces between the links, obstacles and target; a grasp is a
-weld.
+"""The plant in MuJoCo, with contact forces between the links, obstacles and target; a grasp is
+modelled as a weld.
 
 The parameter ``engine`` selects it instead of :class:`.EffortPlant` or :class:`.VelocityPlant`;
-commands, states and topics are the same. MuJoCo integrates by Runge-Kutta 4; contacts, joint stops,
-locked joints and welds are its soft constraints, with a time constant of two steps. They are
-internal forces, so total momentum changes only by the integration error: with 1 ms steps, by about
-1e-9 of its largest value in free motion, and by 1e-5 during a grasp.
+commands, states and topics are the same. MuJoCo integrates with the Runge-Kutta 4 method. Contacts,
+joint stops, locked joints and welds are soft constraints with a time constant of two steps. The
+constraint forces are internal, so the total momentum changes only by the integration error: with 1
+ms steps, by about 1e-9 of its largest value in free motion, and by 1e-5 during a grasp.
 
-Under velocity commands, a change in the commanded rates takes effect within a step. Otherwise,
-servo efforts stay within the URDF effort limits: a joint that meets an obstacle stalls.
+Under velocity commands, a change in the commanded rates takes effect within a step. Apart from such
+changes, servo efforts stay within the URDF effort limits: a joint that meets an obstacle stalls.
 """
 
 from __future__ import annotations
@@ -46,16 +46,17 @@ DEFAULT_INTEGRATION_STEP = 0.001
 """Longest Runge-Kutta step, s."""
 
 _STOP_DISTANCE = 1e-4
-"""Distance to the limit, m or rad, at which a joint is considered stopped: stops are soft."""
+"""Distance to the limit, m or rad, at which a joint is considered stopped, because stops are
+soft."""
 
 _SHARES = (1 / 6, 2 / 6, 2 / 6, 1 / 6)
 """Stage weights in a Runge-Kutta 4 step."""
 
 _CONTROL_CALLBACK = Lock()
-"""MuJoCo has one callback per process: plants in threads take turns."""
+"""MuJoCo allows one callback per process, so plants in different threads take turns."""
 
 _RIGID = 1e15
-"""Inertia of a motor that keeps its rate, kg or kg m^2."""
+"""Inertia of a motor that maintains its rate, kg or kg m^2."""
 
 
 class MujocoPlant:
@@ -64,7 +65,7 @@ class MujocoPlant:
     After :meth:`step`, the attributes are those of :class:`.Plant`, and
 
     ``wrench``
-        (6,) force (N) over torque (N m) of the last tick at the base link origin, in base
+        (6,) force (N) and torque (N m) of the last tick at the base link origin, in base
         components.
     ``holds_target``
         Whether the target is welded to the robot; if so, the momenta include the target.
@@ -82,10 +83,10 @@ class MujocoPlant:
     actuation
         ``velocity`` or ``effort``, as in parameter ``actuation``.
     target
-        The target, and the link that captures it; None: there is none.
+        The target, and the link that captures it; None if there is no target.
     contacts
-        Whether there are contacts, joint stops and locks. Without them, the model is exactly as
-        MuJoCo reads it from the URDF, and joints under velocity commands keep their rates exactly.
+        Whether there are contacts, joint stops and locks. If not, the model is exactly as MuJoCo
+        reads it from the URDF, and joints under velocity commands keep their rates exactly.
 
     Raises
     ------
@@ -146,7 +147,7 @@ class MujocoPlant:
             np.zeros((3, len(robot.link_names))),
         )
         self.expected_momenta = np.zeros(6)
-        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
+        """Linear and angular momentum (6,) in W: the initial value plus thrust and loads."""
         self.limit_counts: dict[str, Counts] = {
             kind: np.zeros(n, dtype=np.int64)
             for kind in ("rate" if self._velocity else "effort", "stroke")
@@ -162,7 +163,7 @@ class MujocoPlant:
     # -- the plant ----------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Return to the initial state, with zero efforts; the limit counters continue."""
+        """Return to the initial state, with zero efforts; the limit counters are kept."""
         start, robot, data = self.initial, self.robot, self._data
         rates = start.rates(robot)
         if self._velocity and rates.any():
@@ -424,7 +425,7 @@ class MujocoPlant:
         self.momentum[6] = float(data.qvel[own] @ moving[own]) / 2
 
     def _momenta_of(self, root: int) -> Array:
-        """Return linear over angular momentum (6,) of a tree about its own centre of mass, in W."""
+        """Return linear and angular momentum (6,) of a tree about its own centre of mass, in W."""
         data, mass = self._data, float(self._model.body_subtreemass[root])
         return np.concatenate([mass * data.subtree_linvel[root], data.subtree_angmom[root]])
 
@@ -440,11 +441,11 @@ class MujocoTarget(Target):
 
     @property
     def momenta(self) -> Array:
-        """Linear over angular momentum (6,) about its centre of mass, in W."""
+        """Linear and angular momentum (6,) about its centre of mass, in W."""
         return np.concatenate(self.motion.momenta(self.inertia))
 
     def reset(self) -> None:
-        """Copy the initial state, after the plant has returned to it."""
+        """Copy the plant's initial state, to which the plant has just returned."""
         self.step()
 
     def release(self, motion: BodyMotion) -> None:
@@ -513,7 +514,7 @@ def build_mujoco_plant(
     step
         Longest Runge-Kutta step, s.
     target
-        The target; None: there is none.
+        The target; None if there is no target.
 
     Raises
     ------

@@ -71,7 +71,7 @@ class Plant(Protocol):
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
+        """Linear and angular momentum (6,) in W: the initial value plus thrust and loads."""
 
 
 class WrappedPlant:
@@ -92,7 +92,7 @@ class WrappedPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial value plus thrust and loads."""
+        """Linear and angular momentum (6,) in W: the initial value plus thrust and loads."""
         return self.plant.expected_momenta
 
     def hold(self, joints: Flags) -> None:
@@ -114,8 +114,8 @@ class InitialState:
 
     ``joint_positions`` None means zero, or the nearest limit if a joint's range excludes zero.
     ``angular_momentum`` (kg m^2/s) is about the system's centre of mass. ``joint_velocities`` None
-    means zero; the base twist follows from them and the momenta. ``center_of_mass`` (m, in W)
-    positions the system's centre of mass instead of the base link.
+    means zero; the base twist follows from the joint velocities and the momenta. ``center_of_mass``
+    (m, in W) positions the system's centre of mass instead of the base link.
 
     Raises
     ------
@@ -153,11 +153,12 @@ class InitialState:
     def __post_init__(self) -> None:
         if self.center_of_mass is not None and np.any(self.position):
             raise ParameterError(
-                "The initial position is set for both the base and the centre of mass: omit one."
+                "The initial position is set for both the base and the centre of mass: omit one "
+                "of them."
             )
 
     def attitude(self) -> Array:
-        """Return the base unit quaternion (x, y, z, w).
+        """Return the unit quaternion (x, y, z, w) of the base attitude.
 
         Raises
         ------
@@ -170,7 +171,7 @@ class InitialState:
             raise ParameterError(f"The initial orientation is refused: {error}.") from None
 
     def momenta(self) -> Array:
-        """Return linear over angular momentum (6,).
+        """Return linear and angular momentum (6,).
 
         Raises
         ------

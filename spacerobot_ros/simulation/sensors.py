@@ -36,11 +36,11 @@ _NOISE_PARAMETERS = {
 class Sensors:
     """Plant state measurements, with bias, noise, delay and dropouts.
 
-    ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are the last measurements, arranged like
-    the plant state. Each call of :meth:`measure` draws new noise; flights with the same seed
-    are identical.
+    ``pose`` (7,), ``twist`` (6,), ``q`` and ``qdot`` (n,) are the last measurements, in the same
+    arrangement as the plant state. Each call of :meth:`measure` draws new noise; flights with the
+    same seed are identical.
 
-    When a delay begins, pose and twist stay frozen until it has elapsed.
+    When a delay begins, pose and twist are frozen until the delay has elapsed.
 
     Parameters
     ----------
@@ -74,16 +74,17 @@ class Sensors:
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
         self._noise = dict.fromkeys(_NOISE_PARAMETERS, 0.0)
         self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
-        """Covariances of pose and twist, each 6 x 6 in row-major order, for the noise
-        only: a sensor does not know its bias and delay."""
+        """Covariances of pose and twist, each 6 x 6 in row-major order, for the noise only; bias
+        and delay are not included."""
         self._delay = 0
         self._past: deque[tuple[Array, Array]] = deque(maxlen=1)
-        """Copies of the true poses and twists in the last ticks."""
+        """Copies of the true poses and twists during the last few ticks."""
         self._apply_faults(plant.active)
         self.used = self.is_imperfect or any(
             FAULT_KINDS[f.kind].sensor for f in plant.timeline.entries
         )
-        """Whether measurements ever differ from the truth: so far, now or due to a known fault."""
+        """Whether measurements differ from the truth now, or at another time because of a known
+        fault."""
 
     @property
     def is_imperfect(self) -> bool:
@@ -97,7 +98,7 @@ class Sensors:
         )
 
     def measure(self) -> None:
-        """Measure the plant's current state; does nothing for sensors without errors."""
+        """Measure the plant's current state; do nothing if the sensors have no errors."""
         if self._plant.active is not self._faults:
             self._apply_faults(self._plant.active)
             self.used = self.used or self.is_imperfect
@@ -152,11 +153,11 @@ class Sensors:
 class TargetSensors:
     """Target motion measurements, with bias, noise, delay, loss and a rate.
 
-    ``pose`` (7,) and ``twist`` (6,) are the last measurement, arranged like the target's pose and
-    twist. Each call of :meth:`measure` draws the same number of random numbers, from a separate
-    stream.
+    ``pose`` (7,) and ``twist`` (6,) are the last measurements, in the same arrangement as the
+    target's pose and twist. Each call of :meth:`measure` draws the same number of random values,
+    from a separate random stream.
 
-    When a delay begins, pose and twist stay frozen until it has elapsed.
+    When a delay begins, pose and twist are frozen until the delay has elapsed.
 
     Parameters
     ----------
@@ -193,7 +194,7 @@ class TargetSensors:
         self._past: deque[tuple[Array, Array]] = deque(maxlen=self._delay + 1)
 
     def measure(self) -> None:
-        """Measure the target's current state; does nothing for sensors without errors."""
+        """Measure the target's current state; do nothing if the sensors have no errors."""
         if not self.used:
             return
         config, truth = self._config, self._capturing
@@ -227,10 +228,10 @@ class ReportedState:
     sensors
         Sources of odom and joint_states.
     target_sensors
-        Source of target/odom; None: there is no target.
+        Source of target/odom; None if there is no target.
     quantities
-        Arrays by :attr:`StateField.quantity` name, updated in place. The dictionary is
-        replaced when the sensors begin to deviate from the truth. It omits quantities that the
+        Arrays by :attr:`StateField.quantity` name, updated in place. The dictionary is replaced
+        when measurements begin to deviate from the truth. The dictionary omits quantities that the
         plant does not have (thrusters, an end-effector, true values that differ from measurements).
 
     Raises
@@ -251,7 +252,7 @@ class ReportedState:
         self._link_poses = robot.buffered("link_poses") if named else None
         capturing = plant.capturing
         self.target = None if capturing is None else capturing.target.description
-        """The target; None: there is none."""
+        """The target; None if there is no target."""
         self.target_sensors: TargetSensors | None = None
         if capturing is not None:
             self.target_sensors = TargetSensors(

@@ -31,18 +31,19 @@ def latched_text(fault: str) -> str:
 
 
 class PlantState(str, Enum):
-    """Plant state regarding time and commands; the value of ``state`` in plant/status."""
+    """State of the plant with regard to time and commands; the value of ``state`` in
+    plant/status."""
 
     INACTIVE = "inactive"
     """The plant publishes no states and accepts no commands."""
     RUNNING = "running"
-    """A command is in force, or a lockstep plant waits for a command."""
+    """A command is active, or a lockstep plant waits for a command."""
     RESTING = "resting"
-    """Time advances without a command in force: none has arrived yet, or the last one expired."""
+    """Time advances without an active command: none has arrived yet, or the last one expired."""
     PAUSED = "paused"
     """Time is stopped; commands are accepted."""
     LATCHED = "latched"
-    """Time advances with everything at rest, until the plant is rearmed."""
+    """Time advances, but joints and thrusters stay at rest until the plant is rearmed."""
     FAILED = "failed"
     """An error stopped the plant: it is inactive until configured or activated again."""
 
@@ -62,31 +63,33 @@ class PlantStatus:
         or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or ``exception``;
         empty otherwise.
     latched_fault
-        The fault latched until ``~/rearm``, in any plant state; empty: none.
+        The fault latched until ``~/rearm``, in any plant state; empty if there is none.
     time_s
         Simulated time of the last change, s.
     rearms, resets
-        Number of rearms and resets; lets subscribers detect a missed status.
+        Number of rearms and resets, by which subscribers can detect a missed status.
     faults
         Lines of the active injected faults.
     disturbances
         Lines of the active disturbances.
     payload
-        The body that the robot holds, as a :class:`.Payload` string; empty: none. It changes
-        the robot's mass, inertia and momentum.
+        The body that the robot holds, as a :class:`.Payload` string; empty if there is no such
+        body. A held body changes the robot's mass, inertia and momentum.
     contacts
-        Links in contact, also with obstacles and the target; the end-effector may touch the target.
+        Links in contact, including obstacles and the target; end-effector contacts with the target
+        are omitted.
     timeouts
         Number of times the joints were brought to rest because no command arrived in time.
     last_command_s
-        Stamp of the last command before the most recent timeout, s; None: there was none.
+        Stamp of the last command before the most recent timeout, s; None if there was no such
+        command.
     actuation
         What joint_commands carry: ``velocity`` or ``effort``; ``auto``: not yet determined by a
-        command; empty: the plant is not configured.
+        command; empty if the plant is not configured.
     tick_rate_hz
-        Ticks per second of simulated time, Hz; 0: the plant is not configured.
+        Ticks per second of simulated time, Hz; 0 if the plant is not configured.
     time_mode
-        Who drives time: ``realtime`` or ``lockstep``; empty: the plant is not configured.
+        Who drives time: ``realtime`` or ``lockstep``; empty if the plant is not configured.
     """
 
     state: PlantState
@@ -166,7 +169,7 @@ class PlantMonitor:
     ) -> None:
         self.observe(commands, plant, config)
         self.rearms = self.resets = 0
-        """Number of rearms and resets, counted by the owner."""
+        """Numbers of rearms and resets, set by the caller."""
         # Commanders learn these before they see a robot or a state.
         self.status = replace(
             PlantStatus(PlantState.INACTIVE, "The plant is inactive."),
@@ -176,9 +179,9 @@ class PlantMonitor:
         )
         """Status of the last update."""
         self.contacts: tuple[str, ...] = ()
-        """Links in contact, set by the owner."""
+        """Links in contact, set by the caller."""
         self.failure = "", ""
-        """Reason for and message of the error that stopped the plant, set by the owner."""
+        """Reason and message of the error that stopped the plant, set by the caller."""
 
     def observe(
         self, commands: CommandValidator, plant: PlantWithFaults, config: PlantConfig
@@ -257,7 +260,7 @@ class PlantMonitor:
             case _ if self._config.time_mode == "lockstep":
                 message = "Each tick uses the command for its state"
             case _ if commands.in_force:
-                message = "A command is in force"
+                message = "A command is active"
             case _:
                 activity = PlantState.RESTING
                 if commands.timed_out:

@@ -28,7 +28,7 @@ class Lockstep:
         """Whether the plant was waiting in the same tick at the last two checks."""
 
     def must_step_at_check(self, tick: int, *, pose_lost: bool) -> bool:
-        """Return whether a plant that checks periodically must step.
+        """Return whether a plant must step; called at periodic checks.
 
         A state without a pose may receive no command: the commander only learns from the next state
         that the pose is missing. The plant therefore steps without a command if it was already
@@ -42,7 +42,7 @@ class RealTime:
     """Schedules ticks by the wall clock, and counts late ticks and commands.
 
     A tick is late if it is taken after the next one is due. A command is late if it arrives after
-    the tick that follows its state is due.
+    the due time of the tick that follows its state.
 
     Parameters
     ----------
@@ -56,11 +56,12 @@ class RealTime:
         self._period, self._pace = period_ns, period_ns / factor
         self._origin = 0.0
         self.ticks_lost = 0
-        """Number of late ticks that the plant never takes."""
+        """Number of late ticks that the plant has skipped."""
         self.ticks = self.ticks_late = 0
-        """Number of ticks, and of those taken after the next was due."""
+        """Number of ticks, and number of ticks executed after the next tick was due."""
         self.commands = self.commands_late = 0
-        """Number of commanded states, and of those commanded after the next tick was due."""
+        """Number of states that received a command, and number of commands that arrived after the
+        next tick was due."""
         self.worst_tick = self.worst_command = 0.0
         """Largest delay of a tick and of a command, s."""
         self._reported = 0, 0
@@ -94,7 +95,7 @@ class RealTime:
             self.worst_tick = max(self.worst_tick, late / SECOND)
 
     def count_command(self, now_ns: int, stamp_ns: float) -> None:
-        """Count a command in force for the state with a given stamp (simulated time)."""
+        """Count an active command for the state with a given stamp (simulated time)."""
         if stamp_ns <= self._answered_ns:
             return  # A refused command leaves the command in force unchanged.
         self._answered_ns = stamp_ns
@@ -106,12 +107,12 @@ class RealTime:
 
     @property
     def command_age(self) -> float:
-        """Age of the state of the command in force, simulated s."""
+        """Age of the state to which the active command refers, in s of simulated time."""
         return (self._state_ns - self._answered_ns) / SECOND
 
     def report(self) -> tuple[float, bool]:
-        """Return the ticks per second of wall time since the last call, and whether there are more
-        delays than then.
+        """Return the ticks per second of wall time since the last call, and whether there have been
+        new delays since then.
         """
         late = self.ticks_late, self.commands_late
         worse, self._reported = late != self._reported, late

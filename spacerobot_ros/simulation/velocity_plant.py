@@ -1,8 +1,8 @@
 """The velocity-driven plant: servos hold joint velocities, and momentum determines the base motion.
 
-One tick is one compiled function: limits, step, and all published quantities. The total
-linear and angular momenta are constants of the motion, initially zero by default; under external
-loads, they are states that change with the impulses.
+Each tick is computed by one compiled function: limits, step, and all published quantities. The
+total linear and angular momenta are constants of the motion, initially zero by default; under
+external loads, they are states that change with the impulses.
 """
 
 from __future__ import annotations
@@ -22,16 +22,17 @@ from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState
 
 _ROUNDING = 1e-9
-"""Excess over a limit considered as rounding: share of a rate, and motion in a tick (m or rad)."""
+"""Largest excess over a limit that is attributed to rounding: a fraction of a rate, and a motion in
+a tick (m or rad)."""
 
 
 class VelocityPlant:
     """A free-floating robot whose servos hold the commanded joint velocities.
 
     After :meth:`step`, the attributes are those of :class:`Plant`: ``qdot`` holds the velocities of
-    the last tick, and ``effort`` the efforts of the servos, from inverse dynamics with the mean
-    velocity before and during the tick, and the velocity difference divided by the tick length.
-    Effort limits do not apply to servos.
+    the last tick, and ``effort`` the servo efforts. The efforts follow from inverse dynamics. The
+    velocity is the mean of the velocities before and during the tick; the acceleration is their
+    difference divided by the tick length. Effort limits do not apply to servos.
 
     Parameters
     ----------
@@ -85,11 +86,11 @@ class VelocityPlant:
 
     @property
     def expected_momenta(self) -> Array:
-        """Linear over angular momentum (6,) in W: the initial value plus external loads."""
+        """Linear and angular momentum (6,) in W: the initial value plus external loads."""
         return self._momenta
 
     def reset(self) -> None:
-        """Return to the initial state, at rest; the limit counters continue."""
+        """Return to the initial state, at rest; the limit counters are kept."""
         start, robot = self.initial, self.robot
         if np.any(start.rates(robot)):
             raise ParameterError(

@@ -28,16 +28,16 @@ from spacerobot_ros.viewer.state import Measured, Notice, Part, StackState
 Color = tuple[int, int, int]
 
 SILENT_AFTER = 1.0
-"""Wall time after which the page reports that no state was received, s."""
+"""Wall time, s, after which the page reports that no state was received."""
 
 _NEAR_LIMIT_SHARE = 0.05
-"""Distance to a limit below which a joint is highlighted, as a fraction of its range."""
+"""Distance to a limit below which a joint is highlighted, as a fraction of the joint range."""
 
 _WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE = 0.8, 0.98
-"""Fractions of a wheel's maximum rate above which it is shown in amber and in red."""
+"""Fractions of the maximum rate of a wheel above which the wheel is shown in amber and in red."""
 
 _NEAR_CONTACT = 0.02
-"""Link distance below which it is shown at the top of the page, m."""
+"""Link distance, m, below which the distance is shown at the top of the page."""
 
 COLORS: Mapping[Verdict, Color] = {
     Verdict.UNCHECKED: (150, 150, 160),
@@ -53,7 +53,9 @@ _LEVEL_COLORS = (
     "var(--warn-color,#c98a00)",
     "var(--bad-color,#d23c3c)",
 )
-"""Colours of the levels OK, WARN and ERROR; those in ``page.js`` are readable in both themes."""
+"""Colours of the levels OK, WARN and ERROR; the colours in ``page.js`` are readable in both
+themes.
+"""
 
 _FAINT_COLOR, _BAR_COLOR = "var(--faint-color,#8a8f98)", "#8a8f9855"
 
@@ -77,9 +79,9 @@ def silence_message(state: StackState) -> str:
 
 
 def time_to_go(state: StackState) -> float | None:
-    """Return the expected time until the goal is reached, s; None if there is no such goal.
+    """Return the expected time, s, until the goal is reached; None if no goal is being pursued.
 
-    It is reported by a planner, or else by a controller.
+    The time is reported by a planner or, if there is none, by a controller.
     """
     planner, controller, measured = state.planner, state.controller, state.measured
     if measured is None:
@@ -105,7 +107,7 @@ def _to_go_text(left: float | None) -> str:
 
 
 def progress(state: StackState) -> float | None:
-    """Return the completed fraction of the planned manoeuvre, 0 to 1; None if there is none."""
+    """Return the completed fraction of the planned manoeuvre, 0 to 1; None without a manoeuvre."""
     left, planner = time_to_go(state), state.planner
     if left is None or planner is None or planner.manoeuvre_time_s <= 0.0:
         return None
@@ -119,10 +121,10 @@ def status_html(
     *,
     described: bool = True,
 ) -> str:
-    """Return the state of the stack; ``described``: whether a robot is known.
+    """Return the state of the stack; ``described`` states whether a robot is known.
 
-    ``errors``: see :func:`goal_errors`. ``tolerance``: the planner's or else the controller's
-    tolerance, if known.
+    ``errors``: see :func:`goal_errors`. ``tolerance`` is the tolerance of the planner or,
+    without a planner, of the controller; None if unknown.
     """
     lines = []
     silence = silence_message(state)
@@ -198,7 +200,7 @@ def _distance_lines(
 
 
 def not_controlled(state: StackState, part: Part) -> tuple[Controlled, ...]:
-    """Return the goal components known not to be controlled by the planner or controller."""
+    """Return the goal components that the planner or controller is known not to control."""
     goal = state.goals.get(part)
     if goal is None or goal.end_effectors:
         return ()
@@ -228,7 +230,7 @@ def line_html(text: str, level: int) -> str:
 
 
 def has_stack_ended(state: StackState) -> bool:
-    """Whether every node that has reported a status is offline, and at least one of them fell
+    """Whether all nodes that have reported a status are offline, and at least one has become
     silent."""
     statuses = {"plant": state.plant, "planner": state.planner, "controller": state.controller}
     known = {key for key, status in statuses.items() if status is not None}
@@ -409,7 +411,7 @@ def _measured_pose(
 def end_effector_positions(state: StackState, kinematics: ForwardKinematics) -> dict[Part, Array]:
     """Return the world positions (3,), m, of the end-effectors whose paths are drawn.
 
-    These are the plant's end-effector, if it publishes one, and the links with goals.
+    These end-effectors are the plant's end-effector, if it publishes one, and the links with goals.
     """
     found = {} if state.tool is None else {DEFAULT_END_EFFECTOR: state.tool[:3]}
     for goal in state.goals.values():
@@ -440,7 +442,8 @@ def planned_positions(
 
 
 def flown_check(state: StackState) -> GoalCheck | None:
-    """Return the end of the plan being flown, as a goal check result; None: there is none.
+    """Return the end of the plan that is being executed, as a goal check result; None: there is
+    none.
 
     Controlled goal components are assumed to be reached: later plans correct remaining errors.
     """
@@ -467,8 +470,8 @@ MOMENTUM_PARTS = ("base", "arm", "wheels", "sum")
 
 
 def momentum_budget(state: StackState) -> dict[str, float]:
-    """Return the angular momentum components in controller/status, N m s; empty: there are none, or
-    the controller is offline.
+    """Return the angular momentum components in controller/status, N m s; empty if there are none,
+    or if the controller is offline.
     """
     control = state.controller
     if control is None or control.command is None or "controller" in state.absent:
@@ -492,7 +495,7 @@ def momentum_html(state: StackState) -> str:
         title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
         bar = _bar_html((1.0 + share) / 2, level)
         rows.append((title, f"{numbers([100 * share], 0)} %", bar))
-    dumping = _line_html("The momentum of the wheels is being dumped.", 1)
+    dumping = _line_html("The wheel momentum is being dumped.", 1)
     return padded(f"<b>Angular momentum</b>{_table_html(rows)}{dumping * command.dumping}")
 
 
@@ -508,7 +511,7 @@ def has_tool(state: StackState) -> bool:
 def fault_line(
     kind: str, target: str, value: float, lasts_s: float, now_s: float, targets: FaultTargets
 ) -> str:
-    """Return the description of a fault that starts now and lasts for ``lasts_s``; 0: forever.
+    """Return the description of a fault that starts now and lasts for ``lasts_s``; 0 means forever.
 
     Raises
     ------
@@ -546,14 +549,15 @@ T = TypeVar("T")
 
 
 class RecentItems(Generic[T]):
-    """Items from the last minutes of simulated time, oldest first, at least one step apart.
+    """Items from the last minutes of simulated time, in order of time, at least one step apart.
 
     Parameters
     ----------
     span_s
-        Simulated time from the oldest to the latest item, s.
+        Simulated time, s, from the oldest to the latest item.
     most
-        Largest number of items; beyond it, every second item is dropped and the step is doubled.
+        Largest number of items; if it is exceeded, every second item is dropped and the step is
+        doubled.
     """
 
     def __init__(self, span_s: float = 300.0, most: int = 1500) -> None:
@@ -589,5 +593,5 @@ class RecentItems(Generic[T]):
         return (self._times[0], self._times[-1]) if self._times else None
 
     def at(self, time_s: float) -> T:
-        """Return the last item at or before a time, or else the first item."""
+        """Return the last item at or before a time or, if there is none, the first item."""
         return self._items[max(bisect_right(self._times, time_s) - 1, 0)]

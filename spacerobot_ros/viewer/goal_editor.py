@@ -40,10 +40,10 @@ Defer = Callable[[Callable[[], None]], None]
 
 
 def react(register: Callable[[Any], Any], defer: Defer, act: Callable[[Any], None]) -> None:
-    """Call a function with an element's value in the thread that draws the page.
+    """Call a function with the value of a page element in the thread that draws the page.
 
-    ``register`` is the element's ``on_click`` or ``on_update``. The function is called only for
-    user changes, not for values set by the page.
+    ``register`` is the method ``on_click`` or ``on_update`` of the element. The function is called
+    only for user changes, not for values set by the page.
     """
 
     @register
@@ -54,7 +54,7 @@ def react(register: Callable[[Any], Any], defer: Defer, act: Callable[[Any], Non
 
 
 GOAL_SETTLING_TIME_S = 0.3
-"""Wall time without changes after which a goal is checked, s."""
+"""Wall time, s, without changes after which a goal is checked."""
 
 _HIDDEN_GHOST_DISTANCE = 0.01
 """Distance from the robot below which the ghost is hidden, in robot lengths and rad."""
@@ -81,7 +81,7 @@ class Origin(Enum):
 
     ROBOT = "the robot's own pose"
     USER = "a user of the page, not sent yet"
-    SENT = "the last goal sent, from this page or elsewhere"
+    SENT = "the last goal sent, from this page or from another client"
 
 
 class GoalEditor:
@@ -98,7 +98,7 @@ class GoalEditor:
     defer
         Queues user changes.
     on_note
-        Called with the reason if an input is rejected.
+        Function called with the reason if an input is rejected.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class GoalEditor:
         self._tool_too = gui.add_checkbox(
             "Goal for the end-effector",
             initial_value=True,
-            hint="Off: the end-effector keeps its current goal, if any.",
+            hint="If disabled, the end-effector keeps its current goal, if any.",
         )
         self._tool_too.visible = False
         self._final = _FinalShape(gui, edit, self._mark_changed)
@@ -164,7 +164,7 @@ class GoalEditor:
         react(self._to_robot.on_click, self._defer, lambda _: act())
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
-        """Start over with another robot, in an empty scene; None: there is none."""
+        """Start again with another robot, in an empty scene; None: there is none."""
         self._gizmos.clear()
         self._marks.clear()
         self._poses.clear()
@@ -202,7 +202,8 @@ class GoalEditor:
         self._origin = Origin.ROBOT
 
     def follow(self, goals: Mapping[Part, Goal], now: float) -> None:
-        """Show the last goals sent by anyone, once. A goal that a user is editing is kept.
+        """Show the last goals sent by any client, once per goal. A goal that a user is editing is
+        kept.
 
         Parameters
         ----------
@@ -246,7 +247,7 @@ class GoalEditor:
 
     @property
     def shows_sent_goal(self) -> bool:
-        """Whether the displayed goal is the last one sent."""
+        """Whether the displayed goal is the goal that was sent last."""
         return self._origin is Origin.SENT
 
     @property
@@ -265,8 +266,8 @@ class GoalEditor:
     def update_robot(self, pose: Array, q: Array) -> None:
         """Update the robot's base pose (7,) and joint positions (n,).
 
-        The ghost uses these joint positions unless a plan or a user sets others, and is hidden if
-        it would coincide with the robot.
+        The ghost uses these joint positions unless a plan or a user sets other positions, and is
+        hidden if it would coincide with the robot.
         """
         self._present = pose, q
         self._final.update_robot(q)
@@ -284,7 +285,7 @@ class GoalEditor:
         self._ghost.base.visible = self._ghost_shown and not hidden
 
     def show_ghost(self, *, visible: bool) -> None:
-        """Show or hide the ghost, unless it is hidden for other reasons."""
+        """Show or hide the ghost; other conditions may hide it too."""
         self._ghost_shown = visible
         if self._present is not None:
             self.update_robot(*self._present)
@@ -314,8 +315,8 @@ class GoalEditor:
             self._show_parts()
 
     def show_parts(self, *, tool: bool, planned: bool) -> None:
-        """Show or hide the controls for a controller's end-effector, and those for planners: the
-        choice of end-effectors, and the final joint positions.
+        """Show or hide the controls for the end-effector of a controller, and the controls for
+        planners: the choice of end-effectors, and the final joint positions.
         """
         self._tool_too.visible = tool
         if _TOOL_GIZMO in self._gizmos:
@@ -346,7 +347,7 @@ class GoalEditor:
             self._show_parts()
 
     def goals(self) -> dict[Part, Goal]:
-        """Return the goals to send, by robot part; a link goal names the link in its end-effectors.
+        """Return the goals to send, by robot part; a link goal names its link in ``end_effectors``.
 
         Raises
         ------
@@ -372,8 +373,8 @@ class GoalEditor:
         return Goal.checked(pose[:3].tolist(), pose[3:].tolist(), shape)
 
     def settled_goals(self, now: float) -> dict[Part, Goal] | None:
-        """Return the goals once after every change, when they have not changed for a while;
-        otherwise None."""
+        """Return the goals once after each change, as soon as they have been unchanged for
+        a while; otherwise None."""
         if (
             self._changed_at is None
             or now - self._changed_at < GOAL_SETTLING_TIME_S
@@ -548,8 +549,8 @@ class _PartMenu:
         return str(self._numbers.value)
 
     def asked(self, part: Part) -> RequestedPart:
-        """Return whether the goal requires the position or the pose of a robot part, or leaves it
-        free."""
+        """Return whether the goal specifies the position or the pose of a robot part, or leaves
+        the part free."""
         if self._there and part in self._menus:
             return RequestedPart(self._menus[part].value)
         return RequestedPart.POSE if part == BASE_GOAL_KEY else RequestedPart.NOTHING
@@ -570,7 +571,7 @@ class _PartMenu:
         self._update()
 
     def choose(self, asked: Mapping[Part, RequestedPart]) -> None:
-        """Select the robot parts of a goal that someone else sent."""
+        """Select the robot parts of a goal that another client sent."""
         for part, menu in self._menus.items():
             menu.value = asked.get(part, RequestedPart.NOTHING).value
         self._update()
@@ -628,7 +629,8 @@ class _FinalShape:
         self._enabled: Any = gui.add_checkbox(
             "Final joint positions",
             initial_value=False,
-            hint="The planned motion ends at these joint positions; otherwise they are free.",
+            hint="If enabled, the planned motion ends at these joint positions; otherwise, final "
+            "joint positions are free.",
         )
         self._enabled.visible = False
         self._folder = gui.add_folder("At the end", visible=False)

@@ -67,7 +67,7 @@ _LOOK_BACK_STEP_S = 0.1  # simulated s
 _MIN_LOOK_BACK_S = 1.0  # simulated s
 
 _SLIDER_HOLD_S = 1.5
-"""Wall time after a user moves the time slider during which the page does not move it, s."""
+"""Wall time, s, during which the page does not move the time slider after a user has moved it."""
 
 
 class ButtonPanel:
@@ -87,12 +87,14 @@ class ButtonPanel:
             "Fly the scenario's goal", color="teal", visible=self._has_scenario_goals
         )
         self._goal = gui.add_button_group(
-            "Goal", ("Abort goal",), hint="Abandon the goal; the joints brake, the stack continues."
+            "Goal",
+            ("Abort goal",),
+            hint="Abandon the goal; the joints brake, and the stack continues.",
         )
         self._plant = gui.add_button_group(
             "Plant",
             ("Stop all", "Rearm", "Reset"),
-            hint="Stop all: joints brake, thrusters are off until Rearm. "
+            hint="Stop all: joints brake, and thrusters are off until Rearm. "
             "Reset: return to the initial state.",
         )
         self._time = gui.add_button_group("Time", ("Pause", "Resume"))
@@ -225,7 +227,7 @@ class FaultPanel:
         react(self._clear.on_click, defer, lambda _: act(InjectAction("clear")))
 
     def offer(self, targets: FaultTargets) -> None:
-        """Offer the faults that are possible for a plant's targets."""
+        """Offer the faults that are possible for the targets in a plant."""
         if targets == self._targets:
             return
         self._targets = targets
@@ -305,7 +307,7 @@ class Plots:
         self._first: Array | None = None
 
     def show_robot(self, robot: RobotDescription | None) -> None:
-        """Start over with another robot."""
+        """Start again with another robot."""
         self._first = None
         for plot in (self._momentum, self._budget):
             plot.clear()
@@ -366,7 +368,7 @@ class Plots:
         self._no_errors.visible = not errors
 
     def draw(self, tolerance: Tolerance | None = None, time_s: float | None = None) -> None:
-        """Redraw the curves, with error tolerances and a line at the displayed time, s."""
+        """Redraw the curves, with error tolerances and a line at the displayed time."""
         limits = () if tolerance is None else (tolerance.position, tolerance.attitude)
         for plot in [each for each in self._errors.values() if each.handle.visible]:
             plot.set_logarithmic(enabled=bool(self._logarithmic.value))
@@ -491,15 +493,15 @@ _ROBOT_PATH = "/robot"
 _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 
 _TEXTS_S, _TABLES_S, _PLOTS_S, _PATHS_S = 0.2, 0.25, 0.5, 0.5
-"""Drawing periods of the slower components, wall s."""
+"""Drawing periods of the slower components, s of wall time."""
 
 _ANSWER_TIME_S = 10.0
-"""Wall time for which the response to a user action is shown at the top, s."""
+"""Wall time, s, for which the response to a user action is shown at the top."""
 
 CAMERA = np.array([1.1, 1.4, 0.8])
 """Initial camera position relative to the robot, in robot lengths.
 
-It places an arm in front of the base on the left, because the panel is on the right.
+This position places an arm in front of the base on the left, because the panel is on the right.
 """
 
 
@@ -524,14 +526,14 @@ _LAYERS = (
 
 
 _PORTRAIT, _PORTRAIT_DISTANCE, _PORTRAIT_SHIFT, _PANEL_SHIFT = 0.8, 1.75, 0.36, 0.32
-"""Aspect ratio (width to height) below which a window is a phone's; ratio of phone to desktop
-camera distance; and view offset below the robot, or else to its right, as shares of the distance.
+"""Aspect ratio (width to height) below which a window is treated as a phone window; ratio of phone
+to desktop camera distance; and view offsets below the robot (phone) and to its right (desktop), as
+fractions of the distance.
 """
 
 
 def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Array]:
-    """Return the position and target (3,) of a camera, m, such that the panel does not cover the
-    robot.
+    """Return a camera position and target (3,), m, for which the panel does not cover the robot.
 
     Parameters
     ----------
@@ -554,7 +556,7 @@ def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Arr
 
 
 class Page:
-    """The page; all browsers that open it show the same content.
+    """The page, which shows the same content in all browsers.
 
     Parameters
     ----------
@@ -578,7 +580,7 @@ class Page:
         self._target: RobotDescription | None = None
         self._target_drawing: scene.RobotDrawing | None = None
         self._obstacles: tuple[RobotDescription | None] | None = None
-        """The obstacles shown last; None: the robot's own obstacles are shown."""
+        """The obstacles shown last; None if the obstacles of the robot are shown."""
         self._drawn_obstacles: list[viser.MeshHandle] = []
         self._table: ThrusterTable | None = None
         self._tolerance: Tolerance | None = None
@@ -586,11 +588,11 @@ class Page:
         self._due: dict[str, float] = {}
         self._now = 0.0
         self._last: Measured | None = None
-        """The last received state; users look back from there."""
+        """The last received state, from which users can look back."""
         self._drawn: Measured | None = None
         self._looked_back = False
         self._announced: tuple[Notice, float] | None = None
-        """The line at the top, and the wall time until which it is shown, s."""
+        """The line at the top, and the wall time, s, until which it is shown."""
         self._build()
 
     def _build(self) -> None:
@@ -616,7 +618,7 @@ class Page:
             self._log = LogPanel(gui)
         self.editor.on_reset_goal(self._goal_to_robot)
         look = gui.add_button(
-            "Look at the robot", color="gray", hint="Point this browser's camera at the robot."
+            "Look at the robot", color="gray", hint="Point the camera of this browser at the robot."
         )
 
         @look.on_click
@@ -663,7 +665,7 @@ class Page:
     # -- the robot and its goal -----------------------------------------------------------------
 
     def show_robot(self, robot: RobotDescription | None) -> None:
-        """Start over with another robot; None: there is none."""
+        """Start again with another robot; None: there is none."""
         self._robot, self._table, self._drawing = robot, None, None
         self._last = self._drawn = None
         self._past: RecentItems[StackState] = RecentItems()
@@ -688,7 +690,7 @@ class Page:
             self.show_target(self._target)
 
     def show_obstacles(self, world: RobotDescription | None) -> None:
-        """Draw other obstacles instead of the robot's own; None: there are none."""
+        """Draw other obstacles instead of those of the robot; None: there are none."""
         self._obstacles = (world,)
         for each in self._drawn_obstacles:
             each.remove()
@@ -735,8 +737,8 @@ class Page:
         self._server.flush()
 
     def show_thrusters(self, table: ThrusterTable | None) -> None:
-        """Set the thrusters, which become known later than the robot; cameras follow a robot that
-        has some, because it flies out of sight.
+        """Set the thrusters, which become known later than the robot; cameras follow a robot with
+        thrusters, because it may fly out of sight.
         """
         if table is not None and self._table is None:
             self._follow.value = True
@@ -751,7 +753,7 @@ class Page:
         self._log.add(notice)
 
     def announce(self, notice: Notice, seconds: float = _ANSWER_TIME_S) -> None:
-        """Add a line to the log, and show it at the top for a wall time, s."""
+        """Add a line to the log, and show it at the top of the page for a wall time in s."""
         self.note(notice)
         self._announced = (notice, self._now + seconds)
 

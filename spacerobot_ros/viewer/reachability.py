@@ -4,8 +4,9 @@ arm.
 The process has low priority, so that neither the page nor the plant waits for it. It works on
 one goal at a time: a newer goal cancels the plan in progress. Questions and answers are numbered.
 
-A controller flies to any pose, and reports only in flight that the arm is too short. Its goals are
-checked by searching for joint positions with both the base and the end-effector at their goals.
+A controller accepts any pose, and reports only in flight if the arm is too short. Goals for a
+controller are checked by a search for joint positions at which both the base and the end-effector
+are at their goals.
 """
 
 from __future__ import annotations
@@ -53,21 +54,21 @@ from spacerobot_ros.termination import Terminated, end_child, guarded, start_chi
 from spacerobot_ros.viewer.state import Part, StackState
 
 _NICENESS = 10
-"""Niceness increment of the process, so that everything else runs first."""
+"""Niceness increment of the process, so that all other processes run first."""
 
 _MAX_CANCELLATION_S = 2.0
-"""Wall time from the cancellation of a plan until the process is killed, s."""
+"""Wall time, s, from the cancellation of a plan until the process is killed."""
 
 
 class Verdict(Enum):
     """Verdict on a goal."""
 
     UNCHECKED = "not checked"
-    """No check: it is disabled, or only a controller is running."""
+    """Not checked: checks are disabled, or only a controller is running."""
     PLANNING = "planning"
     REACHABLE = "reachable"
     PARTLY = "partly reachable"
-    """The goal has components that the method does not control, ending outside the tolerance."""
+    """Goal components that the method does not control end outside the tolerance."""
     REFUSED = "refused"
 
 
@@ -80,12 +81,12 @@ class GoalCheck:
     verdict
         The verdict.
     message
-        Message for the user, including the reason if the goal is refused.
+        Message for the user, including the reason if the goal is rejected.
     shape, base
         Predicted (n,) joint positions, m or rad, and (7,) base pose at the end; None if
-        there is none.
+        there is no prediction.
     source
-        The planned motion it is based on, if this motion is already being flown.
+        The planned motion on which the result is based, if this motion is already being executed.
     """
 
     verdict: Verdict
@@ -97,7 +98,7 @@ class GoalCheck:
 
 @dataclass(frozen=True)
 class GoalQuestion:
-    """A goal to check, and the current situation.
+    """A goal to check, and the data on which the check is based.
 
     Attributes
     ----------
@@ -106,12 +107,12 @@ class GoalQuestion:
     parameters
         Planner parameters, as JSON strings by name.
     state, goal
-        Robot start state, and the goal of its base, links, or both.
+        Start state of the robot, and the goal for its base, its links, or both.
     tool, link
-        Link goal for a controller, which does not plan: the check is whether the arm can reach it.
-        None: a planner flies.
+        Link goal for a controller. A controller does not plan, so the check is whether the arm can
+        reach this goal. None: a planner flies.
     axes
-        Link axes that the controller controls; errors in other axes are ignored.
+        Link axes that the controller controls; errors along other axes are ignored.
     """
 
     urdf: str
@@ -129,7 +130,7 @@ def make_question(
     robot: RobotDescription | None,
     parameters: Mapping[str, Mapping[str, str]],
 ) -> GoalQuestion | str:
-    """Return a reachability question for goals, or the reason why there is none.
+    """Return a reachability question for goals, or the reason why no question is possible.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def make_question(
 
 
 def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
-    """Return goals by robot part as one planner goal, without controller goals.
+    """Combine goals by robot part into one planner goal, without controller goals.
 
     Raises
     ------
@@ -185,7 +186,7 @@ def planned_goal(goals: Mapping[Part, Goal]) -> Goal:
 
 
 def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
-    """Return the planner parameters among JSON strings by name; others are omitted.
+    """Return the planner parameters contained in JSON strings by name; other values are omitted.
 
     Raises
     ------
@@ -246,7 +247,7 @@ class GoalChecker:
         self._send_question(question)
 
     def cancel(self) -> bool:
-        """Cancel the check in progress; return whether there was one."""
+        """Cancel the check in progress; return whether a check was in progress."""
         if self._process is None or self._answered:
             return False
         self._number += 1
@@ -255,8 +256,8 @@ class GoalChecker:
         return True
 
     def latest_answer(self) -> GoalCheck | None:
-        """Return the answer to the last question, once; until it is available, return the time
-        spent on it."""
+        """Return the answer to the last question, once; until the answer is available, return
+        the time spent so far."""
         if self._answered:
             return None
         answer = self._received_answer()
@@ -313,7 +314,7 @@ class GoalChecker:
 
 
 class Planner:
-    """Plans from rest like the stack's planner; keeps the model of the last robot."""
+    """Plans from rest like the planner of the stack; keeps the model of the last robot."""
 
     def __init__(self) -> None:
         self._built: tuple[str, Mapping[str, str]] | None = None

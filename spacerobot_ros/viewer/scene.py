@@ -1,7 +1,7 @@
 """The robot and its surroundings as nodes in a viser scene.
 
-The URDF's frame tree is attached to the base pose: only transforms changed by a joint are sent
-again. Node paths use slashes as separators, so they do not contain link names,
+The frame tree of the URDF is attached to the base pose, so only transforms changed by a joint
+are sent again. Node paths use slashes as separators, so they do not contain link names,
 which may include slashes.
 """
 
@@ -38,7 +38,7 @@ _FRAME_SIZE = 0.12
 """Length of link axes, in robot lengths."""
 
 _STARS, _SKY = 1800, 40.0
-"""Number of stars, and their distance in robot lengths."""
+"""Number of stars, and distance of the stars in robot lengths."""
 
 _SPACE = np.full((1, 1, 3), 14, np.uint8)
 """Image of the space behind the stars: one pixel (red, green, blue)."""
@@ -72,13 +72,13 @@ class RobotDrawing:
     scene
         Scene to draw in.
     path
-        Node path of its base.
+        Node path of the base of the robot.
     robot
         The robot.
     color
         Color of all parts; None: the URDF colors.
     on_note
-        Called with a message about each mesh that cannot be drawn.
+        Function called with a message about each mesh that cannot be drawn.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class RobotDrawing:
             each.visible = visible
 
     def paint(self, color: Color) -> None:
-        """Set the color of all parts."""
+        """Set the colour of all parts."""
         for solid in self._solids:
             solid.color = color
 
@@ -196,7 +196,7 @@ def _draw_solid(
 
 
 def reach_of(robot: RobotDescription) -> float:
-    """Return an upper bound on the distance of any part from the base origin, m."""
+    """Return an upper bound on the distance, m, of all parts from the base origin."""
     farthest: dict[str, float] = {robot.base_link: 0.0}
     for joint in joints_outward(robot):
         farthest[joint.child] = farthest[joint.parent] + float(np.linalg.norm(joint.origin.r))
@@ -259,7 +259,7 @@ def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, lengt
     names, duty
         Thruster names, and the fraction of time each thruster is on, 0 to 1.
     length
-        Plume length at a duty cycle of 1, m.
+        Plume length, m, at a duty cycle of 1.
     """
     segments = []
     for name, part in zip(names, duty, strict=True):

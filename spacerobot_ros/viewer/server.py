@@ -1,9 +1,9 @@
 """The page's web server, and the viewer parameters.
 
-viser accepts websockets from any page open in a browser, and connects to its vendor's server if a
-client requests to share the page. Both are prevented here, to keep foreign pages in a
-user's browser from steering the robot. For the same reason, other pages cannot embed this page in a
-frame.
+viser accepts websockets from any page that is open in a browser, and connects to the server of
+its vendor if a client requests sharing of the page. This module prevents both of these, so that
+foreign pages in a user's browser cannot steer the robot. For the same reason, other pages cannot
+embed this page in a frame.
 """
 
 from __future__ import annotations
@@ -43,11 +43,12 @@ class ViewerConfig(WatchdogConfig):
     )
     host: str = parameter(
         "127.0.0.1",
-        "address of the page; any other than the default lets other machines steer the robot",
+        "address of the page; an address other than the default lets other machines steer the "
+        "robot",
     )
     port: int = parameter(
         8080,
-        "port of the page; if in use, the next free one; 0: any",
+        "port of the page; if it is in use, the next free port; 0: any free port",
         minimum=0,
         maximum=65535,
     )
@@ -61,7 +62,7 @@ class ViewerConfig(WatchdogConfig):
         "", "scenario goals by robot part, as JSON, sent by a button on the page; empty: none"
     )
     check_goals: bool = parameter(
-        True, "whether to check by planning that the displayed goal is reachable before it is sent"
+        True, "whether the displayed goal is checked by planning before it is sent"
     )
 
 
@@ -71,8 +72,8 @@ _NO_FRAMING_HEADERS = {
 }
 
 _ALIVE_PATH, _SERVER_ID = "/alive", secrets.token_hex(8)
-"""Path that open pages request to detect whether the viewer still runs, and the response, which
-changes with each start.
+"""Path that open pages request to detect whether the viewer is still running, and the response,
+which is different after each start.
 """
 
 _server_start_lock = threading.Lock()
@@ -116,7 +117,7 @@ def _require_address(host: str) -> None:
 
 
 def is_own_page(origin: str | None, host: str | None, served: str) -> bool:
-    """Whether a websocket is opened by a page from this server, or by a program that is not a
+    """Whether a websocket was opened by a page from this server or by a program other than a
     browser.
 
     Parameters
@@ -191,7 +192,7 @@ def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
     Raises
     ------
     SpaceRobotError
-        viser is not installed, or the address is not one of this machine.
+        viser is not installed, or the address does not belong to this machine.
     """
     require_viser()
     import viser
@@ -200,7 +201,7 @@ def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
         """A server that never shares its page over the internet."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
-            """Return None: sharing is not requested."""
+            """Return None, because sharing is disabled."""
             return None
 
     _require_address(host)

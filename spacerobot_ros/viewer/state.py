@@ -35,7 +35,8 @@ class Measured:
     pose
         (7,) base link pose in the world: m, quaternion (x, y, z, w).
     q, qdot, effort
-        (n,) joint values in robot description order: m or rad, m/s or rad/s, N or N m.
+        (n,) joint positions (m or rad), rates (m/s or rad/s) and efforts (N or N m), in robot
+        description order.
     twist
         (6,) linear and angular velocity of the base link, in its own frame, m/s and rad/s.
     """
@@ -50,7 +51,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Momenta:
-    """Total momenta in the world: linear (kg m/s) over angular (kg m^2/s).
+    """Total momenta in the world: linear (kg m/s), then angular (kg m^2/s).
 
     Attributes
     ----------
@@ -66,15 +67,15 @@ class Momenta:
 
 @dataclass(frozen=True)
 class Firing:
-    """Thruster activity: ``names``, and the on-time of each as a fraction of the last tick, 0 to
-    1."""
+    """Thruster activity: ``names``, and the on-time of each thruster as a fraction of the last
+    tick, 0 to 1."""
 
     names: tuple[str, ...]
     duty: Array
 
 
 Part = str
-"""The part of the robot that a goal is for: ``base``, a link name, or ``end_effector``,
+"""The robot part to which a goal applies: ``base``, a link name, or ``end_effector``,
 also for a controller's end-effector.
 """
 
@@ -93,18 +94,20 @@ def goals_to_text(goal: Goal, of_controller: Goal | None = None) -> str:
 
 
 def goals_from_text(text: str) -> dict[Part, Goal]:
-    """Return the goals by robot part from a :func:`goals_to_text` string; empty if it is empty."""
+    """Return the goals by robot part from a :func:`goals_to_text` string; empty if the string is
+    empty.
+    """
     return {part: decode_goal(entry) for part, entry in json.loads(text or "{}").items()}
 
 
 @dataclass(frozen=True)
 class StackState:
-    """The state of the stack at one time; None: unknown, or no such node.
+    """The state of the stack at one time; None means unknown, or that there is no such node.
 
     Attributes
     ----------
     measured, age_s
-        The last state, and the wall time since it arrived, s; infinite before the first state.
+        The last state, and the wall time, s, since its arrival; infinite before the first state.
     tool
         (7,) end-effector pose in the world.
     target
@@ -117,19 +120,20 @@ class StackState:
         (k, 3) base positions predicted by the planner, m.
     planned_motion
         (k, 7 + n) base poses and joint positions along the planned path;
-        None also if the planner has not published a schedule that starts together with the path.
+        Also None if the planner has not published a schedule that starts together with the path.
     goals
-        The last goal sent by anyone, by robot part. A planner's link goal names the link in
+        The last goal sent by any client, by robot part. A planner's link goal names the link in
         ``end_effectors``; a goal for a controller's end-effector is only a pose.
     silent
-        Wall time since the last heartbeat of each silent node, s, by name.
+        Wall time, s, since the last heartbeat of each silent node, by name.
     inactive
         Names of nodes that were deactivated or shut down.
     absent
         The statuses (``plant``, ``planner``, ``controller``, ``replay``) whose nodes are silent or
-        inactive: they may be outdated.
+        inactive, so the statuses may be outdated.
     busy
-        Whether a planner or controller is planning or compiling, which delays its response.
+        Whether a planner or controller is planning or compiling, which delays the response of that
+        node.
     """
 
     measured: Measured | None = None
@@ -154,8 +158,8 @@ class StackState:
 
 @dataclass(frozen=True)
 class Notice:
-    """A log line: ``level`` 0 OK, 1 WARN, 2 ERROR; ``time_s`` simulated time, s, if
-    known."""
+    """A log line: ``level`` is 0 (OK), 1 (WARN) or 2 (ERROR); ``time_s`` is the simulated
+    time, s, if known."""
 
     message: str
     level: int = 0
@@ -164,12 +168,12 @@ class Notice:
 
 
 class Request(Enum):
-    """A request to be performed by a service of the stack."""
+    """A request that a service of the stack performs."""
 
     ABORT = "abort"
     """The planner and the controller drop their goals; the joints brake."""
     STOP = "stop"
-    """The plant brings everything to rest and refuses commands until ``REARM``."""
+    """The plant brings everything to rest and rejects commands until ``REARM``."""
     REARM = "rearm"
     PAUSE = "pause"
     RESUME = "resume"

@@ -78,7 +78,7 @@ def _status(number: int) -> DiagnosticStatus:
     return DiagnosticStatus(
         level=DiagnosticStatus.STALE,
         name=f"planner {number}",
-        message="beyond stroke: Δq > 1 m",
+        message="beyond the stroke: Δq > 1 m",
         hardware_id="none",
         values=[KeyValue(key="residual", value="1e-9"), KeyValue(key="state", value="")],
     )

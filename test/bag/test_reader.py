@@ -474,7 +474,7 @@ def test_a_topic_in_another_encoding(tmp_path: Path) -> None:
         writer.finish()
     bag = read_bag(tmp_path / "a.mcap")
     assert bag.message_count("/a") == 1
-    with pytest.raises(RecordingError, match="is not in ROS 2's encoding"):
+    with pytest.raises(RecordingError, match="does not use ROS 2's encoding"):
         bag["/a"]
 
 

@@ -206,7 +206,7 @@ def test_a_disk_that_refuses_a_message_is_reported_once(
         recording.record(channel, b"x" * 70_000)
     assert recording.state.value == "failed"
     (failure,) = map(str, failures)
-    assert failure.endswith("No space left on device; the 0 messages written before are safe.")
+    assert failure.endswith("No space left on device; the 0 messages already written are safe.")
     assert recording.messages == 0
     recording.close()
 

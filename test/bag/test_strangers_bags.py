@@ -255,7 +255,7 @@ def test_topics_that_cannot_be_read_are_named_and_the_rest_is_written(
     (said,) = caplog.messages
     assert said == (
         f"3 topic(s) of the bag {mixed} are omitted: /cfg, /proto, /chatter. The topic /cfg of "
-        f"the bag {mixed} is not in ROS 2's encoding ('cdr' defined by 'ros2msg'), but in 'json' "
+        f"the bag {mixed} does not use ROS 2's encoding ('cdr' defined by 'ros2msg'), but 'json' "
         "defined by 'jsonschema'."
     )
     bag = read_bag(mixed)
@@ -387,7 +387,7 @@ def test_a_message_may_hold_nothing_and_has_a_whole_head(tmp_path: Path) -> None
 def test_a_chunk_and_its_index_agree(tmp_path: Path) -> None:
     path, data = tmp_path / "a.mcap", message(string("x"))
     path.write_bytes(bag(Part("", data, len(data), indexed_size=len(data) + 1)))
-    with pytest.raises(RecordingError, match="and its index state different sizes"):
+    with pytest.raises(RecordingError, match="and its index specify different sizes"):
         read_bag(path)["/a"]
 
 

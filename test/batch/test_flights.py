@@ -64,23 +64,24 @@ NOT_A_NUMBER[1, 2, 0] = np.nan
         (STILL, {"actuation": "speed"}, "The actuation is 'speed', not velocity or effort."),
         (STILL, {"ticks": 0}, "A flight of 0 ticks is too short: use at least 1."),
         (STILL, {"report_ticks": (0, 5, 11)},
-         "The instants (0, 5, 11) are not ascending ticks of a flight of 10."),
+         "The instants (0, 5, 11) are not ascending ticks of a flight of 10 ticks."),
         (STILL, {"report_ticks": (0, 5, 5)},
-         "The instants (0, 5, 5) are not ascending ticks of a flight of 10."),
+         "The instants (0, 5, 5) are not ascending ticks of a flight of 10 ticks."),
         (STILL, {"report_ticks": (-1, 5)},
-         "The instants (-1, 5) are not ascending ticks of a flight of 10."),
+         "The instants (-1, 5) are not ascending ticks of a flight of 10 ticks."),
         (STILL, {"sensors": range(3)}, "There are sensors for 3 flights, not 2."),
         (FollowedSchedule(np.zeros((5, 3))), {"actuation": "effort"},
          "A schedule requires velocity actuation."),
-        (FollowedSchedule(np.zeros((5, 2))), {}, "The positions are (5, 2), not (ticks, 3)."),
+        (FollowedSchedule(np.zeros((5, 2))), {},
+         "The positions have shape (5, 2), not (ticks, 3)."),
         (FollowedSchedule(np.zeros((3, 5, 3))), {}, "There are positions for 3 flights, not 2."),
-        (HeldCommands(np.zeros(3)), {}, "The commands are (3,), not (ticks, 3)."),
+        (HeldCommands(np.zeros(3)), {}, "The commands have shape (3,), not (ticks, 3)."),
         (HeldCommands(np.zeros((1, 1, 2, 3))), {},
-         "The commands are (1, 1, 2, 3), not (ticks, 3)."),
-        (HeldCommands(np.zeros((0, 3))), {}, "The commands are (0, 3), not (ticks, 3)."),
+         "The commands have shape (1, 1, 2, 3), not (ticks, 3)."),
+        (HeldCommands(np.zeros((0, 3))), {}, "The commands have shape (0, 3), not (ticks, 3)."),
         (HeldCommands(NOT_A_NUMBER), {}, "The commands contain a value that is not finite."),
-        (RELAXED, {}, "The commands are (5, 9), not (ticks, 3)."),
-        (STILL, {"actuation": "effort"}, "The commands are (5, 3), not (ticks, 9)."),
+        (RELAXED, {}, "The commands have shape (5, 9), not (ticks, 3)."),
+        (STILL, {"actuation": "effort"}, "The commands have shape (5, 3), not (ticks, 9)."),
     ],
 )  # fmt: skip
 def test_flights_are_refused_in_one_sentence(
@@ -96,7 +97,7 @@ def test_masses_are_those_of_all_bodies_of_all_flights(sliders: SpaceRobot) -> N
     three = nominal.scaled(np.ones((3, 1)))
     with pytest.raises(ParameterError) as refusal:
         flights(sliders, STILL, inertial=three)
-    assert str(refusal.value) == "The masses are (3, 4), not 2 flights of 4 bodies."
+    assert str(refusal.value) == "The masses have shape (3, 4), not (2, 4)."
     two = flights(sliders, STILL, inertial=nominal.scaled(np.array([[1.0], [2.0]])))
     assert two.robot_of(1).total_mass == pytest.approx(2 * two.robot_of(0).total_mass)
     assert flights(sliders, STILL).robot_of(1) is sliders
@@ -301,7 +302,7 @@ def test_flights_that_do_not_go_together_are_refused(described_sliders: SpaceRob
     for arguments, sentence in (
         (("speed", 0.05, 10, starts, commands), "not velocity or effort"),
         (("velocity", 0.05, 0, starts, commands), "0 ticks"),
-        (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((5, 2)))), "commands are"),
+        (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((5, 2)))), "commands have shape"),
         (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((3, 5, 3)))), "3 flights"),
         (("effort", 0.05, 10, starts, FollowedSchedule(np.zeros((5, 3)))), "velocity actuation"),
     ):
@@ -514,14 +515,18 @@ def test_bad_values_are_refused_and_change_nothing(three: SteppedFlights) -> Non
     bad[2, 8] = np.inf
     weightless = robot.inertial.scaled(np.full((1, 1), -1.0))
     refusals: list[tuple[Any, type[Exception], str]] = [
-        (lambda: three.step(zero[:2]), ParameterError, r"The commands are \(2, 9\), not \(3, 9\)"),
+        (lambda: three.step(zero[:2]), ParameterError, r"have shape \(2, 9\), not \(3, 9\)"),
         (lambda: three.step(zero, 0), ParameterError, "A step of 0 ticks is too short"),
         (lambda: three.step(bad), CommandError, "The command for flight 2 is not finite"),
-        (lambda: three.reset([0, 1], one), ParameterError, "2 flights are reset to 1 starts"),
+        (
+            lambda: three.reset([0, 1], one),
+            ParameterError,
+            r"2 flights are reset to 1 start state\(s\)",
+        ),
         (
             lambda: three.reset([0], one, drawn_masses(robot, 2, np.random.default_rng(1))),
             ParameterError,
-            "1 flights are reset to 1 starts with 2 rows of masses",
+            r"1 flights are reset to 1 start state\(s\) with 2 rows of masses",
         ),
         (lambda: three.reset([0], outside), ParameterError, "slider_3.* outside its limits"),
         (lambda: three.reset([0], one, weightless), RobotDescriptionError, "mass"),
@@ -536,7 +541,9 @@ def test_bad_values_are_refused_and_change_nothing(three: SteppedFlights) -> Non
 
 def test_an_unknown_link_and_a_bad_start_are_refused(sliders: SpaceRobot) -> None:
     starts = drawn_starts(sliders, 2, np.random.default_rng(10))
-    with pytest.raises(ParameterError, match=r"has no link 'hand'; it has: base_link, mass_1"):
+    with pytest.raises(
+        ParameterError, match=r"has no link 'hand'; its links are: base_link, mass_1"
+    ):
         SteppedFlights(sliders, "velocity", 0.05, starts, link="hand", in_lanes=False)
     starts.q[1] = 50.0
     for in_lanes in (False, True):

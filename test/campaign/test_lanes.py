@@ -283,7 +283,7 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
         select_engine(beside, "lanes")
     has_contact_forces = campaign(set={"plant.engine": "mujoco"})
     assert select_engine(has_contact_forces, "auto").name == "flights"
-    with pytest.raises(SpaceRobotError, match="its plant uses engine 'mujoco'"):
+    with pytest.raises(SpaceRobotError, match="its plant uses the engine 'mujoco'"):
         select_engine(has_contact_forces, "lanes")
     near = campaign(criteria={"clearance_m": {"min": 0.0}})
     assert select_engine(near, "auto").name == "flights"

@@ -81,7 +81,7 @@ def test_a_report_of_flights_that_ended_early_says_that_late_ones_are_missing(
     assert not Results.of(first).incompleteness_warning
     page = tmp_path / "page.html"
     lines = write_campaign_report(quick, page)
-    sentence = "10 draws are not flown yet although later ones have been"
+    sentence = "10 draws are not flown yet although later draws have been"
     assert sentence in "\n".join(lines)
     assert sentence in unescape(page.read_text("utf-8"))
 
@@ -223,7 +223,7 @@ def test_success_is_counted_over_bins_of_what_was_drawn(tmp_path: Path) -> None:
     assert results.drawn_by_influence(results.influences())[:2] == ["planner.method", "mass.mass_1"]
     page = tmp_path / "page.html"
     write_campaign_report(tmp_path, page)
-    assert "Success over drawn values" in page.read_text("utf-8")
+    assert "Success rate over the drawn values" in page.read_text("utf-8")
 
 
 def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Path) -> None:

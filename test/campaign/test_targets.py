@@ -196,7 +196,7 @@ def test_the_target_weighs_otherwise(scenario: Scenario) -> None:
     with pytest.raises(ParameterError) as caught:
         targets_of("target.masss", scenario)
     assert str(caught.value) == (
-        "'target.masss' is none of target.mass, target.inertia, target.com.x, target.com.y, "
+        "'target.masss' is not one of target.mass, target.inertia, target.com.x, target.com.y, "
         "target.com.z. Did you mean 'target.mass'?"
     )
     (target,) = targets_of("target.mass", scenario)

@@ -230,17 +230,17 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
     ("changes", "remark"),
     [
         ([], None),
-        ([('value="120"', 'value="4.7"')], "'base_link' has 4.7 kg and carries 24 kg"),
+        ([('value="120"', 'value="4.7"')], "'base_link' has a mass of 4.7 kg and carries 24 kg"),
         ([('value="120"', 'value="4.9"')], None),
         ([('value="120"', 'value="12120"')], "has 1.212e+04 kg, 505 times its load"),
         ([('value="120"', 'value="11880"')], None),
         ([(BASE, 'ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"')], "'base_link' is a point"),
-        ([(RATES, '<limit velocity="0" effort="1"/>')], "'pin_1' has the velocity limit 0"),
+        ([(RATES, '<limit velocity="0" effort="1"/>')], "'pin_1' has a velocity limit of 0"),
         ([(RATES, '<limit velocity="0.00098" effort="1"/>')], "'pin_1' moves at up to 0.00098 rad"),
         ([(RATES, '<limit velocity="0.001" effort="1"/>')], None),
         ([(RATES, '<limit velocity="50" effort="1"/>')], None),
         ([(RATES, '<limit velocity="51" effort="1"/>')], "'pin_1' moves at up to 51 rad/s"),
-        ([(RATES, '<limit velocity="2" effort="0"/>')], "'pin_1' has the effort limit 0"),
+        ([(RATES, '<limit velocity="2" effort="0"/>')], "'pin_1' has an effort limit of 0"),
         (to_stops(-12.5, 1.0), None),
         (to_stops(-12.6, 1.0), "'pin_1' ranges from -12.6 to 1 rad"),
         (to_stops(-1.0, 12.6), "'pin_1' ranges from -1 to 12.6 rad"),
@@ -341,7 +341,7 @@ def test_columns_of_the_list_of_robots_are_apart() -> None:
     ("limit", "code", "said"),
     [
         ("", 1, "'pin_1' has no velocity limit, which planning requires"),
-        (RATES.replace("2", "60"), 0, "velocity limit. The same holds for 1 other joint."),
+        (RATES.replace("2", "60"), 0, "velocity limit. The same applies to 1 other joint."),
     ],
 )
 def test_joints_of_a_new_robot_are_remarked(

@@ -121,7 +121,7 @@ def test_a_flight_beside_an_earlier_one_says_which_is_which(
     found = run(monkeypatch, SUMMARY | {"bag": "out/sliding_masses-1.mcap"}, *GOAL)
     assert found.stdout.splitlines()[-3:] == [
         "bag         out/sliding_masses-1.mcap (1234 messages)",
-        "            out/sliding_masses.mcap is an earlier flight, which is kept",
+        "            out/sliding_masses.mcap contains an earlier flight and is kept",
         "next        `spacerobot report out/sliding_masses-1.mcap` draws this flight",
     ]
 
@@ -570,7 +570,7 @@ def test_the_lines_of_a_second_opinion(monkeypatch: pytest.MonkeyPatch) -> None:
     assert agrees.exit_code == 0
     assert agrees.stdout.splitlines()[4:] == [
         "engine      MuJoCo 9.8, by steps",
-        "deviates    2e-09 m, 3.2e-09 rad, joints 9.8e-09 m or rad, most at 17.5 s of 339 ticks",
+        "deviates    2e-09 m, 3.2e-09 rad, joints 9.8e-09 m or rad, largest at 17.5 s of 339 ticks",
     ]
     note = told(replace(found, stop_reason="a joint is held")).stdout.splitlines()[-1]
     assert note == "note        compared until a joint is held"
@@ -591,7 +591,7 @@ def test_a_difference_is_exit_1_and_a_sentence(monkeypatch: pytest.MonkeyPatch) 
     assert "verified" not in result.stdout
     assert result.stderr == (
         "The bag differs: /odom at 2.5 s: twist.twist.linear.x is 0.5 in the bag "
-        "and 0.25 by its commands (a remark).\n"
+        "and 0.25 according to the commands (a remark).\n"
     )
 
 

@@ -376,7 +376,7 @@ def test_a_plant_that_is_reset_shows_another_pose_of_one_time(
     kind: str, *, latched: bool, request: pytest.FixtureRequest
 ) -> None:
     rig: Rig = request.getfixturevalue(kind)
-    before = LATCHED if latched else PlantStatus(PlantState.RUNNING, "A command is in force.")
+    before = LATCHED if latched else PlantStatus(PlantState.RUNNING, "A command is active.")
     rig.state(1)
     rig.commander.receive_plant_status(before)
     rig.commander.receive_plant_status(replace(before, resets=1))
@@ -397,7 +397,7 @@ def test_a_plant_that_is_reset_shows_another_pose_of_one_time(
 # -- a robot that captures a target -----------------------------------------------------------
 
 HELD = Payload("link_1", Inertia(4.0, np.array([0.1, -0.2, 0.3]), np.diag([0.2, 0.3, 0.4])))
-CAPTURED = PlantStatus(PlantState.RUNNING, "A command is in force.", payload=HELD.to_text())
+CAPTURED = PlantStatus(PlantState.RUNNING, "A command is active.", payload=HELD.to_text())
 
 
 def test_a_planner_plans_again_for_the_robot_with_the_body_that_it_holds(
@@ -467,7 +467,7 @@ def test_a_plan_that_a_disturbance_pushes_is_reported_with_a_warning(
         assert found == []
         return
     assert [each.message for each in found] == [
-        f"The plan assumes constant momenta, which a disturbance changes: {line}."
+        f"The plan assumes constant momenta, but a disturbance changes them: {line}."
         for line in ("mass_1 force 1 0 0 in world at 0", "mass_2 torque 0 0 1 in link at 0.2")
     ]
     assert {(each.level, each.goal_id) for each in found} == {(1, rig.host.statuses[-1].goal_id)}

@@ -417,7 +417,7 @@ def test_the_first_state_is_believed_whatever_its_stamp() -> None:
     assert listener.look() is not None
 
 
-RUNNING = PlantStatus(PlantState.RUNNING, "A command is in force.")
+RUNNING = PlantStatus(PlantState.RUNNING, "A command is active.")
 LATCHED = PlantStatus(
     PlantState.LATCHED, "Nothing moves: a fuse.", "abort", "a fuse is blown", time_s=2.0
 )

@@ -942,4 +942,4 @@ def test_where_nothing_can_be_written_the_goal_is_flown(tmp_path: Path) -> None:
     np.testing.assert_allclose(loop.answer()[0][:3], 2 * KP * AIM, atol=1e-12)
     assert loop.state == "tracking"
     (warning,) = loop.warnings
-    assert "not resumed after a restart" in warning
+    assert "will not be resumed after a restart" in warning

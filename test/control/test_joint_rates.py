@@ -347,7 +347,7 @@ def test_errors_that_grow_beyond_twice_what_a_goal_asks_for_end_it(margin: float
     assert (loop.state, loop.status.goal_id) == ("aborted", "g")
     away = f"{2 + margin + 0.01:.3g} m, 0 rad"
     assert loop.status.message == (
-        f"Aborted: control is lost, the errors grow, the robot is {away} from the reference; "
+        f"Aborted: control is lost, the errors grow and the robot is {away} from the reference; "
         "the robot is brought to rest."
     )
 

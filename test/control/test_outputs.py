@@ -336,7 +336,7 @@ def test_default_outputs_never_exceed_the_degrees_of_freedom(joints: int) -> Non
         (OutputSelection(base=("x", "x")), "'x' is named twice"),
         (OutputSelection(end_effector=("x",)), "no end-effector link ''"),
         (OutputSelection(end_effector=("x",), end_effector_link="hand"), "link 'hand'"),
-        (OutputSelection(joints=("knee",)), "no joint 'knee'; there are: shoulder, elbow"),
+        (OutputSelection(joints=("knee",)), "no joint 'knee'; available: shoulder, elbow"),
         (OutputSelection(AXES, AXES, (), END_EFFECTOR), "12 outputs .* 8 degrees"),
     ],
 )

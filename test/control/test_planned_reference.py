@@ -110,7 +110,7 @@ def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:
     inside = Goal.from_rotvec([1.5, 0.75, 0.1], [0.0, 0.0, 0.4])
     for goal, settings, words in (
         (inside, {}, "in collision"),
-        (BEHIND, {"plan.duration": 3.0}, "s at least, but plan.duration is 3 s"),
+        (BEHIND, {"plan.duration": 3.0}, " s, but plan.duration is 3 s"),
     ):
         flight = docked(goal, **settings)
         states = [each for _, each in flight.statuses if isinstance(each, ControllerStatus)]

@@ -188,7 +188,7 @@ def test_saturation_is_announced_once_before_it_comes() -> None:
     (event,) = wheels.events()
     assert (event.kind, event.level) == (EventKind.WHEEL_NEAR_LIMIT, 1)
     assert event.message == (
-        "Wheel 'spin_c' rotates at 182 of 200 rad/s, and will saturate in 1.8 s."
+        "Wheel 'spin_c' rotates at 182 of at most 200 rad/s, and will saturate in 1.8 s."
     )
     assert event.about == {"wheel": "spin_c"}
     observe(wheels, [185.0, 0.0, 0.0])
@@ -200,14 +200,14 @@ def test_saturation_is_announced_once_before_it_comes() -> None:
     (event,) = wheels.events()
     assert (event.kind, event.level) == (EventKind.WHEEL_SATURATED, 1)
     assert event.message == (
-        "Wheel 'spin_c' rotates at 198.5 of 200 rad/s: it is saturated and provides no more torque "
-        "in this direction."
+        "Wheel 'spin_c' rotates at 198.5 of at most 200 rad/s: it is saturated and provides no "
+        "more torque in this direction."
     )
     observe(wheels, [169.0, 0.0, 0.0])
     wheels.torque[:] = 0.0
     observe(wheels, [0.0, -272.0, 0.0])
     (event,) = wheels.events()
-    assert event.message == "Wheel 'spin_a' rotates at -272 of 300 rad/s."
+    assert event.message == "Wheel 'spin_a' rotates at -272 of at most 300 rad/s."
 
 
 def test_the_time_to_saturation_is_that_at_the_present_torque() -> None:
@@ -302,7 +302,7 @@ def test_a_wheel_that_does_not_answer_is_taken_out_of_use(share: float) -> None:
     )  # fmt: skip
     answered = {0.0: "0", 0.4: "0.06"}[share]
     assert event.message == (
-        f"Wheel 'spin_c' absorbed {answered} of 0.15 N m s and is out of use: 2 wheel(s), and "
+        f"Wheel 'spin_c' absorbed {answered} of 0.15 N m s and is no longer used: 2 wheel(s), and "
         "thrusters remain."
     )
     assert wheels.rank == 2
@@ -357,7 +357,7 @@ def test_a_failure_without_thrusters_says_so() -> None:
     observe(wheels, [5.0, 0.0, 0.0])
     fly(wheels, [0.3, 0.0, 0.0], 0.0, 0.52)
     (event,) = wheels.events()
-    assert event.message.endswith("and is out of use: 2 wheel(s) remain.")
+    assert event.message.endswith("and is no longer used: 2 wheel(s) remain.")
 
 
 # -- the gyrostat and the robot ---------------------------------------------------------------
@@ -452,8 +452,8 @@ def config(**changes: object) -> ControllerConfig:
          "The base position of robot 'gyro' cannot be controlled without thrusters "
          "(use_thrusters is false): remove x, y and z from base_outputs."),
         ({"wheels.excluded": "spin_a"},
-         "Robot 'gyro' has no thrusters (use_thrusters is false), and its reaction wheels rotate "
-         "it about 2 of 3 controlled axes: remove rx, ry or rz from base_outputs."),
+         "Robot 'gyro' has no thrusters (use_thrusters is false), and its reaction wheels can "
+         "rotate it about only 2 of 3 controlled axes: remove rx, ry or rz from base_outputs."),
     ],
 )  # fmt: skip
 def test_outputs_that_wheels_do_not_move_are_refused(
@@ -465,7 +465,7 @@ def test_outputs_that_wheels_do_not_move_are_refused(
 
 
 def test_a_base_without_wheels_and_thrusters_is_refused() -> None:
-    with pytest.raises(ParameterError, match="reaction wheels rotate it about 0 of 1 controlled"):
+    with pytest.raises(ParameterError, match="reaction wheels can rotate it about only 0 of 1"):
         build_controller(
             SpaceRobot.from_file(robot_file("planar_manipulator")), config(use_thrusters=False)
         )

@@ -311,7 +311,7 @@ def test_a_plan_takes_the_parameters_that_a_flight_takes() -> None:
     )
     words: dict[str, Any]
     for words, message in (
-        ({"planer.x": 1}, "'planer.x' is not a parameter: give node.parameter"),
+        ({"planer.x": 1}, "'planer.x' is not a parameter: write it as node.parameter"),
         ({}, "'surveyor' has no goal: give one"),
     ):
         with pytest.raises(ParameterError, match=message):

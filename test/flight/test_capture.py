@@ -483,9 +483,9 @@ def test_loads_from_outside_are_not_taken_for_a_body(capture: Flight) -> None:
         with pytest.raises(SpaceRobotError) as error:
             payload_estimates(flight)
         assert str(error.value) == (
-            "The held body is not estimated: external loads (disturbances, an orbit or a table) "
-            "acted on the robot, and their impulse is unknown; estimate it from a flight without "
-            "them."
+            "The parameters of the held body are not estimated: external loads (disturbances, an "
+            "orbit or a table) acted on the robot, and their impulse is unknown; use a flight "
+            "without such loads."
         )
     assert payload_estimates(replace(capture, robot=None)) == ()
     assert payload_estimates(replace(capture, events=(loaded,))) == ()

@@ -95,7 +95,7 @@ def test_an_end_effector_is_brought_to_the_goal_of_the_caller_by_a_law() -> None
     assert abs((turn * Rotation.from_matrix(R_BE)).as_rotvec()[2]) > 0.5
     cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"end_effector_position": [1.2, 1.4, 2.0]}, "end-effector is 2 m from .* along z of"),
-        ({"goal": [0.5, 0.5, 0.2]}, "base is 0.2 m from the current one along z of the world"),
+        ({"goal": [0.5, 0.5, 0.2]}, "base is 0.2 m from the current value along z of the world"),
         ({"end_effector_position": goal, "end_effector": "link_1"}, "'link_1', which the law"),
     )
     for given, named in cases:

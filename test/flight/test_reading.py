@@ -318,7 +318,7 @@ def test_goals_of_named_end_effectors_leave_the_base_free_unless_it_has_one(
         ({}, {"urdf": False}, "contains no robot description."),
         ({}, {"states": 0}, "contains no states: there are no messages on /odom."),
         ({}, {"joints": 0}, "contains no states: there are no messages on /joint_states."),
-        ({}, {"joints": 2}, "has 3 base poses and 2 joint states: its flight is"),
+        ({}, {"joints": 2}, "has 3 base poses and 2 joint states: the flight is"),
         ({}, {"goals": False}, "contains no goal pose."),
     ],
 )

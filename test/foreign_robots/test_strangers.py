@@ -55,7 +55,7 @@ class Stranger:
 
 
 STRANGERS = {
-    "one_link": Stranger("one_link.urdf", said="It has no joints and uses thrusters"),
+    "one_link": Stranger("one_link.urdf", said="has no joints and uses thrusters"),
     "wheels_only": Stranger("wheels_only.urdf"),
     "rotors": Stranger("rotors.urdf"),
     "sliders_only": Stranger("sliders_only.urdf"),
@@ -66,9 +66,7 @@ STRANGERS = {
     ),
     "quaternions": Stranger("quaternions.urdf"),
     "endless": Stranger("endless.urdf"),
-    "impossible": Stranger(
-        "impossible.urdf", ("--nearest-inertia",), "that of link 'hull' is changed by "
-    ),
+    "impossible": Stranger("impossible.urdf", ("--nearest-inertia",), "link 'hull' is changed by "),
     "package": Stranger("probe_arm/urdf/arm.urdf.xacro"),
 }
 

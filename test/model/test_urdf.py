@@ -205,7 +205,7 @@ def test_an_attitude_by_a_quaternion_is_that_of_pinocchio() -> None:
     (theirs,) = list(pin.buildModelFromXML(text).jointPlacements)[1:]
     np.testing.assert_allclose(found.origin.R, theirs.rotation, atol=1e-12)
     np.testing.assert_allclose(found.origin.R, turned.as_matrix(), atol=1e-12)
-    with pytest.raises(RobotDescriptionError, match="has 'rpy' and 'quat_xyzw'"):
+    with pytest.raises(RobotDescriptionError, match="has both 'rpy' and 'quat_xyzw'"):
         parse_robot(robot(HULL, ARM, elbow.replace("quat_xyzw", 'rpy="0 0 1" quat_xyzw')))
     with pytest.raises(RobotDescriptionError, match="has the unknown attribute 'rpw'"):
         parse_robot(robot(HULL, ARM, elbow.replace("quat_xyzw", "rpw")))

@@ -89,7 +89,7 @@ def test_a_target_is_captured_and_released_on_request(harness: Harness) -> None:
     assert captured.message.startswith("The target is captured by an impulse of 0.1286 N s and ")
     again = rig.trigger("plant/capture")
     assert not again.success
-    assert again.message.startswith("'end_effector' holds the target 'block' already")
+    assert again.message.startswith("'end_effector' already holds the target 'block'")
     rig.step([0.0, 0.0], JOINTS)
     harness.spin_until(lambda: bool(events_of(rig)), "the event of the capture")
     assert events_of(rig) == [("captured", "0.000000000")]

@@ -280,7 +280,7 @@ def test_stamps_may_be_left_out_and_go_on_but_not_back() -> None:
     assert_one_sentence(
         str(refusal.value),
         "The path goes back in time: pose 3 is stamped 1.25 s, after 2.5 s; omit the "
-        "stamps, or put the poses in order.",
+        "stamps, or sort the poses by time.",
     )
     far = path_through([[1, 2, 3]], frame="moon")
     with pytest.raises(

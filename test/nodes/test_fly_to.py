@@ -423,7 +423,7 @@ def test_a_controller_is_preempted_and_cancelled(harness: Harness, kind: str) ->
     assert first.state == "aborted"
     harness.spin_until(lambda: len(second.feedback) > 2, "it is flown")
     second.handle.cancel_goal_async()
-    assert sender.end_of(second).message == "Aborted on request; the robot holds."
+    assert sender.end_of(second).message == "Aborted on request; the robot holds its pose."
     assert second.state == "canceled"
     assert {each.phase for each in first.feedback + second.feedback} <= {"waiting", "tracking"}
     assert [len(each.results) for each in (first, second)] == [1, 1]

@@ -266,7 +266,7 @@ def test_limits_are_a_warning_once(diagnosed: Diagnosed) -> None:
     assert diagnosed.status("actuators")[:2] == (OK, "within limits")
     diagnosed.plant.limit_counts[what][1] += 3
     level, sentence, values = diagnosed.status("actuators")
-    assert (level, sentence) == (WARN, "limits of the URDF hold joints back")
+    assert (level, sentence) == (WARN, "joints are limited by the URDF")
     assert values[f"{what}_limited.slider_2"] == "3"
     assert values[f"{what}_limited.slider_1"] == "0"
     assert diagnosed.status("actuators")[0] == OK
@@ -281,7 +281,7 @@ def test_what_thrusters_could_not_give_is_a_warning_once(monkeypatch: pytest.Mon
     for _ in range(3):
         diagnosed.plant.step(none, np.array([1e3, 0.0, 0.0, 0.0, 0.0, 1e2]))
     level, message, values = diagnosed.status("thrusters")
-    assert (level, message) == (WARN, "the requested wrench exceeds their thrust")
+    assert (level, message) == (WARN, "the requested wrench exceeds the available thrust")
     assert float(values["propellant_kg"]) == pytest.approx(thrusters.propellant) != 0.0
     counts = [int(values[f"pulses.{name}"]) for name in thrusters.table.names]
     assert max(counts) > 1

@@ -84,10 +84,10 @@ def changed(place: Place = NEAR, frame: str = "world", **fields: float) -> PoseS
 
 
 REFUSED = {
-    "beyond stroke": (
+    "beyond the stroke": (
         # 16 kg / 2 kg times 0.4 m is 3.2 m of slide.
         changed(x=-0.4, y=0.0, z=0.0),
-        ("beyond stroke", "'slider_1'", "3.2 m", "[-2.5, 2.5] m"),
+        ("beyond the stroke", "'slider_1'", "3.2 m", "[-2.5, 2.5] m"),
     ),
     "another frame": (changed(frame="moon"), ("'moon'", "'world'")),
     "position not a number": (changed(y=math.nan), ("position", "not finite")),
@@ -113,7 +113,7 @@ def test_what_cannot_be_done_is_refused_and_the_next_goal_flies(harness: Harness
     assert max(flight.error_to(NEAR)) <= 1e-3
 
 
-@pytest.mark.parametrize("case", ["beyond stroke", "another frame"])
+@pytest.mark.parametrize("case", ["beyond the stroke", "another frame"])
 def test_a_refused_goal_does_not_disturb_the_one_that_is_flown(harness: Harness, case: str) -> None:
     flight = Flight(harness)
     flight.send(NEAR)

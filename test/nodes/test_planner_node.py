@@ -141,7 +141,7 @@ def test_a_planner_that_is_configured_again_finds_its_robot_again(harness: Harne
 def test_without_the_package_of_the_action_the_planner_says_so(harness: Harness) -> None:
     if action_class("control_msgs", "FollowJointTrajectory") is not None:
         pytest.skip("control_msgs is installed")
-    with pytest.raises(SpaceRobotError, match="needs the package control_msgs: install it"):
+    with pytest.raises(SpaceRobotError, match="requires the package control_msgs: install it"):
         harness.make(PlannerNode, {"robot": "sliding_masses", "output": "trajectory"})
 
 

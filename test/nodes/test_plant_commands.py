@@ -235,11 +235,11 @@ def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness
     wait_for_velocity(rig, 0.0)
     status = rig.diagnosis("commands")
     assert status.level == DiagnosticStatus.ERROR
-    assert_one_sentence(status.message, "rearm", "is in force", "2 nodes")
+    assert_one_sentence(status.message, "rearm", "is active", "2 nodes")
     rig.send([0.2, 0.0, 0.0])
     rig.wait_for_refusals(int(rig.diagnosed("commands", "refused")))
     assert_nothing_moves(rig)
-    assert "is in force" in rig.trigger("plant/rearm").message
+    assert "is active" in rig.trigger("plant/rearm").message
     rig.send([0.2, 0.0, 0.0])
     wait_for_velocity(rig, 0.2)
 

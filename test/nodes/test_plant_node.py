@@ -136,7 +136,7 @@ REFUSED: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
         {"initial_joint_positions": [0.1, 0.2]},
         ("initial joint positions", "2", "slider_1, slider_2, slider_3"),
     ),
-    "joint positions beyond stroke": (
+    "joint positions beyond the stroke": (
         {"initial_joint_positions": [0.0, 0.0, 2.6]},
         ("initial position", "slider_3", "2.6", "2.5"),
     ),

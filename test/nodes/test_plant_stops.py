@@ -238,7 +238,7 @@ def plant_status(loop: Loop, status: PlantStatus) -> None:
     loop.harness.settle(loop.probe)
 
 
-RUNNING = PlantStatus(PlantState.RUNNING, "A command is in force.")
+RUNNING = PlantStatus(PlantState.RUNNING, "A command is active.")
 LATCHED_PLANT = PlantStatus(PlantState.LATCHED, "Nothing moves: a fuse.", "abort", "a fuse")
 
 

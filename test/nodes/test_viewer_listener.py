@@ -189,7 +189,7 @@ def test_statuses_are_read_by_the_kind_of_their_node(viewed: Viewed) -> None:
     pose = (0.5, 0.25, 0.125, *TURNED)
     planner = PlannerStatus(PlannerState.PLANNING, "A plan is made.", goal=pose)
     controller = ControllerStatus(ControllerState.TRACKING, "The goal is approached.")
-    plant = PlantStatus(PlantState.RUNNING, "A command is in force.")
+    plant = PlantStatus(PlantState.RUNNING, "A command is active.")
     replay = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.5)
     for name, status in (
         ("planner", planner),
@@ -391,4 +391,4 @@ def test_a_goal_that_nobody_takes_is_reported(harness: Harness) -> None:
     stack.until(lambda: stack.move(0.25, names) or stack.page.editor.placed, "a goal is shown")
     harness.remove(stack.probe)
     stack.press(stack.page._buttons._fly)
-    stack.until(lambda: "The goal is not received" in stack.log(), "it says so")
+    stack.until(lambda: "The goal was not received" in stack.log(), "it says so")

@@ -294,7 +294,7 @@ def pose_error(messages: Messages, part: str, quantity: str) -> Array:
 
 def thruster_numbers(group: TraceGroup, messages: Messages) -> Array:
     states = messages["/thrusters"]
-    if group.unit == "share of each tick during which they are on":
+    if group.unit == "fraction of each tick during which they are on":
         share = np.array([m.velocity for m in states])
         assert share[:, share.any(axis=0)].max() <= 1.0
         return share[:, share.any(axis=0)]
@@ -353,7 +353,7 @@ UNITS = {
     "momentum_budget": {"angular momentum": "N m s"},
     "momentum": {"change": "kg m/s, kg m²/s", "kinetic energy": "J"},
     "thrusters": {
-        "thrusters": "share of each tick during which they are on",
+        "thrusters": "fraction of each tick during which they are on",
         "impulse given": "N s",
         "propellant": "g",
     },

@@ -221,7 +221,7 @@ def test_the_shortest_of_those_that_plan_is_taken() -> None:
         schedule.notes["because"]
     )
     only = planned(made("a", objection="No."), made("b"))
-    assert "is the only one that can plan this goal." in str(only.notes["because"])
+    assert "is the only method that can plan for this goal." in str(only.notes["because"])
 
 
 def test_what_the_schedules_after_a_partial_one_take_counts() -> None:
@@ -237,7 +237,7 @@ def test_a_manoeuvre_that_ends_off_the_goal_comes_last() -> None:
     misses, reaches = made("misses", off=0.03), made("reaches", ticks=90)
     schedule = planned(misses, reaches)
     assert schedule.notes["chosen"] == "reaches"
-    assert "misses: 0.25 s, which ends off the goal." in str(schedule.notes["compared"])
+    assert "misses: 0.25 s, which misses the goal." in str(schedule.notes["compared"])
     # Without another one it is better than nothing; a measured state corrects it.
     assert planned(misses).notes["chosen"] == "misses"
     misses.off = 0.015
@@ -289,7 +289,7 @@ def test_a_goal_stays_with_its_method() -> None:
     first.refusal = ""
     correction = method.plan(at(np.zeros(2)), goal, correction=True)
     assert correction.notes["chosen"] == "second"
-    assert correction.notes["because"] == "second planned this goal before."
+    assert correction.notes["because"] == "second planned for this goal before."
     other = method.plan(at(np.zeros(2)), goal_of([0, 0, 1]))
     assert other.notes["chosen"] == "first"
     # Unless it plans no more.
@@ -306,7 +306,7 @@ def test_only_methods_that_start_in_motion_are_asked_for_moving_joints() -> None
     request = PlanRequest(at(np.zeros(2)), goal_of([0, 0, 1]), TOLERANCE, motion=motion)
     schedule = choice_of(rests, moves)[0].method.plan(request)
     assert schedule.notes["chosen"] == "moves"
-    assert "rests: rests plans from rest only." in str(schedule.notes["compared"])
+    assert "rests: rests plans only from rest." in str(schedule.notes["compared"])
     with pytest.raises(PlanningError, match=r"rests plans from rest only\."):
         choice_of(rests)[0].method.plan(request)
 

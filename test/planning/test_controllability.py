@@ -119,7 +119,7 @@ def test_sliders_in_a_plane_or_too_few_are_not() -> None:
     for robot, count in ((two, 2), (flat, 3)):
         found = check_sliding_masses(SpaceRobot.from_urdf(robot.urdf))
         assert not found.controllable
-        assert f"{count} slider(s) of rank 2" in found.message
+        assert f"{count} slider(s), whose slots have rank 2" in found.message
 
 
 def test_planar_robots_turn_about_one_axis() -> None:

@@ -324,7 +324,7 @@ def test_planning_that_takes_too_long_is_refused() -> None:
     loop.tick(2)
     status = loop.statuses[-1]
     assert status.state is PlannerState.REFUSED
-    assert "601 s of planning were not enough" in status.message
+    assert "601 s of planning were too short" in status.message
 
 
 def test_a_correction_begins_with_a_rest_too() -> None:

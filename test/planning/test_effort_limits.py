@@ -114,8 +114,8 @@ def test_servos_keep_a_tenth_of_the_efforts_by_default() -> None:
     assert BEYOND_EFFORT_LIMITS not in slow.notes
     careless = plan(robot, **asked, effort_limits=2)
     assert careless.positions.tobytes() == fast.positions.tobytes()
-    peak = f"pin_1 takes {taken[0]:.4g} N m, 10 times its limit of {taken[0] / 10:.4g} N m, "
-    assert str(careless.notes[BEYOND_EFFORT_LIMITS]).startswith(peak + "pin_2 takes")
+    peak = f"pin_1 requires {taken[0]:.4g} N m, 10 times its limit of {taken[0] / 10:.4g} N m, "
+    assert str(careless.notes[BEYOND_EFFORT_LIMITS]).startswith(peak + "pin_2 requires")
 
 
 @pytest.mark.parametrize("effort", [0.0, 1e9])
@@ -134,7 +134,7 @@ def test_a_gait_beyond_effort_limits_says_so() -> None:
     schedule = plan(robot, method="square_path", rotvec=CHAIN_TURN, start=CHAIN_START)
     taken = np.abs(efforts_of_servos(robot, schedule)).max(axis=0)
     assert schedule.notes[BEYOND_EFFORT_LIMITS] == (
-        f"pin_1 takes {taken[0]:.4g} N m, {taken[0] / 0.4:.3g} times its limit of 0.4 N m"
+        f"pin_1 requires {taken[0]:.4g} N m, {taken[0] / 0.4:.3g} times its limit of 0.4 N m"
     )
 
 
@@ -234,7 +234,7 @@ def test_a_given_duration_is_long_enough_or_refused(chain: SpaceRobot) -> None:
     assert schedule.duration == pytest.approx(4.0)
     shares = JointEfforts(chain, np.array([3.4, 1.6]), PERIOD).shares(schedule.positions)
     assert np.abs(shares).max() <= 0.85 * (1 + 1e-8)
-    with pytest.raises(PlanningError, match=r"= 1\.5 s: the fastest one found takes 3"):
+    with pytest.raises(PlanningError, match=r"= 1\.5 s: the fastest manoeuvre found takes 3"):
         plan(chain, **asked, **limited, duration=1.5)
     # The limits of the robot are kept where they can be: nobody asked for them.
     weak = SpaceRobot.from_urdf(with_effort_limits(CHAIN, {"pin_1": 3.4, "pin_2": 1.6}))

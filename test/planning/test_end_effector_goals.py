@@ -198,7 +198,7 @@ def test_no_shape_is_beyond_the_radius_and_goals_beyond_are_refused() -> None:
     [
         ({"end_effector_position": (1, 0, 0), "end_effector": "hand"}, "does not have"),
         ({"end_effector_position": (1, 0, 0), "end_effector": "base_link"}, "is the base"),
-        ({"end_effector_position": (1, 0, 0, 0)}, "needs 3, a position, or 7"),
+        ({"end_effector_position": (1, 0, 0, 0)}, r"give 3 \(a position\) or 7"),
         ({"end_effector_pose": (1, 0, 0)}, "a pose has 7"),
         ({"end_effector_pose": (1, 0, 0, 0, 0, 0, 0)}, "zero quaternion"),
         ({"end_effector_position": (1, 0, np.nan)}, "not finite"),

@@ -138,7 +138,7 @@ def test_a_tracking_error_is_planned_for_at_once_or_from_rest(
     assert requested == [PlanReason.REPLAN if held else PlanReason.TRACKING_ERROR]
     status = loop.statuses[-1]
     assert (status.state, status.corrections) == (PlannerState.REACHED, 1)
-    assert any("Off the path by" in notice for notice in loop.notices)
+    assert any("Deviates from the path by" in notice for notice in loop.notices)
     assert not stub_of(loop).requests[-1].correction
     # Either way the joints come to rest along the path: no step in velocity.
     assert np.abs(np.diff(loop.speeds)).max() < 0.5 * max(loop.speeds)

@@ -73,7 +73,7 @@ def test_a_goal_that_is_refused_in_flight_does_not_disturb_the_earlier_one() -> 
     loop.until(PlannerState.REACHED)
     assert loop.states == ["executing", "refused", "reached"]
     (refused,) = [s for s in loop.statuses if s.state is PlannerState.REFUSED]
-    assert "beyond stroke" in refused.message
+    assert "beyond the stroke" in refused.message
     assert refused.message.endswith(" The earlier goal is still pursued.")
     assert max(loop.error_to(NEAR)) <= 1e-3
     assert len(loop.starts) == 1

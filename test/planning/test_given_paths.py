@@ -275,7 +275,9 @@ def test_auto_takes_the_method_that_follows_paths(start: Array) -> None:
     path = start + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.003]])
     schedule = plan("three_joint_arm", end_effector_path={HAND: path}, start=STATE, method="auto")
     assert schedule.method == "resolved_rate"
-    assert str(schedule.notes["because"]).endswith("is the only one that can plan this goal.")
+    assert str(schedule.notes["because"]).endswith(
+        "is the only method that can plan for this goal."
+    )
 
 
 # -- refusals -----------------------------------------------------------------------------------
@@ -304,9 +306,9 @@ def test_one_end_effector_follows_a_path_and_the_base_is_free() -> None:
     [
         ([], "The path of 'hand' has no poses."),
         (np.zeros((0, 7)), "The path of 'hand' has no poses."),
-        ([1.0, 2.0, 3.0], r"The path of 'hand' is of shape \(3,\); each of its poses has 3"),
-        (np.ones((3, 4)), r"is of shape \(3, 4\)"),
-        (np.ones((2, 3, 3)), r"is of shape \(2, 3, 3\)"),
+        ([1.0, 2.0, 3.0], r"The path of 'hand' has shape \(3,\); each of its poses must have 3"),
+        (np.ones((3, 4)), r"has shape \(3, 4\)"),
+        (np.ones((2, 3, 3)), r"has shape \(2, 3, 3\)"),
         (np.zeros((MAX_PATH_POSES + 1, 3)), "has 10001 poses; at most 10000 are allowed."),
         (
             [[0, 0, 0], [0, np.nan, 0]],

@@ -293,7 +293,7 @@ def test_slots_in_one_plane_are_refused(count: int) -> None:
     robot = SlidingRobot(10.0, np.diag([1.0, 1.5, 1.5]), np.zeros(3), sliders)
     text = refusal_of(robot, origin(count), NEAR)
     assert "linearly independent" in text
-    assert f"{count} slider(s) of rank 2" in text
+    assert f"{count} slider(s), whose slots have rank 2" in text
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(0, 1), (1, -1), (2, 1)])
@@ -301,7 +301,7 @@ def test_a_goal_beyond_stroke_names_joint_and_stroke(axis: int, sign: int) -> No
     # 0.35 m of 16 kg is 2.8 m of 2 kg, the other way.
     position = -0.35 * sign * np.eye(3)[axis]
     text = refusal_of(paper_robot(), origin(), goal_at(position, Rotation.identity()))
-    assert "beyond stroke" in text
+    assert "beyond the stroke" in text
     assert f"'s{axis + 1}'" in text
     assert f"at {2.8 * sign:.4g} m" in text
     assert "[-2.5, 2.5] m" in text

@@ -324,7 +324,7 @@ def test_ends_in_motion_and_a_drift_shorten_the_bound() -> None:
     assert bound_of(robot, drifting, **limits, axes=WHOLE).seconds <= 0.2 / 0.1
     slow = bound_of(robot, rest, **limits, axes=WHOLE, more={"base_rate_limit": 0.01})
     assert slow.seconds == pytest.approx(20.0)
-    assert slow.reason == "the base rotates by 0.2 rad at optimal.max_base_rate at most"
+    assert slow.reason == "the base rotates by 0.2 rad at no more than optimal.max_base_rate"
     # A turn about another axis than the only one is no part of the goal.
     along = bound_of(robot, rest, **limits, axes=np.array([[1.0, 0.0, 0.0]]))
     assert along == DurationBound(0.0, "")

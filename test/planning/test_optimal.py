@@ -314,7 +314,7 @@ def test_what_one_joint_cannot_reach_is_refused_at_once(monkeypatch: pytest.Monk
         raise AssertionError("searched")
 
     monkeypatch.setattr(ManoeuvreSearch, "search", searching)
-    sentence = rf"joint 'j1', which is the only one, .* {farthest:.3f}\d* to .* rad from here"
+    sentence = rf"joint 'j1', the only joint, can .* {farthest:.3f}\d* to .* rad from here"
     with pytest.raises(PlanningError, match=sentence):
         plan(robot, rotvec=[0, 0, farthest * 1.001], start=[0.3], **ASKED)
 

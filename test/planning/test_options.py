@@ -105,9 +105,7 @@ def test_what_is_no_shape_is_refused(shape: npt.ArrayLike) -> None:
 
 
 def test_a_goal_of_the_end_effector_without_a_name_is_refused_by_that() -> None:
-    with pytest.raises(
-        GoalError, match=r"^The goal of the end-effector is 2 number\(s\); it needs 3"
-    ):
+    with pytest.raises(GoalError, match=r"^The goal of the end-effector has 2 number\(s\); give 3"):
         EndEffectorGoal.checked("", [1.0, 0.0])
     with pytest.raises(GoalError, match=r"^The end-effector has 2 goals; only one is allowed\.$"):
         Goal.of_end_effectors([EndEffectorGoal.checked("", np.ones(3))] * 2)
@@ -155,7 +153,9 @@ def test_a_call_without_ros_checks_its_options_too() -> None:
 def test_a_start_has_a_position_for_every_joint_and_a_method_is_one_of_the_registry() -> None:
     with pytest.raises(ParameterError, match=r"start has 2 joint position\(s\), .* has 3 joints"):
         plan(robot_of(ARM), start=(0.1, 0.2))
-    with pytest.raises(ParameterError, match="no gait method 'magic'; there are: lie_bracket, "):
+    with pytest.raises(
+        ParameterError, match="no gait method 'magic'; the methods are: lie_bracket, "
+    ):
         plan(robot_of(ARM), method="magic")
 
 
@@ -299,7 +299,7 @@ def test_options_by_name_are_not_dispersed() -> None:
     assert values_of(scenario.planner)["optimal.max_velocity"] == ("slider_2:0.1",)
     declaration = Parameter("optimal.max_velocity", ())
     with pytest.raises(
-        ParameterError, match="the list has strings NAME:VALUE; set a number for ea"
+        ParameterError, match="the list consists of strings NAME:VALUE; set a number for ea"
     ):
         _list_values("n", "planner", declaration, scenario)
 

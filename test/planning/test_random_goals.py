@@ -84,7 +84,7 @@ def test_two_sliders_share_a_way_up_to_the_ends_of_both_strokes_and_no_further()
             np.testing.assert_allclose(z_f, [reach, 0.0, 0.0, reach], atol=1e-9)
             continue
         text = refusal_in(partial(method.final_shape, ends, goal))
-        assert "beyond stroke" in text
+        assert "beyond the stroke" in text
         # 0.4 mm of 2 kg are missing, of 18 kg.
         assert f"no closer to it than {4e-4 * 2 / 18:.3g} m" in text
 
@@ -140,7 +140,7 @@ def test_a_jump_of_time_is_reported_with_both_times(jump: float, after: str) -> 
     assert loop.executive.phase is Phase.EXECUTING
     loop.measured.stamp_ns += round(jump * 1e9)
     loop.tick()
-    words = f"has jumped from {before} s to {after} s, for which no motion is planned."
+    words = f"has jumped from {before} s to {after} s; no motion is planned for that time."
     assert any(words in notice for notice in loop.notices), loop.notices
 
 

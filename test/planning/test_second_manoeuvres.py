@@ -223,7 +223,7 @@ def test_a_goal_shape_is_held_against_the_limits_of_its_own_joint(
     robot = unequal(tmp_path)
     method = planner_of("square_path", robot, SECOND_TICK, TOLERANCE, SECOND_TICK).method
     name = robot.joint_names[joint]
-    with pytest.raises(UnreachableError, match="beyond limits") as refusal:
+    with pytest.raises(UnreachableError, match="violates joint limits") as refusal:
         method.goal_shape(replace(goal_at(NEAR), joint_positions=np.array(shape)))
     assert f"joint '{name}' at {at} rad, but its limits are {limits} rad" in str(refusal.value)
     within = np.array([-2.85, 2.55])

@@ -300,7 +300,7 @@ def test_fewer_than_three_links_are_refused(links: int) -> None:
             "plane",
         ),
         ('ixz="0" iyy="1"', 'ixz="0.05" iyy="1"', "products of inertia"),
-        ('<origin xyz="1 0 0"/>', '<origin xyz="1 0 0.1"/>', "outside one plane"),
+        ('<origin xyz="1 0 0"/>', '<origin xyz="1 0 0.1"/>', "that do not lie in one plane"),
     ],
 )
 def test_what_is_not_planar_is_refused(old: str, new: str, mention: str) -> None:
@@ -329,7 +329,7 @@ def test_angles_written_with_six_digits_are_planar() -> None:
 def test_a_goal_out_of_the_plane_is_refused(chain: SpaceRobot, tilt: float) -> None:
     goal = goal_of(about_z(1.0) * Rotation.from_rotvec([0.6 * tilt, 0.8 * tilt, 0.0]))
     text = refusal_of(chain, at_rest(FOLDED), goal)
-    assert f"{tilt:.4g} rad off any rotation about the axis [0.0, 0.0, 1.0]" in text
+    assert f"{tilt:.4g} rad away from any rotation about the axis [0.0, 0.0, 1.0]" in text
     assert "base_link" in text
     # Within the tolerance it is as good as in the plane.
     gait = planner(chain, Tolerance(1e-3, 1.01 * tilt)).plan(at_rest(FOLDED), goal)

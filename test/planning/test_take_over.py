@@ -151,7 +151,7 @@ def test_a_goal_that_is_refused_in_motion_is_planned_for_from_rest(
     loop.propose_goal(OTHER)
     status = loop.until(PlannerState.REACHED)
     assert (status.goal_id, loop.error_to(OTHER)[0] < 1e-3) == ("goal-2", True)
-    begin = "No plan begins in motion, so the goal is planned for from"
+    begin = "No plan that begins in motion was found, so planning is repeated from"
     assert [n for n in loop.notices if n.startswith(begin)] == [
         f"{begin} a later tick: It is too far.",
         f"{begin} rest: It is too far.",

@@ -208,7 +208,7 @@ def test_joints_stop_at_their_limits() -> None:
     shapes = np.array(loop.shapes)
     assert shapes[:, 1].max() <= 2.8 + 1e-9
     assert shapes[:, 1].max() > 2.75
-    assert any("Joint 'elbow' reaches its limit at 2." in s.message for s in loop.statuses)
+    assert any("Joint 'elbow' reaches its limit of 2." in s.message for s in loop.statuses)
     most = np.array([0.6, 0.8]) * TICK
     assert np.all(np.abs(np.diff(np.array(loop.commands), axis=0)) <= most + 1e-9)
 
@@ -291,7 +291,7 @@ def test_a_goal_comes_first_and_twists_have_to_pause_before_they_count_again() -
     options: dict[str, Any] = {"link": "mass_1", "linear": [0.02, 0.0, 0.0]}
     fly(loop, 5, **options)
     loop.propose_goal(NEAR)
-    pursued = "Twists are not followed while a goal is pursued: abort it first."
+    pursued = "Twists are not followed while a goal is pursued: abort the goal first."
     assert refusal(loop, **options) == pursued
     for _ in range(400):
         loop.tick()
@@ -299,9 +299,9 @@ def test_a_goal_comes_first_and_twists_have_to_pause_before_they_count_again() -
             break
         assert refusal(loop, **options) == pursued
     assert loop.states[-1] == "reached"
-    assert refusal(loop, **options) == "Twists are ignored until none has arrived for 0.4 s."
+    assert refusal(loop, **options) == "Twists are ignored until no twist has arrived for 0.4 s."
     loop.tick(7)
-    assert refusal(loop, **options) == "Twists are ignored until none has arrived for 0.4 s."
+    assert refusal(loop, **options) == "Twists are ignored until no twist has arrived for 0.4 s."
     loop.tick(9)
     send(loop, **options)
     assert loop.executive.phase is Phase.TELEOPERATING
@@ -331,14 +331,14 @@ def test_without_a_measured_base_the_joints_brake() -> None:
         loop.tick(base=False)
     assert loop.commands[-1].tolist() == [0.0, 0.0, 0.0]
     assert loop.statuses[-1].message == (
-        "The base is not measured. The twist is followed as far as possible."
+        "The base motion is not measured. The twist is followed as far as possible."
     )
     loop.late()
     fly(loop, 3)
     assert np.abs(loop.commands[-1]).max() > 0
     loop.measured.broken = True
     loop.tick()
-    assert loop.statuses[-1].message == "The joints are not measured."
+    assert loop.statuses[-1].message == "The joint motion is not measured."
     assert loop.executive.phase is Phase.IDLE
 
 
@@ -424,7 +424,7 @@ def test_a_joint_that_lags_is_left_to_the_controller() -> None:
 def test_an_abort_leaves_the_braking_to_the_controller() -> None:
     loop = flown(ticks=60, abort_time=2.5)
     loop.tick(5)
-    assert loop.abort() == "The joints' controller has 2.5 s to bring them to rest."
+    assert loop.abort() == "The joint controller has 2.5 s to bring them to rest."
     assert loop.executive.phase is Phase.BRAKING
 
 

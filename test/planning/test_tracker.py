@@ -217,7 +217,7 @@ def test_instants_between_two_ticks_and_missed_ones_are_passed_over() -> None:
     assert not check.due(START_NS + 15 * PERIOD_NS)
     unused = check_of(schedule_of(), 0.0, 0.0)
     assert not unused.due(START_NS)
-    assert str(TrackingError(0.25, 1.5)) == "Off the path by 0.25 m and 1.5 rad"
+    assert str(TrackingError(0.25, 1.5)) == "Deviates from the path by 0.25 m and 1.5 rad"
 
 
 # -- one schedule after the other -------------------------------------------------------------

@@ -319,10 +319,11 @@ def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_pa
     read = read_flight(open_flight_bag(bag))
     for each in (flight, read):
         assert not each.verdict.complete
-        assert each.verdict.word == "Reached by the measured pose"
+        assert each.verdict.word == "Reached according to the measured pose"
     assert_all_say(bag, read, position_counts=True)
     report = page(FlightReport.of(open_flight_bag(bag)), PagePart(""), [])
-    assert '<p class="outcome reached partly"><b>Reached by the measured pose</b>' in report
+    outcome = "<b>Reached according to the measured pose</b>"
+    assert f'<p class="outcome reached partly">{outcome}' in report
     command = CliRunner().invoke(main, ["run", "faults/biased_pose", "--bag", f"{bag}.again"])
     assert (command.exit_code, command.stderr) == (1, "")
     assert command.stdout.splitlines()[0].endswith(f": {flight.verdict.sentence}")

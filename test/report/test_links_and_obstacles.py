@@ -136,7 +136,7 @@ def test_the_tables_have_goal_and_errors_of_each_link(hands: FlightReport) -> No
     assert rows["Goal of the base"] == "not controlled"
     assert not any(name.startswith(("Goal position", "Position error of the")) for name in rows)
     assert rows[f"Goal of {RIGHT}"] == "(1.10000, -0.80000, 0.30000) m, any attitude"
-    attitude = "rotation vector (0.00000, 0.78540, 0.00000) rad, 45.000° in all"
+    attitude = "rotation vector (0.00000, 0.78540, 0.00000) rad, 45.000° in total"
     assert rows[f"Goal of {LEFT}"] == f"(1.00000, 0.90000, 0.40000) m, {attitude}"
     assert rows[f"Final position of {LEFT}"] == "(1.00000, 0.90000, 0.40000) m"
     tiles = {label: (value, note) for label, value, note in headline(hands)}
@@ -354,7 +354,7 @@ def test_the_page_says_which_robot_it_shows_and_which_it_does_not(
     words = ["report", str(bag), "-o", str(page), "--namespace", "fleet/b"]
     assert CliRunner().invoke(main, words).exit_code == 0
     text = page.read_text("utf-8")
-    assert "<span>namespace /fleet/b</span><span>the bag also has /fleet/a</span>" in text
+    assert "<span>namespace /fleet/b</span><span>the bag also contains /fleet/a</span>" in text
     words = ["figures", str(bag), "--only", "joints", "--format", "svg", "-o", str(tmp_path)]
     assert CliRunner().invoke(main, [*words, "--namespace", "/fleet/b"]).exit_code == 0
     assert "joint_2" in (tmp_path / "joints.svg").read_text("utf-8")

@@ -232,7 +232,7 @@ def test_a_bag_without_a_flight_has_no_figures_and_says_so(tmp_path: Path) -> No
 def test_letters_leave_room_for_panels(bag: Path, tmp_path: Path) -> None:
     style = tmp_path / "own.mplstyle"
     style.write_text("font.size: 29\n")
-    with pytest.raises(SpaceRobotError, match="no room for panels in a figure 40 mm wide"):
+    with pytest.raises(SpaceRobotError, match="no room for the panels in a figure 40 mm wide"):
         write_figures(bag, tmp_path, ["pose"], style=style, width=40.0)
 
 

@@ -274,10 +274,10 @@ def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
 def test_a_refused_goal(tmp_path: Path) -> None:
     statuses = [
         (0.0, "Waiting for a goal pose.", {"state": "idle"}),
-        (0.0, "The goal is beyond stroke.", {"state": "refused"} | goal_value()),
+        (0.0, "The goal is beyond the stroke.", {"state": "refused"} | goal_value()),
     ]
     page = report_of(tmp_path, Story(still(), statuses, goals=[(0.0, *GOAL)]))
-    assert "The goal is beyond stroke." in page.text
+    assert "The goal is beyond the stroke." in page.text
     assert numbers_in(page.number("Goal position (refused)")) == GOAL[0]
     assert "Manoeuvre" not in page.tiles
 

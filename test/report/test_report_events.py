@@ -200,7 +200,7 @@ def test_the_table_has_the_estimated_body(monkeypatch: pytest.MonkeyPatch) -> No
     (text,) = (value for name, value in result_table(report).rows if name == "Held body, estimated")
     assert re.fullmatch(
         r"mass (10|9\.9999\d*) ± \de-\d\d kg; centre of mass \(0\.27\d+, -0\.1\d+, -?0[.0]*\) m in "
-        "end_effector; not determined by its motion: Ixx, Iyy, Ixy",
+        "end_effector; not determined by the motion: Ixx, Iyy, Ixy",
         text,
     ), text
 
@@ -224,11 +224,11 @@ def test_the_text_of_an_estimate_leaves_out_unknown_parameters() -> None:
     )
     some = np.where(np.arange(10) == 2, np.nan, numbers)
     assert payload_text(PayloadEstimate("hand", some, spread, np.zeros((0, 10)), False)) == (
-        "mass 2 ± 0.03 kg; not determined by its motion: m cy"
+        "mass 2 ± 0.03 kg; not determined by the motion: m cy"
     )
     none = np.full(10, np.nan)
     assert payload_text(PayloadEstimate("hand", none, none, np.eye(10), False)).startswith(
-        "not determined by its motion: m, m cx"
+        "not determined by the motion: m, m cx"
     )
 
 

@@ -163,7 +163,7 @@ def test_a_goal_that_is_reached_but_for_a_part_is_not_called_reached(tmp_path: P
     ]
     text = page(flight(tmp_path, statuses), PagePart(""), [])
     assert (
-        '<p class="outcome reached partly"><b>Reached, but for the position</b>'
+        '<p class="outcome reached partly"><b>Reached, except for the position</b>'
         "Done. Not controlled: position.</p>"
     ) in text
 
@@ -171,9 +171,9 @@ def test_a_goal_that_is_reached_but_for_a_part_is_not_called_reached(tmp_path: P
 def test_the_numbers_of_the_run(tmp_path: Path) -> None:
     assert result_table(flight(tmp_path)).rows == [
         ("Goal position", "(1.00000, 2.00000, 3.00000) m"),
-        ("Goal attitude", "rotation vector (0.00000, -0.10000, 0.00000) rad, 5.730° in all"),
+        ("Goal attitude", "rotation vector (0.00000, -0.10000, 0.00000) rad, 5.730° in total"),
         ("Final position", "(0.70000, 2.00000, 3.40000) m"),
-        ("Final attitude", "rotation vector (0.00000, 0.20000, 0.00000) rad, 11.459° in all"),
+        ("Final attitude", "rotation vector (0.00000, 0.20000, 0.00000) rad, 11.459° in total"),
     ]
 
 

@@ -127,7 +127,7 @@ def test_kills_need_nodes_in_real_time(tmp_path: Path, nodes: bool) -> None:
     scenario = load_scenario(f"faults/{KILLED}")
     with pytest.raises(ParameterError) as caught:
         run_scenario(scenario, tmp_path / "run.mcap", nodes=nodes)
-    assert_one_sentence(str(caught.value), "kills nodes in flight", "--nodes", "--realtime")
+    assert_one_sentence(str(caught.value), "kills nodes during the flight", "--nodes", "--realtime")
     assert not (tmp_path / "run.mcap").exists()
 
 

@@ -292,7 +292,7 @@ TYPES = get_typestore(Stores.ROS2_JAZZY)
 
 
 def messages(bag: Path) -> dict[str, list[str]]:
-    """Return the messages of each topic as texts.
+    """Return the messages on each topic as texts.
 
     When a message has come to the recorder is not compared: nodes do not wait for each other there.
     """
@@ -478,7 +478,7 @@ def test_unreachable_goal_is_summed_up_too(tmp_path: Path) -> None:
     result = run_scenario(scenario, tmp_path / "run.mcap")
     assert not result.succeeded
     assert result.summary["state"] == "refused"
-    assert "beyond stroke" in result.message
+    assert "beyond the stroke" in result.message
     assert "slider_1" in result.message
 
 

@@ -339,13 +339,13 @@ def test_another_end_effector_is_heard_by_the_planner_without_being_listed() -> 
 @pytest.mark.parametrize(
     ("goals", "message"),
     [
-        ("{link_7: [1.0, 2.0]}", "needs 3, a position, or 7"),
+        ("{link_7: [1.0, 2.0]}", r"give 3 \(a position\) or 7"),
         ("{link_7: [0, 0, 1, 0, 0, 0, 0]}", "zero quaternion"),
         ("[1.0, 2.0, 3.0]", r"must map names to poses, not \[1.0, 2.0, 3.0\]\.$"),
         ("1.5", r"must map names to poses, not 1.5\.$"),
         ("{link_7: far}", "is not a list of numbers"),
         ("{link_7: [[0, 0, 1], [0, 0, 1, 0]]}", "is not a list of numbers"),
-        ("{link_7: [[0, 0, 1, 0], [0, 0, 1, 0]]}", "each of its poses has 3 numbers"),
+        ("{link_7: [[0, 0, 1, 0], [0, 0, 1, 0]]}", "each of its poses must have 3 numbers"),
     ],
 )
 def test_goals_of_a_file_that_are_none_are_refused(

@@ -300,7 +300,7 @@ def test_refusals() -> None:
     with pytest.raises(CommandError) as error:
         capturing.capture()
     assert str(error.value) == (
-        "'end_effector' holds the target 'block' already: call '~/release' first."
+        "'end_effector' already holds the target 'block': call '~/release' first."
     )
 
 

@@ -343,8 +343,8 @@ def test_slow_plants_brake_without_a_joint_turning_back(tick_rate: float) -> Non
 @pytest.mark.parametrize(
     ("stamp", "now", "clause"),
     [
-        (3.15, 7.4, "it is stale: stamped 3.15 s, the plant is at 7.4 s"),
-        (7.45, 7.4, "it is ahead of time: stamped 7.45 s, the plant is at 7.4 s"),
+        (3.15, 7.4, "it is stale: stamped 3.15 s, while the plant is at 7.4 s"),
+        (7.45, 7.4, "it is ahead of time: stamped 7.45 s, while the plant is at 7.4 s"),
     ],
 )
 def test_in_lockstep_a_refusal_names_both_times(stamp: float, now: float, clause: str) -> None:
@@ -365,9 +365,9 @@ def test_in_real_time_a_refusal_says_how_far_off_it_is(
     rig = real_time()
     assert clause_of(rig, stamp, now) == clause
     assert rig.offer(round(7.4 * SECOND), round(7.4 * SECOND)) is None
-    assert clause_of(rig, 7.15, 7.4) == "it is 0.25 s older than the one in force"
+    assert clause_of(rig, 7.15, 7.4) == "it is 0.25 s older than the active command"
     rig.joints.commanders = 3
-    same = "a command for the same state is in force, and 3 nodes command"
+    same = "a command for the same state is active, and 3 nodes send commands"
     assert clause_of(rig, 7.4, 7.4) == same
     assert rig.commands.fault == f"a command on 'joint_commands' was refused: {same}"
 
@@ -417,7 +417,7 @@ def test_names_and_lengths() -> None:
     assert read(["c", "a", "b"], [3.0, 1.0, 2.0]) == [1.0, 2.0, 3.0]
     for named, words in (
         (["c", "x"], "'x' is unknown"),
-        (["a", "b"], "'c' is missing: a message must name all joints"),
+        (["a", "b"], "'c' is missing: each message must name all joints"),
         ([], "'a' is missing"),
         (["a", "a", "b"], "named twice"),
     ):

@@ -280,8 +280,8 @@ TABLE = TableConfig(tilt=0.01)
         (
             "planar_manipulator",
             {"orbit": OrbitConfig(mean_motion=0.001), "table": TABLE},
-            "Parameters 'table.*' and 'orbit.*' are both set: a robot is either on a table or in "
-            "an orbit.",
+            "Parameters 'table.*' and 'orbit.*' are both set: a robot can be either on a table or "
+            "in an orbit.",
         ),
         (
             "servicer",

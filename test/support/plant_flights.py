@@ -33,7 +33,7 @@ from spacerobot_ros.simulation.sensors import Sensors
 from spacerobot_ros.times import SECOND
 
 _Commands = Callable[[int, Plant | Sensors], Sequence[Array]]
-"""Function from a tick and a measured state to a flight's commands."""
+"""Function that returns the commands of a flight for a tick and a measured state."""
 
 
 def fly_one_by_one(flights: Flights) -> BatchResult:

@@ -238,14 +238,14 @@ def test_what_follows_a_latched_fault_is_said_to(tmp_path: Path) -> None:
     difference = verify_bag(made).difference
     assert difference is not None
     assert difference.time == pytest.approx(6 * TICK)
-    assert difference.remark == " (a fault latched at 0.4 s; rearming is not in a bag)"
+    assert difference.remark == " (a fault latched at 0.4 s; rearming is not recorded)"
     # In the tick after it latched that is why it rests.
     moved = [RATES] * 10
     made = Made(moved, commands, config=config).write(tmp_path / "c.mcap")
     difference = verify_bag(made).difference
     assert difference is not None
     assert difference.time == pytest.approx(5 * TICK)
-    assert difference.remark == " (a fault latched at 0.4 s; rearming is not in a bag)"
+    assert difference.remark == " (a fault latched at 0.4 s; rearming is not recorded)"
 
 
 @pytest.mark.parametrize("prefix", ["", "/a"])
@@ -254,7 +254,7 @@ def test_the_refusal_of_a_command_is_named(tmp_path: Path, prefix: str) -> None:
     difference = verified(tmp_path, [RATES] * 10, commands, prefix=prefix).difference
     assert difference is not None
     assert difference.time == pytest.approx(5 * TICK)
-    assert f"that on {prefix}/joint_commands stamped 0.4 s is rejected:" in difference.remark
+    assert f"the command on {prefix}/joint_commands stamped 0.4 s is rejected:" in difference.remark
 
 
 def test_states_after_the_end_of_its_plant_are_differences(
@@ -606,7 +606,7 @@ def test_a_refused_command_is_named_with_the_reason(tmp_path: Path) -> None:
     difference = verify_bag(bag).difference
     assert difference is not None
     assert difference.time == pytest.approx(121 * TICK)
-    assert "that on /joint_commands stamped 12 s is rejected: a value is not finite" in str(
+    assert "the command on /joint_commands stamped 12 s is rejected: a value is not finite" in str(
         difference
     )
 
@@ -619,7 +619,7 @@ def test_a_latched_fault_is_named_with_its_time(tmp_path: Path) -> None:
     difference = verify_bag(bag).difference
     assert difference is not None
     assert difference.time == pytest.approx(121 * TICK)
-    assert "a fault latched at 12 s; rearming is not in a bag" in str(difference)
+    assert "a fault latched at 12 s; rearming is not recorded" in str(difference)
 
 
 @pytest.mark.parametrize("tick", [0, 33])

@@ -207,7 +207,7 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         looked.keep("look-back")
         page.press("Back to the present")
         page.press("Abort goal")
-        page.wait_for_text("Aborted on request; the robot holds.", "Plant running")
+        page.wait_for_text("Aborted on request; the robot holds its pose.", "Plant running")
         looked.keep("aborted")
         page.press("Stop all")
         page.wait_for_text(

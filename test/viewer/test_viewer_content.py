@@ -338,7 +338,7 @@ def test_the_momentum_budget_is_that_of_the_controller() -> None:
     assert "dumped" not in text
     dumping = controlled(momentum=parts, wheels=shares, dumping=True)
     (line,) = re.findall(
-        "<[^<]*>The momentum of the wheels is being dumped.", content.momentum_html(dumping)
+        "<[^<]*>The wheel momentum is being dumped.", content.momentum_html(dumping)
     )
     assert "#c98a00" in line, "a warning"
 

@@ -81,7 +81,7 @@ class Stack:
 
     def describe(self, urdf: str = URDF) -> None:
         self.description.publish(String(data=urdf))
-        plant = PlantStatus(PlantState.RUNNING, "A command is in force.")
+        plant = PlantStatus(PlantState.RUNNING, "A command is active.")
         values = [KeyValue(key=k, value=v) for k, v in plant.to_values().items()]
         self.status.publish(DiagnosticStatus(name="/robot", values=values, message=plant.message))
 
@@ -363,7 +363,7 @@ def test_an_address_that_others_reach_is_warned_of_and_a_wrong_one_is_refused(
         node("no.such.host.invalid")
     harness.add(node("0.0.0.0"))
     said = capfd.readouterr()
-    assert "anyone who can reach this machine there can steer the robot" in said.err
+    assert "anyone who can reach this address can steer the robot" in said.err
     assert said.out.startswith("viewer      http://127.0.0.1:")
 
 

@@ -19,7 +19,7 @@ class ComputedTorqueLaw(ControlLaw):
 
     Here ``u = qddot_ref + Kd (qdot_ref - qdot) + Kp (q_ref - q)`` (Kp in 1/s^2, Kd in 1/s). The
     base reacts with ``omegadot = -D^-1 (D_q u + C_omega)``, the base rows of eq. (19) of paper 4
-    without a wrench; inserted into the joint rows this gives ``Js = D_qq - D_q' D^-1 D_q`` and
+    without a wrench; inserted into the joint rows, this gives ``Js = D_qq - D_q' D^-1 D_q`` and
     ``Fs = C_q - D_q' D^-1 C_omega``. This form holds for any spatial tree and any momentum; the
     paper's case is a planar chain without angular momentum. No wrench is commanded, so both momenta
     are conserved.

@@ -35,8 +35,8 @@ _FASTEST_DAMPING = 2.0
 """Largest automatic Kd for accelerations, 1/s: errors decay within seconds."""
 
 _DAMPING_PER_PERIOD = 0.4
-"""Largest product of automatic Kd and the control period: 1 is unstable if commands arrive one
-period late, and 2 if they do not."""
+"""Largest product of automatic Kd and the control period: the loop is unstable at 1 if commands
+arrive one period late, and at 2 if they do not."""
 
 _CRITICAL_STIFFNESS = 1 / 4
 """Ratio of automatic Kp to the square of Kd, for accelerations: critical damping."""
@@ -51,13 +51,12 @@ singularities."""
 
 @dataclass(frozen=True)
 class GainPair:
-    """Proportional, derivative and integral gain for each output in a group: entries of Kp, Kd and
+    """Proportional, derivative and integral gains for each output in a group: entries of Kp, Kd and
     Ki.
 
-    Their units depend on the law (:attr:`ControlLaw.gain_units`): a force or torque per error and
-    per
-    error rate with ``transposed_jacobian``, an acceleration per error and per error rate with laws
-    that use the inertia. The unit of Ki is that of Kp per second.
+    The units of the gains depend on the law (:attr:`ControlLaw.gain_units`): a force or torque per
+    error and per error rate with ``transposed_jacobian``, an acceleration per error and per error
+    rate with laws that use the inertia. The unit of Ki is that of Kp per second.
 
     Automatic gains depend on the robot and the control period (:meth:`ControlLaw.set_gains`).
 
@@ -90,8 +89,8 @@ class GainPair:
     )
     ki: float = nonnegative(
         0.0,
-        "integral gain, against constant disturbances; 0: none. N/(m s) or N m/(rad s) with laws "
-        "that command forces, 1/s^3 with laws that command accelerations",
+        "integral gain, which removes errors due to constant disturbances; 0: none. N/(m s) or N "
+        "m/(rad s) with laws that command forces, 1/s^3 with laws that command accelerations",
         "by law",
         maximum=1e9,
         read_only=False,
@@ -101,7 +100,7 @@ class GainPair:
 def _matrix_parameter(name: str) -> Any:
     return parameter(
         (),
-        f"matrix {name} for all outputs, row by row in the order of the statuses' errors, "
+        f"matrix {name} for all outputs, row by row in the order of the errors in statuses, "
         f"symmetric and positive definite; []: the {name.lower()} of the groups",
         "by law",
         maximum=1e9,
@@ -174,7 +173,7 @@ def _checked_matrix(
     if len(numbers) != m * m:
         raise ParameterError(
             f"Parameter 'gains.{name}' has {len(numbers)} values; the {m} outputs of the law "
-            f"({labels}) take {m * m}, row by row."
+            f"({labels}) require {m * m}, row by row."
         )
     matrix = np.reshape(numbers, (m, m)).astype(float)
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
@@ -189,7 +188,7 @@ class LawStatus:
     """Conditioning of the last command.
 
     ``smallest_singular_value`` of ``J_z`` in SI units; ``singular``: whether it is below the law's
-    threshold; ``damping``: added to that singular value in quadrature, zero if not needed.
+    threshold; ``damping``: added in quadrature to the smallest singular value; zero if not needed.
     """
 
     smallest_singular_value: float
@@ -384,7 +383,7 @@ class ControlLaw(ABC):
         """Change the gains from the next command on.
 
         Automatic gains make every error critically damped, as fast as the control period permits;
-        if the law commands forces, they are scaled by the masses (:meth:`automatic_effort`).
+        if the law commands forces, the gains are scaled by the masses (:meth:`automatic_effort`).
 
         Raises
         ------
@@ -429,7 +428,7 @@ class ControlLaw(ABC):
         return filled_kp, np.where(kd > 0, kd, rate)
 
     def integrate_error(self, duration: float, *, limited: bool = False) -> None:
-        """Add the error at the last command, held for ``duration`` (s), to the integral.
+        """Integrate the error at the last command over ``duration`` (s).
 
         If the command was ``limited``, an integral may only shrink (anti-windup).
         """
@@ -444,7 +443,8 @@ class ControlLaw(ABC):
     def start(self, time: float, start: Reference, goal: Reference) -> None:
         """Restart the law: at ``time`` (s), the reference starts towards new goals.
 
-        A stateful law initialises its state here, after calling this method.
+        A stateful law overrides this method: it calls the method of the base class, then
+        initialises its state.
         """
         self.reset_integral()
 
@@ -468,11 +468,11 @@ class ControlLaw(ABC):
 
     @property
     def takes_matrices(self) -> bool:
-        """Whether gains may be matrices, which act through the law's integral term."""
+        """Whether gains may be matrices; they act through the law's integral term."""
         return self._has_integral
 
     def command(self, state: ControlState, reference: Reference) -> Actuation:
-        """Return the thruster wrench and the joint efforts, unlimited.
+        """Return the unlimited thruster wrench and joint efforts.
 
         Raises
         ------
@@ -493,15 +493,16 @@ class ControlLaw(ABC):
         return self.actuation(reference)
 
     def slowest_decay(self) -> float:
-        """Return the decay rate (1/s) of the slowest error near the last state, at rest."""
+        """Return the decay rate (1/s) of the error that decays slowest, near the last state with
+        the robot at rest."""
         Kp, Kd, _ = self._acceleration_gains()
         m = self.outputs.m
         motion = np.block([[np.zeros((m, m)), np.eye(m)], [-Kp, -Kd]])
         return float(-np.linalg.eigvals(motion).real.max())
 
     def sampling_warning(self) -> str:
-        """Return a warning if errors grow near the last state, at rest, when commands are held for
-        a control period and arrive one period late; empty if errors decay.
+        """Return a warning if errors grow near the last state, with the robot at rest, when
+        commands are held for a control period and arrive one period late; empty if errors decay.
         """
         Kp, Kd, mobility = self._acceleration_gains()
         m, h = self.outputs.m, self.control_period
@@ -560,7 +561,8 @@ class ControlLaw(ABC):
         return self._out["error"].copy()
 
     def largest_error_share(self, bounds: Array) -> float:
-        """Return the largest error at the last command as a fraction of its bound (m,), > 0."""
+        """Return the largest error at the last command as a fraction of the positive bound on that
+        error (m,)."""
         # Of numpy's, as the largest number of Python may hide one that is none: it must not count
         # as reached.
         return float(np.abs(self._out["error"] / bounds).max(initial=0.0))
@@ -583,15 +585,16 @@ class ControlLaw(ABC):
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
         """Return the law's additional function arguments, by name, with their initial values.
 
-        They follow the state, reference and gains; :meth:`actuation` may change them in
+        These arguments follow the state, reference and gains; :meth:`actuation` may change them in
         ``self._in``.
         """
         return {}
 
     @property
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """Arguments of :attr:`function` other than state, reference and gains, if equal in all
-        flights; None if some depend on the flight, or if the function is not the whole command.
+        """Arguments of :attr:`function` other than state, reference and gains, if these are the
+        same in all flights; None if some depend on the flight, or if the function does not compute
+        the whole command.
 
         The latter is assumed if a law overrides a step of the command but not :meth:`is_complete`.
         """
@@ -616,9 +619,9 @@ class ControlLaw(ABC):
 
         ``actuation`` (6 + n,) is the command: force (N) and torque (N m) at the base link origin in
         base components, then the joint efforts; other results are specific to the law.
-        ``symbols`` has ``kp`` and ``kd`` (m,), ``integral`` (m,), to be added to ``kp`` times the
-        error, and one symbol per name of :meth:`inputs`; all others are in ``self.outputs``. If
-        ``actuation`` does not depend on ``integral``, the law rejects integral gains.
+        ``symbols`` contains ``kp``, ``kd`` and ``integral`` (m,), to be added to ``kp`` times the
+        error, and one symbol per name of :meth:`inputs`; all other symbols are in ``self.outputs``.
+        If ``actuation`` does not depend on ``integral``, the law rejects integral gains.
         """
 
     def actuation(self, reference: Reference) -> Actuation:

@@ -28,8 +28,8 @@ class ModelBasedOptions(LawOptions):
     )
     posture_stiffness: float = nonnegative(
         0.0,
-        "stiffness pulling non-output joints towards the joint reference, without moving any "
-        "output",
+        "stiffness that pulls joints that are not outputs towards the joint reference, without "
+        "moving any output",
         "1/s^2",
         maximum=1000000000.0,
     )
@@ -45,17 +45,18 @@ class ModelBasedLaw(ControlLaw):
 
     This also holds for fewer outputs than degrees of freedom: ``xi`` is the desired acceleration in
     the null space of ``J_z``, which does not move any output. It damps all velocities and
-    optionally pulls the joints towards the joint reference. For a square J_z, it cancels.
+    optionally pulls the joints towards the joint reference. For a square J_z, ``xi`` cancels.
 
-    Near a singularity of J_z (smallest singular value ``s`` below the threshold ``t``) no bounded
+    Near a singularity of J_z (smallest singular value ``s`` below the threshold ``t``), no bounded
     force accelerates the outputs along the singular direction ``u``. There, the law is damped:
 
     * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to its value for
     ``s = t``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
       Accelerations along v stay bounded; other directions are unaffected.
-    * Velocity along v, which the outputs no longer show, so that their Kd does not act on it, is
-    damped directly with the largest Kd. If the reference describes a single motion, motion along
-      v follows its joints instead, critically damped.
+    * Velocity along v is not visible in the outputs, so the Kd of the outputs does not act on it.
+      It is damped
+      directly with the largest Kd. If the reference describes a single motion, motion along v
+      follows the joints of that motion instead, with critical damping.
 
     Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
 
@@ -86,8 +87,8 @@ class ModelBasedLaw(ControlLaw):
     @property
     @override
     def fixed_inputs(self) -> Mapping[str, npt.ArrayLike] | None:
-        """The fixed arguments; None if there is a posture, because it depends on the reference or
-        the state."""
+        """The fixed arguments; None if there is a posture, which depends on the reference or the
+        state."""
         return None if self.options.posture_stiffness else super().fixed_inputs
 
     @override

@@ -31,7 +31,7 @@ class NumpyLaw(ControlLaw):
 
     @abstractmethod
     def compute(self, state: ControlState, reference: Reference) -> Actuation:
-        """Return the base wrench and the joint efforts, unlimited.
+        """Return the unlimited base wrench and joint efforts.
 
         Parameters
         ----------
@@ -44,7 +44,7 @@ class NumpyLaw(ControlLaw):
         Returns
         -------
         Actuation
-            ``wrench_B`` (6,), force (N) over torque (N m) at the base link origin in base
+            ``wrench_B`` (6,), force (N), then torque (N m) at the base link origin in base
             components, and ``tau`` (n,), joint efforts (N or N m).
         """
 

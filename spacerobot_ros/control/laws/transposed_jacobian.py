@@ -29,11 +29,10 @@ class TransposedJacobianOptions(LawOptions):
 class TransposedJacobianLaw(ControlLaw):
     """Paper 4, eqs (29) and (30): ``[f; n; tau] = J_q^-T J_z' (Kp e + Kd edot)``.
 
-    The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates: the
+    The product ``J_z J_q^-1`` maps the base twist and the joint rates to the output rates. The
     masses cancel, and the law requires only the robot's geometry. No potentially singular matrix is
-    inverted: if the errors are bounded, so is the command, even near a singularity of ``J_z``.
-    It has no
-    acceleration feedforward. Automatic gains are matrices that depend on the masses, with
+    inverted: if the errors are bounded, so is the command, even near a singularity of ``J_z``. It
+    has no acceleration feedforward. Automatic gains are matrices that depend on the masses, with
     feedforward (:meth:`.ControlLaw.automatic_effort`).
 
     If there are fewer outputs than degrees of freedom, eq. (29) does not act on the remaining

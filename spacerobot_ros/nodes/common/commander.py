@@ -1,4 +1,4 @@
-"""Base class of the nodes that command a plant: it converts a commander's messages."""
+"""Base class of the nodes that command a plant; it converts the messages of a commander."""
 
 from __future__ import annotations
 
@@ -53,19 +53,21 @@ _WAITING_STATE_CHECK_PERIOD = 0.1  # wall s
 _STATUS_LOG_PERIOD = 5.0  # wall s, of statuses that do not count
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
-"""Maximum wall time between diagnostics in runs that need not be repeatable, s."""
+"""Maximum wall time, s, between diagnostics in runs that need not be repeatable."""
 
 _STATUS_QOS = QoSProfile(
     depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""QoS of plant/status: no status may be lost, so the queue is deeper than for latched topics."""
+"""QoS of plant/status; no status may be lost, so the queue is deeper than that of latched
+topics.
+"""
 
 
 class CommanderNode(FlightNode):
-    """A node around a :class:`Commander`: it converts messages and owns topics, services and
-    timers.
+    """A node that wraps a :class:`Commander`: the node converts messages and owns topics,
+    services and timers.
 
-    If no robot is configured, it uses the latest robot_description.
+    If no robot is configured, the node uses the latest robot_description.
     """
 
     role = Role.COMMANDER
@@ -91,7 +93,7 @@ class CommanderNode(FlightNode):
 
     @abstractmethod
     def make_commander(self) -> Commander:
-        """Return a commander with the current parameters, hosted by this node."""
+        """Return a commander that has the current parameters and this node as its host."""
 
     def listen(self, status_topic: str) -> None:
         """Subscribe to the topics common to all commanders, and use the configured robot.
@@ -148,7 +150,9 @@ class CommanderNode(FlightNode):
         """Set the robot."""
 
     def decoder_of(self, robot: SpaceRobot) -> MessageDecoder:
-        """Return a decoder for a robot; it also merges the robot's partial joint states."""
+        """Return a decoder for a robot; the decoder also merges partial joint states of the
+        robot.
+        """
         joints = robot.description.moving_joints
         followers = [joint.name for joint in joints if joint.mimic is not None]
         self._decoder = MessageDecoder(robot.joint_names, followers)
@@ -185,7 +189,7 @@ class CommanderNode(FlightNode):
         return now_ns / SECOND if now_ns else None
 
     def on_silence(self, silence: SilenceReport) -> None:
-        """Drop all goals if the plant is silent and the parameters require it."""
+        """Drop all goals if the plant is silent and the parameters require this."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
             self.commander.give_up_goals(PlantStopped(silence.message))
@@ -255,7 +259,7 @@ class CommanderNode(FlightNode):
         self.receive(key, message, lambda: self.read_goal(key, message))
 
     def receive(self, key: str, message: PoseStamped | Path, read: Callable[[], Goal]) -> None:
-        """Pass the goal returned by ``read`` to the commander; log it if accepted."""
+        """Pass the goal returned by ``read`` to the commander; log the goal if it is accepted."""
         stamp, part = message.header.stamp, key.replace("_", "-")
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
@@ -280,13 +284,13 @@ class CommanderNode(FlightNode):
         return self.goal_of_link(end_effector_goal(key, message, frame, what, self.pose_of))
 
     def goal_of_link(self, aim: EndEffectorGoal) -> Goal:
-        """Return the goal of one end-effector; the default one has no name."""
+        """Return the goal of one end-effector; the default end-effector has no name."""
         if aim.link == DEFAULT_END_EFFECTOR:
             aim = replace(aim, link="")
         return Goal.of_end_effectors([aim], joint_positions=self.goal_shape)
 
     def pose_of(self, frame: str) -> Array | None:
-        """Return the pose (7,) of a frame in the world; None: it is not known."""
+        """Return the pose (7,) of a frame in the world; None if the pose is unknown."""
         own: dict[str, tuple[str, Array]] = {}
         robot, states = self.commander.robot, self.commander.states
         if robot is not None and states.odom and states.joints:
@@ -326,8 +330,8 @@ class CommanderNode(FlightNode):
         if self._has_foreign_statuses():
             self._doubted = True
             self.get_logger().warning(
-                "plant/status has more publishers than odom. It is ignored until only the plant "
-                "publishes it.",
+                "plant/status has more publishers than odom has. The topic is ignored until only "
+                "the plant publishes it.",
                 throttle_duration_sec=_STATUS_LOG_PERIOD,
             )
             return

@@ -31,9 +31,9 @@ from spacerobot_ros.planning.core.goal import Goal, Tolerance
 from spacerobot_ros.times import SECOND
 
 _RESULT_TIMEOUT = 60
-"""Time for which a server keeps the result of a completed goal, s.
+"""Time, s, for which a server keeps the result of a completed goal.
 
-Each kept goal slows down later goals.
+Each stored result slows down the processing of later goals.
 """
 
 _NAV2_FAILURE = 9000
@@ -44,11 +44,11 @@ _BASE_GOAL_NAME = "The goal of the base"
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Facts about a node that are needed to read a goal."""
+    """Data from the node that are needed to read goals."""
 
     world_frame: str
     joint_names: Sequence[str] | None
-    """Joints of the robot; None: there is no robot yet."""
+    """Joints of the robot; None if there is no robot yet."""
     pose_of: Callable[[str], Array | None]
     """Returns the pose (7,) of another frame in the frame of goals; None if unknown."""
 
@@ -65,18 +65,18 @@ class FlyToAction:
     name: ClassVar = "~/fly_to"
 
     def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
-        """Return the goal of a request, or raise PlanningError: it is refused."""
+        """Return the goal in a request; raise PlanningError if the goal is rejected."""
         links, poses = list(request.end_effectors), list(request.end_effector_poses)
         if len(links) != len(poses):
             raise PlanningError(
-                f"The goal has {len(links)} end-effector(s) and {len(poses)} pose(s): give each "
-                "end-effector one pose."
+                f"The goal has {len(links)} end-effector(s) and {len(poses)} pose(s): give "
+                f"exactly one pose for each end-effector."
             )
         joints = request.joint_positions
         if len(joints.name) != len(joints.position):
             raise PlanningError(
                 f"The goal has {len(joints.name)} joint name(s) and {len(joints.position)} joint "
-                "position(s): give each joint one position."
+                "position(s): give exactly one position for each joint."
             )
         if not links and not request.base_pose:
             alone = "has only joint positions" if joints.name else "is empty"
@@ -136,11 +136,11 @@ class NavigateToPoseAction:
     name: ClassVar = "~/navigate_to_pose"
 
     def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
-        """Return the goal of a request, or raise PlanningError: it is refused."""
+        """Return the goal in a request; raise PlanningError if the goal is rejected."""
         if request.behavior_tree:
             raise PlanningError(
-                f"The goal names the behavior tree '{request.behavior_tree}': none are supported; "
-                "leave it empty."
+                f"The goal names the behavior tree '{request.behavior_tree}': behavior trees are "
+                f"not supported, so leave it empty."
             )
         return FlyTo(
             goal_of(
@@ -165,7 +165,7 @@ class NavigateToPoseAction:
         return message
 
     def result(self, result: FlyToResult) -> Any:
-        """Return a result as a message; in ROS 2 Humble it is empty."""
+        """Return a result as a message; in ROS 2 Humble, the message is empty."""
         message = self.kind.Result()
         if hasattr(message, "error_code"):
             message.error_code = 0 if result.outcome == "reached" else _NAV2_FAILURE
@@ -175,7 +175,7 @@ class NavigateToPoseAction:
 
 
 GoalAction = FlyToAction | NavigateToPoseAction
-"""An action for goals; ``name`` is that of its server, below the node's."""
+"""An action for goals; ``name`` is the name of the action server, relative to the node name."""
 
 
 class _Server(ActionServer):
@@ -217,9 +217,9 @@ class GoalClient:
 
 
 class GoalActions:
-    """A commander node's action servers; they exist as long as the node.
+    """The action servers of a commander node, which exist as long as the node.
 
-    A client therefore receives the result of a goal that a cleanup of the node has ended. While the
+    Therefore, if a cleanup of the node ends a goal, the client still receives the result. While the
     node is not configured, goals are rejected.
     """
 

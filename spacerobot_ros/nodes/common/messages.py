@@ -32,10 +32,14 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
 _MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
-"""Numbers of stored /tf and /tf_static messages: a few seconds from several publishers."""
+"""Numbers of stored /tf and /tf_static messages, enough for a few seconds from several
+publishers.
+"""
 
 _MAX_CHAINED_FRAMES = 1000
-"""Maximum number of frames between a frame and the world; received frames may form a cycle."""
+"""Maximum number of frames between a frame and the world; needed because received frames may form
+a cycle.
+"""
 
 _SHORTEST_QUATERNION = 1e-6
 """Minimum quaternion norm in a message."""
@@ -44,12 +48,13 @@ _SHORTEST_QUATERNION = 1e-6
 def message_class(type_name: str) -> Any:
     """Return the class of a type such as ``nav_msgs/msg/Odometry``.
 
-    Names also come from bags, so only packages with installed definitions are imported.
+    Names may come from bags, so only packages with installed definitions are imported.
 
     Raises
     ------
     SpaceRobotError
-        Its package is not installed; the message completes a sentence about a topic.
+        The package with the type is not installed; the error message completes a sentence about a
+        topic.
     """
     try:
         module, interface, name = message_module(type_name)
@@ -75,7 +80,7 @@ def interface_class(module: str, name: str) -> Any | None:
 
 
 def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
-    """Return a message with the joint positions required at a goal; empty if there are none."""
+    """Return a message with the joint positions required by a goal; empty if there are none."""
     positions = goal.joint_positions
     if positions is None:
         return JointState()
@@ -105,7 +110,7 @@ def goal_of(
 ) -> Goal:
     """Return the goal of a pose message in ``frame``, with joint positions ``shape``.
 
-    An all-NaN position or orientation is not required.
+    A position or orientation whose values are all NaN is not part of the goal.
 
     ``pose_of`` returns the pose (7,) of another frame in ``frame``; None if unknown.
 
@@ -176,7 +181,7 @@ def path_poses(
     """Return the poses (K, 7) of a path message in ``frame``, or their positions (K, 3).
 
     Only positions are returned if all orientations are zeros. ``pose_of``: see :func:`goal_of`. A
-    pose without a frame is in the path's frame.
+    pose without a frame name is in the frame of the path.
 
     Raises
     ------
@@ -194,7 +199,7 @@ def path_poses(
         k = int(back[0]) + 1
         raise PlanningError(
             f"{what} goes back in time: pose {k + 1} is stamped {times[k] / SECOND:.9g} s, after "
-            f"{times[k - 1] / SECOND:.9g} s; omit the stamps, or put the poses in order."
+            f"{times[k - 1] / SECOND:.9g} s; omit the stamps, or sort the poses by time."
         )
     for name in dict.fromkeys(given):
         other = _pose_of_frame(name, frame, what, pose_of)
@@ -248,9 +253,9 @@ def transform_class() -> Any | None:
 
 
 class KnownFrames:
-    """The frames known to a node: from the robot's state, and from /tf if available.
+    """The frames known to a node, from the robot state and, if available, from /tf.
 
-    Messages of /tf are stored serialised and read when a frame is requested.
+    Messages from /tf are stored in serialised form and read when a frame is requested.
     """
 
     def __init__(self, node: Any) -> None:
@@ -274,8 +279,8 @@ class KnownFrames:
     def pose(self, frame: str, world: str, own: dict[str, tuple[str, Array]]) -> Array | None:
         """Return the last known pose (7,) of a frame in the world.
 
-        ``own`` maps frames to their parent and their pose in it, and overrides /tf. None if the
-        frames are not connected.
+        ``own`` maps each frame to its parent and its pose in the parent frame, and overrides /tf.
+        None if the frames are not connected.
         """
         parents = {**self._received_parents(), **own}
         pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

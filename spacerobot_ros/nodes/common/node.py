@@ -42,7 +42,9 @@ from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport
 from spacerobot_ros.parameters import Parameter, configured, declared, values_of
 
 STREAM = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS for states, commands and events: reliable, with a queue for readers that are briefly busy."""
+"""QoS for states, commands and events: reliable, with a queue for readers that are busy for a
+short time.
+"""
 
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS for state topics from sensor drivers, which do not resend lost messages."""
@@ -68,14 +70,14 @@ _STATES_THAT_CAN_SHUT_DOWN = (
 
 
 class FlightNode(LifecycleNode):
-    """A managed node with declared and checked parameters; every error names the parameter.
+    """A managed node with declared and checked parameters; every error message names the parameter.
 
     Subclasses define ``Config``, which declares their parameters, and the four hooks
     :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`, which raise
     :class:`SpaceRobotError` on failure.
 
-    An exception in a callback (subscription, timer, service) ends neither the process nor the
-    executor: the node is deactivated, calls :meth:`on_failure`, and sends an event; a supervisor
+    An exception in a callback (subscription, timer, service) does not end the process or the
+    executor: the node is deactivated, calls :meth:`on_failure` and sends an event; a supervisor
     may activate or configure it again.
 
     Parameters
@@ -84,12 +86,12 @@ class FlightNode(LifecycleNode):
         Node name; ``kwargs`` are passed to ``rclpy.node.Node`` (namespace, context,
         parameter_overrides, cli_args, ...).
     autostart
-        Overrides the parameter with the same name.
+        Value that overrides the parameter with the same name.
 
     Raises
     ------
     SpaceRobotError
-        A parameter is invalid, or ``autostart`` is on and the node cannot be configured.
+        A parameter is invalid, or ``autostart`` is true and the node cannot be configured.
     """
 
     Config: ClassVar[type[Any]]
@@ -158,7 +160,7 @@ class FlightNode(LifecycleNode):
             self._raising = False
 
     def report_event(self, event: Event) -> None:
-        """Publish an event of this node; an event without a time gets the node's time."""
+        """Publish an event of this node; if the event has no time, the time of the node is used."""
         if event.time_s is None:
             event = replace(event, time_s=self.simulated_time_s)
         values = event.to_values(time.time())
@@ -210,9 +212,11 @@ class FlightNode(LifecycleNode):
         return super().create_service(srv_type, srv_name, answer, *args, **kwargs)
 
     def offer(self, name: str, act: Callable[[], str]) -> None:
-        """Create a service without arguments that responds with the string returned by a function.
+        """Create a service that takes no arguments and responds with the string returned by a
+        function.
 
-        If the function raises CommandError, the response has its message and ``success`` false.
+        If the function raises CommandError, the response contains the error message, and
+        ``success`` is false.
         """
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -302,7 +306,9 @@ class FlightNode(LifecycleNode):
 
     @property
     def has_entities(self) -> bool:
-        """Whether entities of ``configure`` exist: the node is configured or in a transition."""
+        """Whether entities created by ``configure`` exist, that is, the node is configured or in
+        transition.
+        """
         return self.lifecycle_state not in (
             State.PRIMARY_STATE_UNKNOWN,
             State.PRIMARY_STATE_UNCONFIGURED,
@@ -310,12 +316,14 @@ class FlightNode(LifecycleNode):
         )
 
     def finalize(self) -> None:
-        """Shut the node down unless it has been shut down before."""
+        """Shut the node down unless it is already shut down."""
         if self.lifecycle_state in _STATES_THAT_CAN_SHUT_DOWN:
             self.trigger_shutdown()
 
     def destroy_node(self) -> None:
-        """Destroy the node and release its state machine, which would keep it in the graph."""
+        """Destroy the node and release its state machine, which would otherwise keep the node in
+        the graph.
+        """
         self._liveness.end()
         self._destroyed = True
         super().destroy_node()
@@ -343,8 +351,8 @@ class FlightNode(LifecycleNode):
         """Release the resources created by :meth:`configure`."""
 
     def on_failure(self, message: str, error: Exception) -> None:
-        """Report in the node's status that it was stopped by an error; the node is then
-        deactivated."""
+        """Report in the node's status that an error stopped the node; after that, the
+        node is deactivated."""
 
     def interrupt(self) -> None:
         """Cancel a long computation; called when the process must end."""
@@ -361,24 +369,24 @@ class FlightNode(LifecycleNode):
         self.report_event(Event(kind, silence.message, level, about=about))
 
     def long_work(self) -> AbstractContextManager[None]:
-        """Announce a long computation to the nodes that depend on this one."""
+        """Announce a long computation to the nodes that depend on this node."""
         return self._liveness.busy()
 
     @property
     def exit_code(self) -> int:
-        """Exit code of the process of a node that ends on request."""
+        """Exit code of the process if the node ends on request."""
         return 0
 
     def drain(self, executor: EventsExecutor) -> None:
         """Complete pending work within about a second before the node ends."""
 
     def parameters_changed(self) -> None:
-        """React to changed live parameters; ``self.config`` has the new values."""
+        """React to changed live parameters; ``self.config`` contains the new values."""
 
     # -- life cycle ---------------------------------------------------------------------------
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Call :meth:`configure`; if it fails, destroy the entities that it created."""
+        """Call :meth:`configure`; if that fails, destroy the entities that were created."""
         self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
         if unknown := unknown_parameters(self):
             self.get_logger().warning(printable(unknown), once=True)
@@ -496,8 +504,8 @@ class FlightNode(LifecycleNode):
         for change in changes:
             if change.name == AUTOSTART.name:
                 raise ParameterError(
-                    "Parameter 'autostart' is read once, when the node starts: change the node's "
-                    "state instead."
+                    "Parameter 'autostart' is read only once, when the node starts: change the "
+                    "state of the node instead."
                 )
             declaration = self._parameters_declared.get(change.name)
             configured_now = self.lifecycle_state != State.PRIMARY_STATE_UNCONFIGURED
@@ -507,7 +515,7 @@ class FlightNode(LifecycleNode):
                     f"Parameter '{change.name}' keeps its value while the node is configured: "
                     f"first deactivate and clean up the node (ros2 lifecycle set {name} "
                     f"deactivate, "
-                    "then cleanup), set it, and configure and activate the node again."
+                    "then cleanup), set the parameter, and configure and activate the node again."
                 )
 
     def _on_set_parameters(self, changes: list[RosParameter]) -> SetParametersResult:

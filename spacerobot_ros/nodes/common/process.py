@@ -27,10 +27,10 @@ from spacerobot_ros.termination import Terminated, graceful_shutdown, guarded
 _LOG = logging.getLogger(__name__)
 
 _LONGEST_DELIVERY = 1.0
-"""Maximum wall time to wait after a signal until readers confirm messages, s."""
+"""Maximum wall time, s, to wait after a signal until readers confirm messages."""
 
 _LONGEST_END = 10.0
-"""Maximum wall time from a signal to the end of the process, s."""
+"""Maximum wall time, s, from a signal to the end of the process."""
 
 _LAST_DOMAIN = 232
 """Largest ROS_DOMAIN_ID: larger values have no valid ports."""
@@ -48,7 +48,7 @@ _turn = itertools.count(os.getpid())
 _SHARED_MEMORY = Path("/dev/shm")
 
 _REQUIRED_SHARED_MEMORY = 2 * 2**20
-"""Minimum free shared memory for a process, bytes; the middleware uses about 1 MiB."""
+"""Minimum free shared memory for a process, in bytes; the middleware uses about 1 MiB."""
 
 
 def use_loopback_discovery() -> None:
@@ -104,17 +104,18 @@ def free_domain() -> Iterator[int]:
 
 
 def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = None) -> int:
-    """Run one node in its own process until SIGINT, SIGTERM, SIGHUP, or its parent's end.
+    """Run one node in its own process until SIGINT, SIGTERM or SIGHUP arrives, or the parent
+    process ends.
 
-    The parent's end is ignored unless the parent requested otherwise; a shell or ``ros2 run`` does
-    not.
-    Returns the exit code: 0 after a signal, 2 if the node cannot start (the message is on standard
-    error), the node's own code if it ends by itself.
+    The end of the parent is ignored unless the parent requested otherwise; a shell and ``ros2
+    run`` make no such request.
+    Returns the exit code: 0 after a signal, 2 if the node cannot start (the reason is written to
+    standard error), or the node's own code if the node ends by itself.
 
     Raises
     ------
     Terminated
-        A signal arrived before the node existed, and the caller has its own guard.
+        A signal arrived before the node existed, and the caller has its own signal guard.
     """
     use_loopback_discovery()
     with guarded() as alone:
@@ -127,7 +128,7 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
 
 
 def start_ros(arguments: list[str] | None) -> None:
-    """Initialise rclpy; signals are left to Python.
+    """Initialise rclpy; signals are handled by Python.
 
     Raises
     ------

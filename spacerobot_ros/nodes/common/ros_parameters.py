@@ -1,4 +1,6 @@
-"""A node's parameters as ROS parameters, and other nodes' parameters via their services."""
+"""A node's parameters as ROS parameters, and the parameters of other nodes, read through their
+services.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,15 @@ _MAX_CHECKS_FOR_ANSWER = 200
 """Number of checks after which a silent node is assumed to have no parameter services."""
 
 _CHECKS_UNTIL_CONNECTED = 3
-"""Number of checks before a request, while the node discovers the client. An earlier response would
-block the node for 0.1 s and be lost."""
+"""Number of checks before a request, during which the node discovers the client. An earlier
+response would block the node for 0.1 s and be lost."""
 
 _CHECKS_UNTIL_LOST = 50
 """Number of checks after which a response is considered lost by the middleware."""
 
 
 class RemoteParameters:
-    """All parameters of another node, by its full name; call :meth:`look` until it returns true."""
+    """All parameters of another node, by its full name; call :meth:`look` until it returns True."""
 
     def __init__(self, node: Node, name: str) -> None:
         self._node, self.name = node, name
@@ -39,7 +41,9 @@ class RemoteParameters:
         self._steps = self._request_values()
 
     def look(self) -> bool:
-        """Return whether the request is complete: the node has responded, or never will."""
+        """Return whether the request is complete: the node has responded, or no response is
+        expected any more.
+        """
         return next(self._steps, True)
 
     def close(self) -> None:
@@ -80,7 +84,7 @@ def _json_value(value: Any) -> Any:
 
 
 _QOS_OVERRIDES = "qos_overrides."
-"""Prefix of the parameters that rclpy declares with some publishers and subscriptions."""
+"""Prefix of the parameters that rclpy declares for some publishers and subscriptions."""
 
 _LARGEST_FLOAT = sys.float_info.max
 _INTEGER_BOUNDS = -(2**63), 2**63 - 1
@@ -139,9 +143,10 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
 
 
 def unknown_parameters(node: Node) -> str:
-    """Return a sentence about parameters that were set but do not exist on a node.
+    """Return a sentence that names the parameters that were set but do not exist on a node.
 
-    The sentence suggests the nearest existing name for each; it is empty if all are known.
+    The sentence suggests the most similar existing name for each; it is empty if all parameters
+    exist.
     """
     unknown = [
         name
@@ -158,7 +163,7 @@ def unknown_parameters(node: Node) -> str:
 
 
 def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
-    """Let ``ros2 param describe`` report whether parameters are read-only now."""
+    """Let ``ros2 param describe`` report whether parameters are currently read-only."""
     for parameter in parameters:
         # Node.set_descriptor never makes a parameter writable again.
         node.describe_parameter(parameter.name).read_only = fixed

@@ -1,4 +1,4 @@
-"""Matched node publishers and subscriptions."""
+"""Matching of the publishers and subscriptions of nodes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Matches = tuple[tuple[str, int], ...]
 
 @dataclass(frozen=True)
 class MatchedEndpoints:
-    """The endpoints of one node, except the middleware's own.
+    """The endpoints of one node, except those of the middleware.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class MatchedEndpoints:
 
 
 def topics_without_all_matches(nodes: Iterable[MatchedEndpoints]) -> set[str]:
-    """Return the topics on which some endpoints of these nodes are not matched yet."""
+    """Return the topics on which some endpoints of these nodes have not been matched yet."""
     nodes = list(nodes)
     writers = Counter(topic for node in nodes for topic, _ in node.publishers)
     readers = Counter(topic for node in nodes for topic, _ in node.subscriptions)

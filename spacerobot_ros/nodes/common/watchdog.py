@@ -22,12 +22,14 @@ from spacerobot_ros.model.compilation import compilation_contexts
 TOPIC = "heartbeat"
 
 HEARTBEAT_PERIOD = 0.2
-"""Wall time between two heartbeats of an active node, s."""
+"""Wall time, s, between two heartbeats of an active node."""
 
 _SILENCE_CHECK_PERIOD = 0.1  # wall s
 
 _SUSPENSION_TIME = 0.3
-"""Maximum wall time between two checks unless this node itself was suspended, s."""
+"""Wall time, s, between two checks above which this node itself is assumed to have been
+suspended.
+"""
 
 _REPORT_PERIOD = 1.0  # wall s, while a node is silent
 HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
@@ -47,20 +49,20 @@ class HeartbeatState(str, Enum):
 
     ACTIVE = "active"
     BUSY = "busy"
-    """The node plans or compiles, and sends no heartbeat until it is done."""
+    """The node is planning or compiling, and sends no heartbeat until it is done."""
     INACTIVE = "inactive"
     """The node was deactivated or shut down cleanly, and sends no heartbeat."""
 
 
 @dataclass(frozen=True)
 class SilenceReport:
-    """A node has become silent, or is back."""
+    """A node has become silent, or has returned."""
 
     name: str
     seconds: float
-    """Duration without a heartbeat, wall s."""
+    """Duration without a heartbeat, s of wall time."""
     over: bool = False
-    """Whether the node is back."""
+    """Whether the node has returned."""
 
     @property
     def message(self) -> str:
@@ -73,21 +75,23 @@ class SilenceReport:
 class Watchdog:
     """Detects nodes whose heartbeats stop.
 
-    A node is monitored from its first heartbeat until it reports that it is inactive. While it is
-    busy, no heartbeat is expected. If this node itself was suspended, all timeouts restart.
+    A node is monitored from its first heartbeat until it reports that it is inactive. While a
+    node is busy, no heartbeat is expected. If this node itself was suspended, all timeouts restart.
 
     Parameters
     ----------
     timeout
-        Wall time without a heartbeat after which a node is silent, s.
+        Wall time, s, without a heartbeat after which a node is considered silent.
     clock
-        Returns the wall time, s.
+        Function that returns the wall time, s.
     """
 
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._timeout, self._clock = timeout, clock
         self._heard: dict[str, float] = {}
-        """Time of each node's last received or excused heartbeat, s; infinite if busy."""
+        """Time of the last received or excused heartbeat of each node, s; infinite if the node is
+        busy.
+        """
         self.silent: dict[str, float] = {}
         """Time of the last heartbeat of each silent node, s."""
         self._looked = clock()
@@ -120,9 +124,10 @@ class Watchdog:
 
 
 class Liveness:
-    """Sends the heartbeats of a node, and watches those of the roles that it depends on.
+    """Sends the heartbeats of a node, and monitors the heartbeats of the roles on which this node
+    depends.
 
-    ``on_silence`` is called when a watched node has become silent, or is back.
+    ``on_silence`` is called when a monitored node has become silent, or has returned.
     """
 
     def __init__(
@@ -140,12 +145,12 @@ class Liveness:
         self._watchdog: Watchdog | None = None
         self._timeout = 0.0
         self._busy = 0
-        """Number of running computations that may take long."""
+        """Number of running computations that may take a long time."""
 
     def configure(self, timeout: float) -> None:
         """Subscribe to heartbeats and create the diagnostics publisher; a cleanup destroys both.
 
-        ``timeout``: see :class:`Watchdog`; 0: nothing is monitored.
+        For ``timeout``, see :class:`Watchdog`; if it is 0, nothing is monitored.
         """
         self._timeout, node = timeout, self._node
         if self._watched and timeout:
@@ -155,7 +160,7 @@ class Liveness:
             )
 
     def begin(self) -> None:
-        """Start sending heartbeats and monitoring those of other nodes."""
+        """Start sending heartbeats and monitoring the heartbeats of other nodes."""
         # Compiling a function on its first call counts as a long computation.
         compilation_contexts.append(self.busy)
         steady, create = Clock(clock_type=ClockType.STEADY_TIME), self._node.create_timer
@@ -178,7 +183,7 @@ class Liveness:
 
     @contextmanager
     def busy(self) -> Iterator[None]:
-        """Announce to other nodes' watchdogs that a computation may take long."""
+        """Announce to other nodes' watchdogs that a computation may take a long time."""
         self._busy += 1
         self._beat()
         try:

@@ -59,28 +59,29 @@ if TYPE_CHECKING:
 _READER_CHECK_PERIOD = 0.1  # wall s
 
 _MAX_UNCONFIRMED_TICKS = STREAM.depth // 2
-"""Maximum number of lockstep ticks until all readers must confirm their states: a reader further
-behind than the publisher queue would lose messages."""
+"""Maximum number of lockstep ticks between confirmations of the states by all readers: a reader
+that lags by more than the publisher queue would lose messages."""
 
 _MAX_RATE_AT_REST = 1e-3  # m/s or rad/s
 _LONGEST_REST = 0.8  # wall s, before the process ends
 
 _REPORT_PERIOD_NS = 950_000_000
-"""Wall time after which new diagnostics are due, ns: about once per second."""
+"""Wall time after which new diagnostics are due, ns (about one second)."""
 
 _LONGEST_MARKER_PERIOD, _LONGEST_FRAME_PERIOD, _LONGEST_CLEARANCE_PERIOD = 0.5, 0.1, 0.5
-"""Maximum wall time between two publications in real time, s: markers, /tf, clearances."""
+"""Maximum wall time, s, between two publications of markers, /tf or clearances in real time."""
 
 _CARRIED = {"velocity": "velocities", "effort": "efforts", "auto": "velocities or efforts"}
 """Commanded quantities, by the parameter ``actuation``."""
 
 
 class PlantNode(FlightNode):
-    """Integrates the momentum-conserving model and publishes a real robot's topics.
+    """Integrates the momentum-conserving model and publishes the topics of a real robot.
 
-    In ``lockstep`` it publishes the state of tick k and steps when the command stamped with that
-    tick has arrived. In ``realtime`` it runs on the wall clock times ``real_time_factor``, holds
-    the last command, and brings the joints to rest if that is older than ``command_timeout``.
+    In ``lockstep``, it publishes the state of tick k and steps when the command stamped with that
+    tick has arrived. In ``realtime``, the plant follows the wall clock, scaled by
+    ``real_time_factor``, holds the last command, and brings the joints to rest if that command is
+    older than ``command_timeout``.
     """
 
     Config: ClassVar = PlantConfig
@@ -92,7 +93,9 @@ class PlantNode(FlightNode):
         self._active = PlantState.INACTIVE
         self._when_active = PlantState.RUNNING
         self.tick, self._period_ns = 0, 1
-        """Number of the tick whose state was published last, and the time between two, ns."""
+        """Number of the tick whose state was published last, and the time, ns, between two
+        ticks.
+        """
         self._wall_timers: list[Timer] = []
         self._monitor: PlantMonitor | None = None
         self.status = PlantStatus(PlantState.INACTIVE)
@@ -139,7 +142,7 @@ class PlantNode(FlightNode):
         # Joints that move, and thrusters, are there for efforts alone.
         self._undecided = config.actuation == "auto" and decided.actuation == "velocity"
         self._under_efforts: PlantWithFaults | None = None
-        """The effort plant in its initial state, as long as it may be needed."""
+        """The effort plant in its initial state, kept as long as it may be needed."""
         if self._undecided:
             under_efforts = config.decided("effort")
             self._under_efforts = build_plant(robot, under_efforts)
@@ -183,7 +186,7 @@ class PlantNode(FlightNode):
                 self, robot.description, has_contact_forces=config.engine == "mujoco"
             )
         self._obstacles: str | None = None
-        """The last URDF on the topic obstacles; None: the robot's own obstacles are used."""
+        """The last URDF on the topic obstacles; None if the robot's own obstacles are used."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         for topic in (*self._readers, *(["base_wrench"] if self._undecided else [])):
             kind = message_class(TOPICS[topic].type)
@@ -321,8 +324,8 @@ class PlantNode(FlightNode):
         )
 
     def on_failure(self, message: str, error: Exception) -> None:
-        """Report the failure and drop the current commands, so that none is active after a
-        restart."""
+        """Report the failure and drop the current commands, so that no command is active
+        after a restart."""
         self._stop_timers()
         self._active = PlantState.FAILED
         reason = "model" if isinstance(error, SpaceRobotError) else "exception"
@@ -384,7 +387,7 @@ class PlantNode(FlightNode):
         state = last_state(path, self.get_namespace().rstrip("/"))
         if state.joint_names != list(robot.joint_names):
             raise ParameterError(
-                f"Parameter 'resume_bag' is '{path}', a bag from a robot with the joints "
+                f"Parameter 'resume_bag' is '{path}', a bag recorded with a robot whose joints are "
                 f"{', '.join(state.joint_names)}; this robot has {', '.join(robot.joint_names)}."
             )
         if self.config.target.given != (state.target is not None):
@@ -574,7 +577,7 @@ class PlantNode(FlightNode):
                 self._publish_changed_status()
 
     def on_silence(self, silence: SilenceReport) -> None:
-        """Bring all joints to rest if a commander is silent and the parameters require it."""
+        """Bring all joints to rest if a commander is silent and the parameters require this."""
         super().on_silence(silence)
         if self.config.watchdog_action == "latch" and not silence.over:
             self.commands.latch("watchdog", f"node '{silence.name}' is silent", self.time_ns)

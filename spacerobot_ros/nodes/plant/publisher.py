@@ -62,7 +62,7 @@ class PlantReport:
             node.get_logger().warning(f"The thrusters cannot produce {missing}.")
 
     def observe_plant(self) -> None:
-        """Report on the present plant of the node from now on."""
+        """Report on the current plant of the node from now on."""
         self._diagnostics.observe(self._node.commands, self._node.plant)
 
     def refused(self, source: CommandSource, refusal: Refusal) -> None:
@@ -81,15 +81,17 @@ class PlantReport:
         self._node.get_logger().error(f"{latched_text(self._node.commands.fault)}.")
 
     def timed_out(self, source: CommandSource, timeout: float) -> None:
-        """Log that a commander's commands have stopped."""
+        """Log that the commands from a commander have stopped."""
         self._diagnostics.command_timeouts += 1
         self._node.get_logger().warning(
-            f"No command on '{source.topic}' for {timeout:g} s: its actuators are brought to rest.",
+            f"No command on '{source.topic}' for {timeout:g} s: the actuators are brought to rest.",
             throttle_duration_sec=_LOG_PERIOD,
         )
 
     def limited(self) -> None:
-        """Log that limits restricted joints in the last step, unless they only rest on a stop."""
+        """Log that limits restricted joints in the last step, except joints that only rest on a
+        stop.
+        """
         plant, texts = self._node.plant, []
         resting = np.zeros(plant.robot.n, dtype=np.bool_)
         if plant.takes_wrench:
@@ -119,7 +121,7 @@ _LONGEST_WAIT = 0.5  # wall s, for readers
 
 
 class StatePublisher:
-    """Publishes the state topics that the table of topics lists for a plant."""
+    """Publishes the state topics that the topic table lists for a plant."""
 
     def __init__(
         self, node: FlightNode, robot: SpaceRobot, state: ReportedState, config: PlantConfig
@@ -167,7 +169,7 @@ class StatePublisher:
     def publish(self, time_ns: int, *, all_topics: bool) -> None:
         """Publish the state, stamped ``time_ns``.
 
-        ``all_topics``: include the topics that are not published in every tick.
+        ``all_topics`` includes the topics that are not published in every tick.
         """
         lost = self._of_measured_pose if self._state.sensors.dropout else []
         if self._state.misses_target:
@@ -180,8 +182,8 @@ class StatePublisher:
     def has_new_readers(self) -> bool:
         """Whether the state has gained a subscriber since the last call.
 
-        The check takes 1 ms. If one subscription replaces another, their number stays the same; a
-        discovered subscription may be matched later.
+        The check takes 1 ms. If one subscription replaces another, the number of subscriptions
+        stays the same; a discovered subscription may be matched later.
         """
         outputs = self._outputs.values()
         readers = frozenset(
@@ -229,10 +231,10 @@ class StatePublisher:
 
 
 class TransformPublisher:
-    """Publishes the measured frames of a robot on /tf, and its fixed frames on /tf_static.
+    """Publishes the measured frames of a robot on /tf, and the fixed frames on /tf_static.
 
-    If the package ``tf2_msgs`` is missing, nothing is published; bags contain the transforms
-    anyway.
+    If the package ``tf2_msgs`` is missing, nothing is published; bags nevertheless contain
+    the transforms.
     """
 
     def __init__(self, node: PlantNode, robot: SpaceRobot, config: PlantConfig) -> None:
@@ -290,8 +292,8 @@ class ClearancePublisher:
     ) -> ClearancePublisher | None:
         """Return the publisher for a plant with obstacles; None if no links could touch.
 
-        ``before`` is the publisher for the previous obstacles, whose topic is reused;
-        ``has_contact_forces``: see :class:`.ClearanceMonitor`.
+        ``before`` is the publisher for the previous obstacles; its topic is reused. For
+        ``has_contact_forces``, see :class:`.ClearanceMonitor`.
         """
         # Not every plant measures distances.
         from spacerobot_ros.simulation.clearance import ClearanceMonitor
@@ -308,9 +310,10 @@ class ClearancePublisher:
         return cls(node, monitor, None if before is None else before._stream)
 
     def look(self, time_ns: int, *, publishes: bool) -> tuple[str, ...] | None:
-        """Report contacts that have begun or ended; return the current ones, or None if unchanged.
+        """Report contacts that have begun or ended; return the current contacts, or None if they
+        are unchanged.
 
-        ``publishes``: also publish the current clearance.
+        If ``publishes`` is true, also publish the current clearance.
         """
         plant = self._node.plant
         status, events = self._monitor.measure(

@@ -1,10 +1,9 @@
 """Collects the stack's topics into one :class:`~spacerobot_ros.viewer.state.StackState`.
 
-The plant publishes its state hundreds or thousands of times per second; a page is drawn twenty
-times per second. Therefore a node that is not spun subscribes to the streams: the middleware keeps
-only the
-last message of each, which is read when the page is drawn. Subscriptions are best effort, so that
-no publisher waits for the viewer.
+The plant publishes its state hundreds or thousands of times per second; the page is drawn
+twenty times per second. Therefore, a node that is not spun subscribes to the streams: the
+middleware keeps only the last message of each stream, which is read when the page is drawn.
+Subscriptions are best effort, so that no publisher waits for the viewer.
 """
 
 from __future__ import annotations
@@ -49,16 +48,16 @@ LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """QoS of streams: only the last message is kept, without acknowledgement."""
 
 _MAX_CALL_INTERVAL = 1.5
-"""Maximum wall time between two calls unless this process was suspended, s."""
+"""Wall time, s, between two calls above which this process is assumed to have been suspended."""
 
 _TIME_UNTIL_SILENT_NODE_IS_HIDDEN = 60.0
-"""Wall time after which a silent node and its last reports are no longer shown, s."""
+"""Wall time, s, after which a silent node and its last reports are no longer shown."""
 
 _JITTER_NS = 200_000
-"""Jitter of the time between two messages published in one tick, wall ns."""
+"""Jitter, ns of wall time, in the publication times of two messages from one tick."""
 
 _LONGEST_EXPECTED_DELAY_NS = SECOND
-"""Wall time after which a plant is assumed to publish no expected momenta, ns."""
+"""Wall time, ns, after which a plant is assumed to publish no expected momenta."""
 
 _REFUSED = " A later goal is refused: "
 """Text between the message about the pursued goal and the reason why a later goal was refused."""
@@ -66,24 +65,28 @@ _REFUSED = " A later goal is refused: "
 _MAX_PATH_POINTS = 1000
 
 _MAX_MOTION_POINTS = 200
-"""Maximum number of configurations in a planned motion: links are placed at each."""
+"""Maximum number of configurations in a planned motion; link poses are computed for each of
+them.
+"""
 
 M = TypeVar("M")
 
 
 class LatestMessage(Generic[M]):
-    """The last message of a topic, deserialized on demand; its node is not spun."""
+    """The last message of a topic, deserialized on demand; no executor spins the subscribing
+    node.
+    """
 
     def __init__(self, node: Node, kind: type[M], topic: str) -> None:
         self._kind = kind
         self.sent_ns = 0
-        """Publication time of the last message taken, wall ns."""
+        """Publication time of the last message taken, ns of wall time."""
         self._subscription = node.create_subscription(
             kind, topic, lambda raw: None, LATEST_QOS, raw=True
         )
 
     def take(self) -> M | None:
-        """Return the message received since the last call; None without a new message."""
+        """Return the message received since the last call; None if there is no new message."""
         handle = self._subscription.handle
         with handle:
             taken = handle.take_message(self._kind, True)
@@ -101,10 +104,10 @@ class Listener:
     """Collects the stack state.
 
     The node ``streams``, which is not spun, receives states; callbacks of ``node`` receive
-    statuses, goals (in ``frame``) and heartbeats. ``on_status`` is called for every status with
-    ``plant``, ``planner``, ``controller`` or ``replay`` and the full name of the node that
-    published it. An active node without a heartbeat for ``silent_after`` (wall s; 0: never) is
-    silent.
+    statuses, goals (in ``frame``) and heartbeats. For every status, ``on_status`` is called with
+    ``plant``, ``planner``, ``controller`` or ``replay``, and with the full name of the publishing
+    node. An active node is silent if it has sent no heartbeat for ``silent_after`` (s of wall
+    time; 0: never).
     """
 
     def __init__(
@@ -131,19 +134,21 @@ class Listener:
         self._reporters: dict[str, str] = {}
         """Full name of the publishing node, by kind of status."""
         self._hidden: dict[str, str] = {}
-        """Nodes whose reports are hidden, and the node whose next heartbeat shows them again."""
+        """Nodes whose reports are hidden, and, for each, the node whose next heartbeat shows the
+        reports again.
+        """
         self._last_call = time.monotonic()
         self._planned: Array | None = None
         self._path: tuple[int, Signal] | None = None
-        """Begin, ns, and poses (k, 7) of the base that a planner predicts."""
+        """Start time, ns, and base poses (k, 7) predicted by a planner."""
         self._last_schedule: JointTrajectory | None = None
-        """It is latched, so it may arrive before the corresponding robot."""
+        """The path is latched, so it may arrive before the corresponding robot."""
         self._schedule: tuple[int, Signal] | None = None
-        """Begin, ns, and planned positions (m, n) of the joints."""
+        """Start time, ns, and planned joint positions (m, n)."""
         self._motion: Array | None = None
         self._goals: dict[Part, Goal] = {}
         self._pursued_goals: dict[Part, Goal] = {}
-        """Goals at the start of the pursued goal."""
+        """The goals that were set when the pursued goal started."""
         self._pursued: dict[str, Any] = {}
         """The last status of the pursued goal, by kind of status."""
         self.forget_state()
@@ -234,7 +239,9 @@ class Listener:
         )
 
     def time_ns(self) -> int:
-        """Return the simulated time of the last state, ns; wall time before the first state."""
+        """Return the simulated time of the last state, ns, or the wall time before the first
+        state.
+        """
         if self._measured is None:
             return time.time_ns()
         return round(self._measured.time_s * SECOND)

@@ -95,7 +95,7 @@ _SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] 
     Request.PLAY: (("replay",), "pause", False),
     Request.HOLD: (("replay",), "pause", True),
 }
-"""For each page request: nodes, service name, and its data (None: Trigger)."""
+"""For each page request: nodes, service name, and request data (None: Trigger)."""
 
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 
@@ -109,8 +109,9 @@ _MILLISECOND_NS = 1_000_000
 class ViewerNode(FlightNode):
     """Serves the page that shows and steers the robot.
 
-    It subscribes and publishes like any other tool: it works with nodes in other processes, started
-    before or after it, and with restarted nodes. Opening the page does not move the robot.
+    The node subscribes and publishes like any other tool: it works with nodes in other processes,
+    whether they start before or after it, and with restarted nodes. Opening the page does not move
+    the robot.
     """
 
     Config: ClassVar = ViewerConfig
@@ -132,7 +133,7 @@ class ViewerNode(FlightNode):
         self.url = url_of(self._server)
         if not is_loopback(config.host):
             self.get_logger().warning(
-                f"The page is served at '{config.host}': anyone who can reach this machine there "
+                f"The page is served at '{config.host}': anyone who can reach this address "
                 "can steer the robot."
             )
         self._page = Page(self._server, config)
@@ -204,12 +205,12 @@ class ViewerNode(FlightNode):
             streams.destroy_node()
 
     def destroy_node(self) -> None:
-        """Close the page, in any node state."""
+        """Close the page, whatever the state of the node."""
         self.cleanup()
         super().destroy_node()
 
     def report_event(self, event: Event) -> None:
-        """Publish no event: the viewer is not part of the recorded flight."""
+        """Publish no event, because the viewer is not part of the recorded flight."""
 
     def _add_goal_topics(self, parts: Iterable[Part]) -> None:
         for part in parts:
@@ -461,7 +462,9 @@ class ViewerNode(FlightNode):
             aim = goal.end_effectors[0].as_goal() if goal.end_effectors else goal
             self._goal_topics[part].publish(goal_message(aim, self.config.world_frame, time_ns))
         if not self._count_readers(goals):
-            self._answer("The goal is not received: no planner or controller is running.", 2)
+            self._answer(
+                "The goal was not received, because no planner or controller is running.", 2
+            )
         else:
             self._answer("Goal sent.")
             goal_id = GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND))
@@ -469,7 +472,9 @@ class ViewerNode(FlightNode):
         editor = self._page.editor
         editor.note_sent()
         if self._checker.cancel() and not editor.moving:
-            editor.show_check(GoalCheck(Verdict.UNCHECKED, "It was sent before it was checked."))
+            editor.show_check(
+                GoalCheck(Verdict.UNCHECKED, "The goal was sent before it was checked.")
+            )
 
     def _call_service(self, request: Request) -> None:
         keys, service, data = _SERVICE_BY_REQUEST[request]

@@ -1,4 +1,4 @@
-"""Planning jobs in the background, and their cancellation, which long searches poll."""
+"""Background planning jobs, and their cancellation, which long searches poll."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 from spacerobot_ros.errors import PlanningError
 
 MAX_THREAD_END_TIME = 1.5
-"""Largest wall time for a planning thread to end after cancellation, s."""
+"""Longest wall time that a cancelled planning thread may take to end, s."""
 
 
 class PlanningCancelled(PlanningError):  # noqa: N818 - a request, not a failure
@@ -46,22 +46,22 @@ class Cancellation:
 
 
 NEVER = Cancellation()
-"""The cancellation of plans that run to their end; nobody requests it."""
+"""A cancellation that is never requested, for plans that run to completion."""
 
 
 _Plan = TypeVar("_Plan")
 
 
 class PlanningJob(Generic[_Plan]):
-    """A plan in the making.
+    """A plan being computed.
 
     Parameters
     ----------
     work
         Returns the plan, or raises an error.
     begins
-        Start time of the plan, s, if the plan is ready by then; minus infinity: as soon as it is
-        ready.
+        Time at which the plan starts, s, if it is ready by then; minus infinity: it starts as soon
+        as it is ready.
     """
 
     def __init__(self, work: Callable[[Cancellation], _Plan], begins: float = -math.inf) -> None:
@@ -75,7 +75,7 @@ class PlanningJob(Generic[_Plan]):
         self._thread = Thread(target=self._run, daemon=True)
 
     def start(self, *, in_background: bool, after: PlanningJob[_Plan] | None = None) -> None:
-        """Do the work: in a thread, after another job has ended, or immediately."""
+        """Run the work in a thread, after another job has ended, or immediately."""
         self._after = after
         if in_background:
             self._thread.start()
@@ -95,7 +95,7 @@ class PlanningJob(Generic[_Plan]):
         self.done = True
 
     def cancel(self) -> None:
-        """Cancel the job; its result is dropped. Any thread may call this."""
+        """Cancel the job; its result is discarded. Any thread may call this."""
         self._cancellation.cancel()
 
     def close(self) -> None:
@@ -106,7 +106,7 @@ class PlanningJob(Generic[_Plan]):
             self._thread.join(MAX_THREAD_END_TIME)
 
     def result(self) -> _Plan:
-        """Return the plan of a job that is done, or raise the error of its work.
+        """Return the plan of a job that is done, or raise the error that its work raised.
 
         Raises
         ------

@@ -1,4 +1,5 @@
-"""Plan clearance: smallest distances between a robot's bodies, and to obstacles."""
+"""Plan clearance: smallest distances between the bodies of a robot, and from these bodies to
+obstacles."""
 
 from __future__ import annotations
 
@@ -36,10 +37,10 @@ DEFAULT_CLEARANCE = 0.01
 _CLEARANCE_OF_OBSTACLES = 0.01
 """Smallest distance if there are obstacles and none is requested, m."""
 
-_SRDF_REMEDY = ", or have an SRDF disable the pair (planner.srdf)"
+_SRDF_REMEDY = ", or disable the pair in an SRDF (planner.srdf)"
 
 _DISTANCE_ERROR = 1e-6
-"""Error of a distance, m."""
+"""Numerical error of a computed distance, m."""
 
 _CLEARANCE_FACTOR_FOR_LOOPS = 5.0
 
@@ -49,7 +50,8 @@ may be slightly closer."""
 
 
 class Clearance:
-    """The smallest distance that a robot's plans keep between its links, and from obstacles.
+    """Smallest distance that planned motions of a robot keep between its links, and from its links
+    to obstacles.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ class Clearance:
     def wanted(
         cls, robot: RobotDescription, distance: float, parameter: str = "planner.clearance"
     ) -> Clearance | None:
-        """Return the requested clearance for a robot; None for a distance of zero.
+        """Return the requested clearance for a robot; None if the distance is zero.
 
         If there are obstacles, a distance of zero means 0.01 m.
 
@@ -107,12 +109,12 @@ class Clearance:
 
     @property
     def has_obstacles(self) -> bool:
-        """Whether the base motion matters, because there are obstacles."""
+        """Whether the base motion must be considered, because there are obstacles."""
         return bool(self.geometry.with_obstacles.any())
 
     @property
     def facts(self) -> Array:
-        """The values that plans depend on: the distance, pairs, and the solids around bodies."""
+        """The values that affect plans: the distance, the pairs, and the solids around bodies."""
         geometry = self.geometry
         solids = [each.enclosure for each in geometry.solids]
         return np.concatenate(
@@ -159,7 +161,8 @@ class Clearance:
                 remedy = "" if isinstance(links, ObstaclePair) else _SRDF_REMEDY
                 raise PlanningError(
                     f"{sentence_case(links.subject)} are {distance:.3g} m apart at the start, "
-                    f"closer than {self._parameter} = {self.distance:g} m: make it smaller{remedy}."
+                    f"closer than {self._parameter} = {self.distance:g} m: reduce this "
+                    f"value{remedy}."
                 )
             else:
                 required[pair] = min(self.distance, distance)
@@ -180,7 +183,7 @@ class Clearance:
             ):
                 raise UnreadMeshError(
                     f"Contacts of link '{each.link}' cannot be checked: {each.reason} Or disable "
-                    f"its pairs by an SRDF (planner.srdf), or set {self._parameter} to 0."
+                    f"its pairs in an SRDF (planner.srdf), or set {self._parameter} to 0."
                 )
             warn_once(each.note)
 
@@ -189,7 +192,7 @@ class Clearance:
             self._warned.add(links.subject)
             remedy = ""
             if not isinstance(links, ObstaclePair):
-                remedy = " If they only appear to be, disable the pair by an SRDF (planner.srdf)."
+                remedy = " If the contact is not real, disable the pair in an SRDF (planner.srdf)."
             _LOG.warning(
                 "%s are in contact at the start: their contact is ignored.%s",
                 sentence_case(links.subject),
@@ -197,7 +200,7 @@ class Clearance:
             )
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
-        """Return whether (N,) all links have room for loops in configurations (N, n)."""
+        """Return, for each configuration (N, n), whether all links have room for loops (N,)."""
         return self._keep_distances(shapes, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance)
 
     def is_clear(self, shapes: Array, required: Array) -> bool:
@@ -234,8 +237,8 @@ class Clearance:
         positions
             (N + 1, n) shapes at the ticks, m or rad.
         required
-            (P,) required distances, m; None: those :meth:`required` from the first shape on. base
-            Base poses at the ticks; None: obstacles are ignored.
+            (P,) required distances, m; None: as returned by :meth:`required` for the first shape.
+            base Base poses at the ticks; None: obstacles are ignored.
         """
         if not len(self.geometry.pairs):
             return []
@@ -244,8 +247,7 @@ class Clearance:
         return nearest_approaches(self.geometry, positions, required, base)
 
     def clause(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about an approach that is too close; without a control period, no
-        times."""
+        """Return a clause about an approach that is too close, with times if a period is given."""
         when = ""
         if control_period is not None:
             when = f" after {approach.tick * control_period:.4g} s,"
@@ -257,8 +259,8 @@ class Clearance:
     def require_shape(self, shape: Array, required: Array, base: BasePoses | None = None) -> None:
         """Check that links are not too close in the shape (n,) of a goal.
 
-        ``required`` are the distances (P,) of all pairs, m, and ``base`` is the base pose there, if
-        known.
+        ``required`` (P,) are the required distances of all pairs, m; ``base`` is the base pose in
+        this shape, if known.
 
         Raises
         ------

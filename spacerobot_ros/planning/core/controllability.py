@@ -2,10 +2,10 @@
 
 A small loop in the plane of two joints rotates the base by curvature times area (papers 1 and 2).
 If three such first-order brackets span the three axes of rotation, they satisfy the Lie algebra
-rank condition, and attitude and shape are controllable (paper 1, proposition 1); brackets are
-analytic,
-so their span at one shape is the span at almost all shapes (proposition 2). The base position
-follows from attitude and shape; it is also controllable if three sliders have independent slots.
+rank condition, and attitude and shape are controllable (paper 1, proposition 1). Brackets are
+analytic, so their span at one shape is the span at almost all shapes (proposition 2). The base
+position follows from attitude and shape; it is also controllable if three sliders have independent
+slots.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
 MAX_CONDITION = 1e6
-"""Condition number above which brackets are considered linearly dependent: their directions are
-rounding errors."""
+"""Condition number above which brackets are considered linearly dependent, because their directions
+result from rounding errors."""
 
 ZERO_TURN_PER_AREA = 1e-12
-"""Bracket singular values below this, rad per unit area, count as zero."""
+"""Threshold, rad per unit area, below which singular values of the brackets are treated as zero."""
 
 _SAMPLED_SHAPE_COUNT = 24
 """Number of sampled shapes; brackets that span at one shape span at almost all shapes."""
@@ -40,7 +40,8 @@ class Controllability:
     rank, required_rank
         Number of rotation axes spanned by the brackets, and the required number.
     singular_values
-        (3,) of the best three brackets, rad per unit area (rad^2, rad m or m^2), descending.
+        (3,) singular values of the best three brackets, rad per unit area (rad^2, rad m or m^2),
+        descending.
     joints
         The joints of these brackets.
     shape
@@ -81,12 +82,12 @@ class Controllability:
 
 
 def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
-    """Return finite bounds (n,), (n,) of the shape space: one revolution for unlimited joints."""
+    """Return finite bounds of the shape space, (n,) each: one revolution for unlimited joints."""
     return robot.description.shape_box
 
 
 def sample_shapes(robot: SpaceRobot, count: int) -> Array:
-    """Return shapes (count, n) spread evenly over the shape space; they do not depend on a seed."""
+    """Return shapes (count, n) spread evenly over the shape space, independent of any seed."""
     lower, upper = shape_box(robot)
     # Multiples of independent irrational numbers are evenly spread.
     fractions = np.outer(np.arange(1, count + 1), np.sqrt(_first_primes(robot.n))) % 1.0
@@ -138,9 +139,9 @@ def sliders_of(robot: SpaceRobot) -> list[int]:
 
 
 def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Array:
-    """Return the centre-of-mass motion (3, s), in B, per slider motion, m/m.
+    """Return the centre-of-mass motion (3, s), in B, per unit of slider motion, m/m.
 
-    It is linear in the slider position, so a unit step is exact.
+    This motion is linear in the slider position, so a unit step is exact.
     """
     c = robot.center_of_mass(shape)
     steps = [robot.center_of_mass(shape + np.eye(robot.n)[i]) - c for i in sliders]
@@ -161,14 +162,16 @@ def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
         return
     raise PlanningError(
         "lie_bracket needs three sliders with linearly independent slots (paper 1, section 4.1); "
-        f"robot '{robot.description.name}' has {slots.shape[1]} slider(s) of rank {rank}."
+        f"robot '{robot.description.name}' has {slots.shape[1]} slider(s), whose slots have rank "
+        f"{rank}."
     )
 
 
 def tilted_goal_error(robot: SpaceRobot, axis: Array, tilt: float) -> UnreachableError:
-    """Return the error for a goal attitude tilted by ``tilt`` (rad) off the ``axis`` (3,)."""
+    """Return the error to raise for a goal attitude tilted by ``tilt`` (rad) from the ``axis``
+    (3,)."""
     return UnreachableError(
-        f"The goal attitude is {tilt:.4g} rad off any rotation about the axis "
+        f"The goal attitude is {tilt:.4g} rad away from any rotation about the axis "
         f"{(np.round(axis, 6) + 0.0).tolist()} of {robot.base_link}: planar robot "
         f"'{robot.description.name}' cannot rotate about any other axis.",
         Proof.RANK,
@@ -176,7 +179,7 @@ def tilted_goal_error(robot: SpaceRobot, axis: Array, tilt: float) -> Unreachabl
 
 
 def check_sliding_masses(robot: SpaceRobot) -> Controllability:
-    """Test a robot by paper 1: three independent slots and spanning slider brackets."""
+    """Test a robot as in paper 1: three independent slots and spanning slider brackets."""
     sliders = sliders_of(robot)
     try:
         require_three_slots(robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders))

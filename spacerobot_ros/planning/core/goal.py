@@ -1,4 +1,4 @@
-"""Goals, the states from which plans begin, and the error between them."""
+"""Goals, the initial states of plans, and errors relative to goals."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MAX_PATH_POSES = 10_000
 """Largest number of poses in a given path, which limits planning time."""
 
 _MAX_ANGLE = 2e6 * np.pi
-"""A million revolutions, rad: larger angles do not resolve the attitude."""
+"""A million revolutions, rad: larger angles do not determine the attitude accurately."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class EndEffectorGoal:
         (4,) of R_WE, (x, y, z, w); None: any attitude.
     waypoints
         Waypoints before the goal, connected by straight lines: positions (K, 3), m, or poses (K, 7)
-        if the goal has an attitude, which rotates along the lines. The link moves straight to the
-        first waypoint. None: the method chooses the path.
+        if the goal has an attitude, which rotates along the lines. The link moves in a straight
+        line to the first waypoint. None: the method chooses the path.
     """
 
     link: str
@@ -82,8 +82,8 @@ class EndEffectorGoal:
         values = as_numbers(pose, f"The goal of {name}", GoalError)
         if values.shape not in ((3,), (7,)):
             raise GoalError(
-                f"The goal of {name} is {values.size} number(s); it needs 3, a position, or 7, "
-                "a position and a quaternion."
+                f"The goal of {name} has {values.size} number(s); give 3 (a position) or 7 (a "
+                "position and a quaternion)."
             )
         given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
         return cls(link, given.position, given.quaternion if len(values) == 7 else None)
@@ -97,7 +97,7 @@ class EndEffectorGoal:
         Raises
         ------
         GoalError
-            There are no poses or too many, or one is invalid.
+            There are no poses or too many, or a pose is invalid.
         """
         values = as_numbers(poses, f"The goal path of '{link}'", GoalError)
         name = f"The path of '{link}'"
@@ -105,8 +105,8 @@ class EndEffectorGoal:
             raise GoalError(f"{name} has no poses.")
         if values.ndim != 2 or values.shape[1] not in (3, 7):
             raise GoalError(
-                f"{name} is of shape {values.shape}; each of its poses has 3 numbers, a "
-                "position, or 7, a position and a quaternion."
+                f"{name} has shape {values.shape}; each of its poses must have 3 numbers (a "
+                "position) or 7 (a position and a quaternion)."
             )
         if len(values) > MAX_PATH_POSES:
             raise GoalError(
@@ -127,7 +127,8 @@ class EndEffectorGoal:
 
     @classmethod
     def of_numbers(cls, link: str, numbers: npt.ArrayLike) -> EndEffectorGoal:
-        """Return the goal from its file form: a position or pose, or a path as a list of them.
+        """Return the goal from its representation in files: a position or a pose, or a list of
+        these for a path.
 
         Raises
         ------
@@ -181,8 +182,9 @@ class Goal:
     end_effectors
         End-effector goals, at most one per link.
     base
-        Requested components of the base pose. With end-effector goals, any or none of them may be
-        requested; the motion determines the others.
+        Requested components of the base pose. If there are end-effector goals, any of these
+        components may be requested, or none of them; the motion determines the components that are
+        not requested.
     asked
         Base pose components given explicitly by the sender. Other components are
         kept from the start (:meth:`kept_at`), and are not required for the goal to be reached.
@@ -257,18 +259,19 @@ class Goal:
         Raises
         ------
         GoalError
-            A list has the wrong length, or numbers that are not finite or too large, or the
-            quaternion is zero.
+            A list has the wrong length, or contains numbers that are not finite or are too large,
+            or the quaternion is zero.
         """
         r = as_numbers(position, "The goal position", GoalError)
         q = as_numbers(quaternion, "The goal orientation", GoalError)
         if r.shape != (3,) or q.shape != (4,):
-            raise GoalError("A goal has three position and four orientation values.")
+            raise GoalError("A goal needs three position values and four orientation values.")
         if not np.all(np.isfinite(r)):
             raise GoalError(f"The goal position {r.tolist()} is not finite.")
         if np.abs(r).max() > _MAX_COORDINATE:
             raise GoalError(
-                f"The goal position {r.tolist()} is farther than {_MAX_COORDINATE:g} m away."
+                f"The goal position {r.tolist()} is more than {_MAX_COORDINATE:g} m from the "
+                "origin."
             )
         if not np.all(np.isfinite(q)):
             raise GoalError(f"The goal orientation {q.tolist()} is not finite.")
@@ -290,8 +293,8 @@ class Goal:
             return cls(r, unit_quaternion(q), shape)
         except ValueError:
             raise GoalError(
-                f"The goal orientation {q.tolist()} is a zero quaternion, not a rotation; "
-                "no rotation is (0, 0, 0, 1)."
+                f"The goal orientation {q.tolist()} is a zero quaternion, not a rotation; the "
+                "identity is (0, 0, 0, 1)."
             ) from None
 
     @classmethod
@@ -301,7 +304,7 @@ class Goal:
         quaternion: Sequence[float],
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return the goal from a message, as :meth:`checked`; a component that is NaN is not
+        """Return the goal in a message, checked as by :meth:`checked`; NaN components are not
         requested.
 
         Raises
@@ -333,7 +336,8 @@ class Goal:
         vector = as_numbers(rotvec, "The goal rotation vector", GoalError)
         if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_ANGLE):
             raise GoalError(
-                f"The rotation vector {rotvec!r} is not three finite numbers of at most "
+                f"The rotation vector {rotvec!r} does not consist of three finite numbers of at "
+                f"most "
                 f"{_MAX_ANGLE:.2g} rad."
             )
         return cls.checked(position, quaternion_from_rotvec(vector))
@@ -349,7 +353,7 @@ class Goal:
         """
         angles = as_numbers(rpy_deg, "The goal roll, pitch and yaw", GoalError)
         if angles.shape != (3,) or not np.all(np.abs(angles) <= np.degrees(_MAX_ANGLE)):
-            raise GoalError(f"The angles {rpy_deg!r} are not three finite numbers of degrees.")
+            raise GoalError(f"The angles {rpy_deg!r} are not three finite numbers in degrees.")
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
     def for_robot(self, robot: RobotDescription) -> Goal:
@@ -385,9 +389,9 @@ class Goal:
         return replace(self, end_effectors=tuple(sorted(goals, key=lambda each: each.link)))
 
     def joined_with(self, other: Goal) -> Goal:
-        """Return the goal merged with another goal, which takes precedence.
+        """Return this goal merged with another goal; the other goal takes precedence.
 
-        If both are base goals only, the other goal is returned.
+        If both goals are for the base only, the other goal is returned.
         """
         if not self.end_effectors and not other.end_effectors:
             return other
@@ -397,7 +401,7 @@ class Goal:
         return replace(of_base, joint_positions=shape, end_effectors=tuple(links.values()))
 
     def kept_at(self, position: Array, quaternion: Array) -> Goal:
-        """Return the goal with components that are not requested taken from a base pose."""
+        """Return the goal, with the components that it does not request taken from a base pose."""
         if self.asked == POSE or not self.base:
             return self
         return replace(
@@ -474,8 +478,8 @@ class RobotState:
     linear_momentum, angular_momentum
         (3,) each in W, kg m/s and kg m^2/s; angular momentum is about the system's centre of mass.
     qdot
-        (n,) joint velocities, m/s or rad/s; None: zero. Plans from rest use only those of reaction
-        wheels, which may spin while the other joints are at rest.
+        (n,) joint velocities, m/s or rad/s; None: zero. Plans from rest use only the velocities of
+        reaction wheels, which may spin while the other joints are at rest.
     """
 
     position: Array
@@ -488,19 +492,20 @@ class RobotState:
 
 @dataclass(frozen=True)
 class PoseError:
-    """Remaining error between a pose and shape and a goal.
+    """Remaining error of a pose and a shape relative to a goal.
 
     Attributes
     ----------
     position
-        (3,) from the base to its goal, in W, m.
+        (3,) vector from the base to its goal, in W, m.
     rotvec
         (3,) rotation vector from the attitude to the goal attitude, in B, rad.
     shape
-        (n,) from the joint positions to the goal positions, m or rad; empty if the goal has none.
+        (n,) differences from the joint positions to the goal positions, m or rad; empty if the goal
+        has none.
     end_effectors
-        The same for each end-effector in the goal, from its pose, in W and in its own frame; the
-        rotation is zero for a position-only goal.
+        The same errors for each end-effector in the goal: position in W, rotation in the
+        end-effector frame (zero for a position-only goal).
     """
 
     position: Array
@@ -517,7 +522,7 @@ class PoseError:
         q: Array | None = None,
         robot: SpaceRobot | None = None,
     ) -> PoseError:
-        """Return the error between a pose, and the shape ``q`` (n,) if given, and the goal.
+        """Return the error of a pose, and of the shape ``q`` (n,) if given, relative to the goal.
 
         End-effector errors require the shape and the robot.
         """
@@ -536,7 +541,7 @@ class PoseError:
 
     @classmethod
     def of_link(cls, pose: Array, goal: Goal | EndEffectorGoal) -> PoseError:
-        """Return the error from a link's pose (7,) in the world to its goal."""
+        """Return the error of a link pose (7,) in the world relative to its goal."""
         turn = np.zeros(3)
         if goal.quaternion is not None:
             turn = attitude_error(pose[3:], goal.quaternion)
@@ -611,20 +616,21 @@ def missed_parts(
 
 
 def missed_turn(angle: float, tolerance: Tolerance) -> dict[str, str]:
-    """Return a missed end-effector attitude (rad) in the form of :func:`missed_parts`."""
+    """Return a missed end-effector attitude (rad) in the format of :func:`missed_parts`."""
     return {"end-effector's attitude": f"{angle:.3g} rad"} if angle > tolerance.attitude else {}
 
 
 def reached_message(remaining: str, missed: Mapping[str, str]) -> str:
     """Return the message for a reached goal; ``missed`` are its :func:`missed_parts`."""
     parts = " and ".join(f"its {part}, which is {error} off" for part, error in missed.items())
-    but = f" but for {parts} and not controlled" if parts else ""
+    but = f" but for {parts} (not controlled here)" if parts else ""
     return f"The goal is reached{but}: {remaining}."
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Largest errors for a goal to be reached: ``position`` m, ``attitude`` rad, joints m or rad.
+    """Largest errors at which a goal is considered reached: ``position`` m, ``attitude`` rad,
+    joints m or rad.
 
     Pose tolerances apply to the base and to end-effectors.
     """
@@ -674,4 +680,4 @@ class Tolerance:
 
 
 NO_TOLERANCE = Tolerance(0.0, 0.0, 0.0)
-"""Tolerances if the sender has given none."""
+"""Default tolerances if the sender specifies none."""

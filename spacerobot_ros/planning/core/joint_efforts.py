@@ -13,7 +13,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 
 _MAX_EXCESS = 1e-6
-"""Fraction of a limit by which rounding errors may exceed it."""
+"""Fraction of a limit by which an effort may exceed it through rounding errors."""
 
 _MAX_CHECKED_TICKS = 4000
 """Number of ticks up to which all efforts are compared with the limits."""
@@ -22,9 +22,10 @@ _MAX_CHECKED_TICKS = 4000
 class JointEfforts:
     """Efforts of a robot whose joints follow held commands, and their limits.
 
-    Between two commands, the joints have their mean velocity, and the acceleration that changes one
-    into the other within a control period. The efforts follow from inverse dynamics
-    (the model's :func:`.joint_efforts`), as in the plant under velocity actuation.
+    Between two commands, the joints are assumed to move at the mean of the two velocities, with the
+    acceleration that changes the first velocity into the second within a control period. The
+    efforts follow from inverse dynamics (the model's :func:`.joint_efforts`), as in the plant under
+    velocity actuation.
 
     Parameters
     ----------
@@ -53,8 +54,8 @@ class JointEfforts:
         """Return the efforts under held commands relative to their limits (N + 1, n), at the ticks.
 
         ``positions`` (N + 1, n) are the shapes at the ticks; the velocities ``velocity`` and
-        ``after`` (n,) are held before and after. ``L_B`` (N + 1, 3) is the angular momentum about
-        the centre of mass in the base, kg m^2/s; None: zero.
+        ``after`` (n,) are held before and after the motion. ``L_B`` (N + 1, 3) is the angular
+        momentum about the centre of mass in base components, kg m^2/s; None: zero.
         """
         return self._effort_shares(positions, *self._rates(positions, velocity, after), L_B)
 
@@ -65,8 +66,8 @@ class JointEfforts:
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> float:
-        """Return the factor by which held commands must be slowed down; no slowdown is needed if at
-        most 1.
+        """Return the factor by which held commands must be slowed down; at most 1 if no slowdown is
+        needed.
 
         Arguments are as in :meth:`shares`. For a drifting robot this is an estimate, as the
         efforts are not quadratic in the speed.
@@ -83,7 +84,7 @@ class JointEfforts:
     ) -> str:
         """Return a clause that names the joints exceeding their effort limits; empty: none.
 
-        Arguments are as in :meth:`shares`. If there are many ticks, only those with the largest
+        Arguments are as in :meth:`shares`. If there are many ticks, only the ticks with the largest
         accelerations and some in between are checked.
         """
         rates, changes = self._rates(positions, velocity, after)
@@ -101,7 +102,7 @@ class JointEfforts:
                 unit = "N" if joint.unit == "m" else "N m"
                 taken, allowed = f"{share * limit:.4g} {unit}", f"{limit:.4g} {unit}"
                 clauses.append(
-                    f"{joint.name} takes {taken}, {share:.3g} times its limit of {allowed}"
+                    f"{joint.name} requires {taken}, {share:.3g} times its limit of {allowed}"
                 )
         return ", ".join(clauses)
 
@@ -143,7 +144,7 @@ class JointEfforts:
 def given_effort_limits(robot: SpaceRobot) -> Array | None:
     """Return the URDF effort limits (n,); None if the URDF has none.
 
-    A limit of zero means an unknown limit, since nothing could move under it.
+    A limit of zero means that the limit is unknown, because no joint could move without effort.
     """
     limit = np.where(robot.effort_limit > 0, robot.effort_limit, np.inf)
     return limit if np.isfinite(limit).any() else None

@@ -48,10 +48,10 @@ class InitialMotion:
     Attributes
     ----------
     velocity
-        (n,) joint velocities held until then, m/s or rad/s.
+        (n,) joint velocities held until the gait begins, m/s or rad/s.
     remaining
         (M + 1, n) shapes at the remaining ticks of the current plan, until rest; the gait begins at
-        the first one.
+        the first of these ticks.
     """
 
     velocity: Array
@@ -67,15 +67,16 @@ class PlanRequest:
     state
         The state from which the gait begins.
     goal
-        The goal at which it ends.
+        The goal at which the gait ends.
     tolerance
         Largest errors at the goal.
     correction
-        Whether an earlier schedule for the same goal has just ended: then the remaining error is
+        Whether an earlier schedule for the same goal has just ended. If so, the remaining error is
         small, and options that fix the size of the first manoeuvre do not apply.
     previous
-        The last executed schedule for the same goal; None for the first. ``auto`` keeps its
-        method, and methods that plan step by step continue from its ``progress``.
+        The last executed schedule for the same goal; None for the first. ``auto`` continues with
+        the method of this schedule, and methods that plan step by step continue from its
+        ``progress``.
     motion
         Joint motion at the start of the gait; None: they rest. Only methods that
         declare ``starts_in_motion`` receive it.
@@ -98,10 +99,10 @@ BEYOND_EFFORT_LIMITS = "beyond_effort_limits"
 """Name of the note about joints that exceed their effort limits."""
 
 NO_JOINTS = (
-    "Robot '{}' has no joints that could move its base. If it has thrusters, "
-    "coordinated_control flies it; with `profile: planned` it plans the motion."
+    "Robot '{}' has no joints that could move its base. If it has thrusters, use "
+    "coordinated_control; `profile: planned` plans the motion."
 )
-"""Message for rejecting a robot, with its name."""
+"""Message that rejects a robot, to be formatted with the robot name."""
 
 
 class GaitMethod(ABC):
@@ -117,8 +118,8 @@ class GaitMethod(ABC):
     control_period
         Command duration, s.
     integration_step
-        Longest Runge-Kutta step for the predicted attitude, s; use the plant's value for equal
-        results.
+        Longest Runge-Kutta step for the predicted attitude, s; use the plant's value to obtain the
+        same results.
     options
         An instance of the method's ``Options``; None: the defaults.
     clearance
@@ -129,10 +130,10 @@ class GaitMethod(ABC):
     name
         Registry name, and name of the parameter group ``<name>.<option>``.
     controls
-        Goal components controlled by the method's schedules. A method that selects among others
-        sets them only in each schedule.
+        Goal components controlled by the method's schedules. A method that selects among other
+        methods sets these components only in its schedules.
     plans_for_base, plans_for_end_effectors
-        Whether it plans for base goals, and for end-effector goals.
+        Whether the method plans for base goals, and for end-effector goals.
     follows_paths
         Whether it moves end-effectors along given paths.
     repeats_cycles
@@ -206,14 +207,14 @@ class GaitMethod(ABC):
 
     @abstractmethod
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
-        """Return a gait for a request that ends at rest; equal requests yield equal gaits.
+        """Return a gait that ends at rest, for a request; identical requests yield identical gaits.
 
         Raises
         ------
         PlanningError
             The method cannot reach the goal; the message says why.
         PlanningCancelled
-            Cancellation was requested meanwhile.
+            Cancellation was requested during planning.
         """
 
     def schedule_of(
@@ -233,9 +234,9 @@ class GaitMethod(ABC):
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
-        ``velocity`` and ``end_velocities`` (n,) are held before and after. Efforts beyond the URDF
-        limits are noted; ``L_B`` (N + 1, 3) is the angular momentum in the base for
-        this check (:class:`JointEfforts`).
+        ``velocity`` and ``end_velocities`` (n,) are held before and after the motion. A note
+        reports efforts beyond the URDF limits; ``L_B`` (N + 1, 3) is the angular momentum in base
+        components for this check (:class:`JointEfforts`).
 
         Raises
         ------
@@ -317,7 +318,7 @@ class GaitMethod(ABC):
         if beyond[worst] > _LIMIT_SLACK:
             joint = robot.description.movable_joints[worst]
             raise UnreachableError(
-                f"The goal shape is beyond limits: joint '{joint.name}' at "
+                f"The goal shape violates joint limits: joint '{joint.name}' at "
                 f"{wanted[worst]:.4g} {joint.unit}, but its limits are [{robot.lower[worst]:.4g}, "
                 f"{robot.upper[worst]:.4g}] {joint.unit}.",
                 Proof.LIMITS,
@@ -396,13 +397,13 @@ class GaitMethod(ABC):
             raise PlanningError(
                 "The robot drifts: its total momentum is not zero "
                 f"({p:.3g} kg m/s, {L:.3g} kg m^2/s), but {self.name} plans for zero momentum, "
-                "which joint motions cannot establish; optimal plans for robots that drift."
+                "which joint motions cannot establish; use optimal for drifting robots."
             )
         wheels = ReactionWheels.of(self.robot.description)
         if state.qdot is not None and wheels.are_spinning(state.qdot):
             raise PlanningError(
-                f"Reaction wheels spin, but {self.name} begins with all joints at rest; optimal "
-                "plans from spinning wheels."
+                f"Reaction wheels spin, but {self.name} begins with all joints at rest; use "
+                f"optimal if wheels spin at the start."
             )
 
     def significant(self, momentum: Array) -> Array:

@@ -22,8 +22,8 @@ _MIN_PATH_POSES = 200
 """Smallest number of poses in a predicted base path; a path has at most twice as many."""
 
 _LARGE_ERROR, _MAX_HALVINGS = 1e-7, 8
-"""Integration error, rad, above which its extrapolation is off by more than a nanoradian, and the
-largest number of step halvings."""
+"""Integration error, rad, above which the extrapolated value is off by more than a nanoradian, and
+the largest number of step halvings."""
 
 
 def coasting_positions(
@@ -36,7 +36,7 @@ def coasting_positions(
     robot, state
         The model, and its state at time zero.
     time, shapes, quaternions
-        (K,) s, (K, n) m or rad, and (K, 4) of R_WB, (x, y, z, w).
+        Times (K,), s; shapes (K, n), m or rad; and quaternions (K, 4) of R_WB, (x, y, z, w).
     """
     start = matrix_from_quaternion(state.quaternion) @ robot.center_of_mass(state.q)
     r_cm = state.position + start
@@ -50,7 +50,7 @@ def coasting_positions(
 
 
 class BasePrediction:
-    """Predicts base attitude and position under held joint velocities.
+    """Predicts the base attitude and position under held joint velocities.
 
     Parameters
     ----------
@@ -59,7 +59,8 @@ class BasePrediction:
     control_period
         Command duration, s.
     integration_step
-        Longest Runge-Kutta step for the attitude, s; use the plant's value for equal results.
+        Longest Runge-Kutta step for the attitude, s; use the plant's value to obtain the same
+        results.
 
     Raises
     ------
@@ -78,11 +79,12 @@ class BasePrediction:
         return self._integrate(positions, quaternion, L_W, self._control_period)
 
     def true_end(self, positions: Array, attitudes: Array, L_W: Array) -> Array:
-        """Return the attitude (4,) at the end of the shapes (N + 1, n), independent of speed.
+        """Return the attitude (4,) after a motion through the shapes (N + 1, n); it does not depend
+        on the speed.
 
-        ``attitudes`` (N + 1, 4) come from the plant's steps. Their fourth-order error is
-        estimated with halved steps (Richardson extrapolation); while it is large, steps are halved
-        again.
+        ``attitudes`` (N + 1, 4) are computed with the plant's integration steps. Their fourth-order
+        error is estimated with halved steps (Richardson extrapolation); while the error is large,
+        steps are halved again.
         """
         coarse, path, period = attitudes[-1], positions, self._control_period
         for _ in range(_MAX_HALVINGS):

@@ -34,8 +34,8 @@ class SearchProgress:
     Attributes
     ----------
     starts, max_starts
-        Number of initial guesses tried so far, and the largest number: a search ends earlier if
-        enough solutions agree. 0 and 0 if the search does not count them.
+        Number of initial guesses tried so far, and the largest possible number; a search ends
+        earlier if enough solutions agree. Both are 0 if the search does not count guesses.
     best_s
         Duration of the best manoeuvre so far, s; infinite before the first one.
     phase

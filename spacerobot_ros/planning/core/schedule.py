@@ -41,14 +41,15 @@ class BasePath:
 
 @dataclass(frozen=True, repr=False)
 class GaitSchedule:
-    """A gait as held commands: the shape at each tick, joint velocities constant in between.
+    """A gait as held commands: the shape at each tick, with constant joint velocities between
+    ticks.
 
     Attributes
     ----------
     method
-        Registry name of the method that produced it.
+        Registry name of the method that produced the gait.
     joint_names
-        Joint names, the columns of ``positions``.
+        Joint names, one per column of ``positions``.
     control_period
         s.
     positions
@@ -59,16 +60,17 @@ class GaitSchedule:
     path
         Predicted base path at instants chosen by the method, including the first and the last.
     goal
-        The goal for which it was planned.
+        The goal for which the gait was planned.
     notes
         Named results of the method, for reports (with its paper's symbols).
     partial
-        Whether it intentionally ends short of the goal: the next part is planned from the pose
-        measured at its end.
+        Whether the gait intentionally ends short of the goal, so that the next gait is planned from
+        the pose measured at the end of this one.
     remaining
-        Expected duration of the schedules after a partial schedule until the goal is reached, s.
+        Expected duration, s, of the schedules that follow a partial schedule until the goal is
+        reached.
     controls
-        Goal components that it controls; its result is evaluated by these.
+        Goal components controlled by the gait; only these are evaluated at its end.
     progress
         State of the method for the next schedule to the same goal, of a method-specific type; see
         ``PlanRequest.previous``.
@@ -113,12 +115,13 @@ class GaitSchedule:
 
     @property
     def expected_duration(self) -> float:
-        """Expected time until the goal is reached, including all later schedules for it, s."""
+        """Expected time until the goal is reached, including all later schedules for this goal,
+        s."""
         return self.duration + self.remaining
 
     @cached_property
     def velocities(self) -> Array:
-        """Held joint velocities (N, n), m/s or rad/s; they carry the shape from tick to tick."""
+        """Held joint velocities (N, n), m/s or rad/s; they move the shape from tick to tick."""
         return np.diff(self.positions, axis=0) / self.control_period
 
 
@@ -132,18 +135,18 @@ def straight_motion(
     control_period: float,
     longest: float,
 ) -> Array:
-    """Return the shapes (N + 1, n) at the ticks from ``start`` (n,) through ``ends``.
+    """Return the shapes (N + 1, n) at the ticks of a path from ``start`` (n,) through ``ends``.
 
     Every leg is a straight line in shape space, from rest to rest (paper 3, section III): under
     ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is traversed as
-    ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. The ends are shapes
-    (n,), each with the duration of the leg to it, s. A leg takes a whole number of ticks, more if a
-    joint is slow, zero if nothing moves.
+    ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. ``ends`` are shapes
+    (n,), each with the duration, s, of the leg that leads to it. A leg takes a whole number of
+    ticks: more of them if a joint is slow, none if nothing moves.
 
     Raises
     ------
     PlanningError
-        The legs together take more than ``longest`` s.
+        Together, the legs take more than ``longest`` s.
     """
     starts = [start, *(end for end, _ in ends)]
     legs = [
@@ -156,7 +159,7 @@ def straight_motion(
         joint = robot.description.movable_joints[slowest]
         raise PlanningError(
             f"A motion of {len(legs)} straight legs would take {total:.4g} s, more than longest = "
-            f"{longest:.6g} s; the slowest joint is '{joint.name}', whose limit is "
+            f"{longest:.6g} s; the slowest joint is '{joint.name}', whose velocity limit is "
             f"{robot.velocity_limit[slowest]:.3g} {joint.unit}/s."
         )
     pieces = [start[np.newaxis]]

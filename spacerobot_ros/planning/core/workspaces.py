@@ -1,18 +1,19 @@
 """Path-independent and path-dependent workspaces of an end-effector while the base floats.
 
 At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of the
-end-effector. If it loses rank, there is a direction in which no rates move the end-effector: a
-dynamic singularity. Whether it does depends on the shape. So does the distance of the end-effector
-from the
-system's centre of mass, which is at rest, while the base may have any attitude. A distance attained
-by some singular shape is therefore *path-dependent*: whether the robot is singular there depends on
-the path that led there. Distances not attained by any singular shape are *path-independent*
-(Papadopoulos and Dubowsky; paper 4, section V).
+end-effector. If ``J*`` loses rank, there is a direction in which no joint rates can move the
+end-effector: a dynamic singularity. Whether this happens depends on the shape. The distance of the
+end-effector from the system's centre of mass also depends only on the shape: the centre of mass is
+at rest, while the base may have any attitude. A distance attained by some singular shape is
+therefore *path-dependent*: whether the robot is singular there depends on the path that led there.
+Distances not attained by any singular shape are *path-independent* (Papadopoulos and Dubowsky;
+paper 4, section V).
 
 Singular shapes are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, where ``u`` is the direction
-of no motion. Starting from seeded shapes all over the shape space, Gauss-Newton finds the
-nearest solutions; from each, curves of solutions are followed to larger and to smaller distances.
-Distances change continuously on a curve, so all between its ends are path-dependent.
+in which no motion is possible. Starting from seeded shapes spread over the shape space,
+Gauss-Newton iterations find the nearest solutions; from each of these solutions, curves of
+solutions are followed to larger and to smaller distances. Distances change continuously on a curve,
+so all distances between its ends are path-dependent.
 """
 
 from __future__ import annotations
@@ -34,13 +35,14 @@ reach."""
 _EXTREME_STARTS = 3
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
 _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
-"""Steps along curves of singular shapes, rad (or m) of the fastest joint."""
+"""Number of steps along a curve of singular shapes, and longest and shortest step, rad (or m) of
+the fastest joint."""
 
 _ZERO_RESIDUAL = 1e-9
-"""Residual of the dimensionless singularity equations that counts as zero."""
+"""Largest residual of the dimensionless singularity equations that is treated as zero."""
 
 _ZERO_RATE = 1e-6
-"""Singular value of J*, relative to the reach, that counts as zero."""
+"""Largest singular value of J*, relative to the reach, that is treated as zero."""
 
 _MAX_CLOSED_GAP = 2e-3
 """Gaps between path-dependent distances smaller than this fraction of the reach are closed: curves
@@ -60,7 +62,7 @@ class Workspaces:
     within_limits
         Whether joint limits are enforced; if not, revolute joints are unlimited.
     distance_range
-        The smallest and the largest distance.
+        The smallest and the largest attainable distance.
     path_dependent
         Closed intervals of link distances attained by singular shapes, in ascending order.
     dimensions
@@ -78,7 +80,7 @@ class Workspaces:
 
     @property
     def path_independent(self) -> tuple[Interval, ...]:
-        """Intervals of the reach between the path-dependent ones, in ascending order."""
+        """Intervals of the reach between path-dependent intervals, in ascending order."""
         nearest, farthest = self.distance_range
         ends = [nearest, *np.ravel(self.path_dependent).tolist(), farthest]
         gaps = zip(ends[::2], ends[1::2], strict=True)
@@ -90,9 +92,9 @@ def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
     """Return the workspaces of a link's origin at zero momentum: without revolute joint limits and,
     if there are limits, also within them.
 
-    Except for gaps of less than 0.2 % of the reach, every interval consists of distances of the
-    singular shapes found. The intervals are complete only if the seeded shapes lead to all curves
-    of singular shapes: with two joints in a plane, each curve is found many times.
+    Except for gaps of less than 0.2 % of the reach, all distances in an interval are attained by
+    singular shapes that were found. The intervals are complete only if the seeded shapes lead to
+    all curves of singular shapes: for two joints in a plane, each curve is found many times.
 
     Raises
     ------
@@ -206,7 +208,7 @@ class _Equations:
         return np.hstack([shapes, np.linalg.svd(J)[0][:, :, -1]])
 
     def reach(self, lower: Array, upper: Array) -> tuple[Interval, Array]:
-        """Return the smallest and the largest distance within bounds, and shapes (2, n) there."""
+        """Return the smallest and the largest distance within bounds, and their shapes (2, n)."""
         from scipy.optimize import minimize
 
         m = self.dimensions

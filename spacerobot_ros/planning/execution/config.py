@@ -39,7 +39,8 @@ class PlannerConfig(CommanderConfig):
     )
     trajectory_action: str = parameter(
         "joint_trajectory_controller/follow_joint_trajectory",
-        "name of the FollowJointTrajectory action to which `output` trajectory sends schedules",
+        "name of the FollowJointTrajectory action to which schedules are sent if `output` is "
+        "trajectory",
     )
     clearance: float = nonnegative(
         DEFAULT_CLEARANCE,
@@ -52,7 +53,7 @@ class PlannerConfig(CommanderConfig):
         "", "SRDF file with link pairs excluded from checks; '': NAME.srdf next to the URDF"
     )
     max_corrections: int = nonnegative(
-        3, "number of new plans after the first", maximum=1000, read_only=False
+        3, "largest number of plans after the first", maximum=1000, read_only=False
     )
     abort_time: float = parameter(
         1.0,
@@ -123,7 +124,7 @@ class PlannerConfig(CommanderConfig):
     def goal_links(self) -> tuple[str, ...]:
         """Names of the links that accept goals.
 
-        If a controller moves the robot, end-effector goals are for the controller.
+        If a controller moves the robot, it handles the end-effector goals.
         """
         default = [DEFAULT_END_EFFECTOR] if self.output != "reference" else []
         return tuple(dict.fromkeys((*default, *self.end_effectors)))

@@ -1,6 +1,6 @@
 """Planner state machine: from goals and measured states to setpoints, without ROS.
 
-:meth:`Executive.update` is called for every measured state. ``docs/planner_state_machine.md`` has
+:meth:`Executive.update` is called for every measured state. ``docs/planner_state_machine.md`` lists
 the phases, the events that change them, and the table of all transitions.
 
 Other modules do the work of the phases: :mod:`.tracker` computes the commands along a schedule,
@@ -60,18 +60,19 @@ from spacerobot_ros.planning.execution.worker import (
 from spacerobot_ros.times import SECOND
 
 _MAX_IN_MOTION_ATTEMPTS = 2
-"""Largest number of plans in motion for one goal; each takes over twice as late as the previous
-one."""
+"""Largest number of plans per goal that take over in motion; each plan takes over after twice the
+delay of the previous one."""
 
 
 class Executive:
-    """Brings a robot to successive goals, with a setpoint for every state.
+    """Moves a robot to successive goals, and computes a setpoint for every state.
 
-    If the worker plans synchronously, the measured state waits for its plan, and a plan requested
-    while the joints move begins with braking. If it plans in the background, the joints brake to
-    rest before a plan is requested, and hold their shape until it is available. If the methods of
-    both schedules allow it, no braking is needed: a plan takes over in motion at a later tick. This
-    tick depends on parameters and on the request's stamp, not on the planning time.
+    If the worker plans synchronously, the measured state is held until the plan is made, and a plan
+    requested while the joints move begins with braking. If it plans in the background, the joints
+    brake to rest before a plan is requested, and hold their shape until the plan is available. If
+    the methods of the current and the new schedule allow it, no braking is needed: the new plan
+    takes over in motion at a later tick. This tick depends on parameters and on the request's
+    stamp, not on the planning time.
 
     Parameters
     ----------
@@ -96,7 +97,7 @@ class Executive:
         self._job: PlanJob | None = None
         """The requested plan."""
         self._ready_plan: GaitSchedule | None = None
-        """The result of the job, which waits for its tick (``TAKING_OVER``)."""
+        """The plan from the job, until the tick at which it takes over (``TAKING_OVER``)."""
         self._active_goal: ActiveGoal | None = None
         self._replan_ns = 0
         """Stamp from which the remaining motion is replanned, ns."""
@@ -119,7 +120,7 @@ class Executive:
     # -- requests of the owner ----------------------------------------------------------------
 
     def propose_goal(self, identified: IdentifiedGoal) -> None:
-        """Plan for a goal from the next measured states; it replaces any other goal."""
+        """Plan for a goal from the next measured states; this goal replaces any other goal."""
         self._new_goal, self._in_motion_attempts = identified, 0
         self._average.restart()
         match self.phase:
@@ -130,16 +131,18 @@ class Executive:
                 self._change_phase(Event.NEW_GOAL, Phase.EXECUTING)
 
     def propose_twist(self, twist: TwistCommand) -> None:
-        """Make an end-effector follow a twist from the next state on, until twists stop.
+        """Make an end-effector follow a twist from the next state on, until no more twists arrive.
 
         Raises
         ------
         PlanningError
-            A goal is pursued, or the twist is rejected by :class:`Teleoperation`.
+            A goal is being pursued, or the twist is rejected by :class:`Teleoperation`.
         """
         if self.phase not in (Phase.IDLE, Phase.TELEOPERATING) or self._new_goal is not None:
             self._teleoperation.refuse(self._stamp_ns)
-            raise PlanningError("Twists are not followed while a goal is pursued: abort it first.")
+            raise PlanningError(
+                "Twists are not followed while a goal is pursued: abort the goal first."
+            )
         self._teleoperation.receive(twist, self._stamp_ns)
         if self.phase is Phase.IDLE:
             self._change_phase(Event.TWIST, Phase.TELEOPERATING)
@@ -157,7 +160,8 @@ class Executive:
         return frozenset(goal.goal_id for goal in goals if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the current activity for a goal, and the expected time until it ends, s.
+        """Return the current activity for a goal, and the expected time, s, until the goal is
+        reached.
 
         None if no schedule leads to the goal yet.
         """
@@ -192,7 +196,7 @@ class Executive:
                 duration = self.config.abort_time
                 message = f"The joints brake along the planned path within {duration:g} s."
                 if self.config.output == "trajectory":
-                    message = f"The joints' controller has {duration:g} s to bring them to rest."
+                    message = f"The joint controller has {duration:g} s to bring them to rest."
                 self._change_phase(Event.ABORTED, Phase.BRAKING)
         self._forget_goals()
         self._add_abort(f"Aborted {why}. {message}", latest)
@@ -201,11 +205,11 @@ class Executive:
     def plant_stopped(
         self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
     ) -> bool:
-        """Abort all goals immediately, because the plant no longer obeys commands.
+        """Abort all goals immediately, because the plant no longer accepts commands.
 
-        If the plant rests because no commands arrived, a goal continues if nothing had been
-        commanded for it, or if planning took so long that no state was processed. A goal that was
-        to replace another one is planned from rest.
+        If the plant rests because no commands arrived, two kinds of goals continue: goals for which
+        nothing had been commanded, and goals whose planning took so long that no state was
+        processed. A goal that was about to replace another goal is planned from rest.
         """
         successor = None
         if commanded_until_ns is not None:
@@ -234,9 +238,9 @@ class Executive:
     def schedule_ended(self, why: str = "", *, final: bool = False) -> None:
         """End the schedule at the next state, because the robot's own controller has ended it.
 
-        The measured state is compared with the goal as after every schedule, and the remaining
-        motion is planned again; ``final``: there are no further plans. ``why`` is the clause that
-        says why it ended early; empty: it was followed to its end.
+        The measured state is compared with the goal, as after any schedule, and the remaining
+        motion is planned again; ``final``: there are no further plans. ``why`` is a clause with the
+        reason for an early end; empty: the schedule was completed.
         """
         active = self._active_goal
         if active is None:
@@ -248,7 +252,7 @@ class Executive:
         self._tracker.end_by_result()
 
     def configure(self, config: PlannerConfig) -> None:
-        """Use other tolerances and correction settings from now on."""
+        """From now on, use other tolerances and correction settings."""
         self.config = config
 
     def on_plant_obeying(self) -> None:
@@ -261,9 +265,9 @@ class Executive:
     def use_robot(
         self, robot: SpaceRobot, worker: PlanningWorker, config: PlannerConfig | None = None
     ) -> None:
-        """Plan again for the present goal, if any, by another worker.
+        """Plan again for the current goal, if any, with another worker.
 
-        The robot has other mass properties, or ``config`` has another rate of the plant.
+        Either the robot has different mass properties, or ``config`` has a different plant rate.
         """
         what = (
             "The robot has a different mass" if config is None else "The plant has a different rate"
@@ -279,16 +283,17 @@ class Executive:
             self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
 
     def plan_at_once(self) -> None:
-        """From now on, plan while states wait, because the plant is in lockstep."""
+        """From now on, let states wait during planning, because the plant runs in lockstep."""
         self.config = replace(self.config, plan_in_background=False)
         self._worker.plans_in_background = False
 
     def use_obstacles(self, make_worker: Callable[[], PlanningWorker]) -> None:
         """Plan around other obstacles from now on.
 
-        A plan in progress is restarted. If the rest of the present schedule comes too near to
+        A plan in progress is restarted. If the rest of the current schedule comes too close to
         obstacles, the joints brake, and the remaining motion is planned again. ``make_worker``
-        returns the worker that knows the obstacles; it is called when no plan is in progress.
+        returns the worker that avoids these obstacles; the function is called when no plan is in
+        progress.
         """
         self._drop_plan()
         self._worker.close()
@@ -318,7 +323,9 @@ class Executive:
     def _plan_again(self, message: str) -> None:
         self._average.forget()
         if self.phase is Phase.TELEOPERATING:
-            self._end_teleoperation(Event.PLANT_RESET, "The plant was reset: the joints rest.")
+            self._end_teleoperation(
+                Event.PLANT_RESET, "The plant was reset: the joints are at rest."
+            )
         # The held shape and the schedule belong to the time before the reset.
         self._tracker.stop()
         self._tracker.forget_wheels()
@@ -348,7 +355,8 @@ class Executive:
     # -- measured states ----------------------------------------------------------------------
 
     def add_base_measurement(self, measured: MeasuredState) -> None:
-        """Use a base measurement that arrived after its state was processed."""
+        """Use a base measurement that arrived after the state with the same stamp had been
+        processed."""
         if self.phase is Phase.TELEOPERATING:
             self._teleoperation.keep_base_pose(measured)
         elif self.measuring:
@@ -593,7 +601,7 @@ class Executive:
         self._drop_plan()
         self._in_motion_attempts += job.reason.is_for_new_goal
         self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
-        message = "The plan was not ready when it was to take over."
+        message = "The plan was not ready in time to take over."
         about = {"reason": job.reason.value}
         self._add_warning(EventKind.PLAN_LATE, message, job.identified, about)
 

@@ -37,8 +37,8 @@ class IdentifiedGoal:
     tolerance
         Its tolerance; None: the commander's parameters.
     resumes
-        Whether a restarted commander continues it. An action goal is not continued: its client is
-        notified of its end when the commander stops.
+        Whether a restarted commander resumes the goal. Action goals are not resumed: their clients
+        are notified when the commander stops.
     required
         Tolerances given by the sender; 0: none. A goal with a tolerance for a component
         that the method or law does not control is rejected.
@@ -51,7 +51,7 @@ class IdentifiedGoal:
     required: Tolerance = NO_TOLERANCE
 
     def kept_at(self, position: Array, quaternion: Array) -> IdentifiedGoal:
-        """Return this with the goal from :meth:`Goal.kept_at`."""
+        """Return a copy with the goal from :meth:`Goal.kept_at`."""
         return replace(self, goal=self.goal.kept_at(position, quaternion))
 
 
@@ -83,7 +83,7 @@ class GoalIds:
 class GoalFile:
     """A file with a commander's current goals; reached and abandoned goals are removed.
 
-    A restarted commander loads them and continues. An executive's reports update the file:
+    A restarted commander loads and resumes them. An executive's reports update the file:
     :meth:`pursue` and :meth:`end`.
 
     Parameters
@@ -105,11 +105,11 @@ class GoalFile:
         try:
             self.save(pursued.goals)
         except ParameterError as error:
-            return f"{error} The goal is pursued, but not resumed after a restart."
+            return f"{error} The goal is pursued, but will not be resumed after a restart."
         return ""
 
     def end(self, goal_id: str, *, refused: bool) -> None:
-        """Delete the file when a goal has ended, unless another goal was refused."""
+        """Delete the file when a goal has ended, unless another goal was rejected."""
         if self._ids and (goal_id in self._ids or not refused):
             self.delete()
 
@@ -146,7 +146,7 @@ class GoalFile:
                 self._path.unlink()
 
     def load(self) -> dict[str, IdentifiedGoal]:
-        """Return the goals that a commander was pursuing when it ended; empty without a file.
+        """Return the goals that a commander was pursuing when it ended; empty if there is no file.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class GoalFile:
             }
         except (KeyError, TypeError) as error:
             raise ValueError(
-                "a goal has 'position', 'quaternion' and 'joint_positions' (null: any shape)"
+                "a goal must have 'position', 'quaternion' and 'joint_positions' (null: any shape)"
             ) from error
 
 

@@ -2,9 +2,9 @@
 
 At zero momentum, the base rotation depends only on the shape path and on ratios of masses and
 inertias. A rotation that differs from the prediction indicates errors in these model
-parameters. To first order, the deviation of the base path is linear in their relative errors, each
-multiplied by a path sensitivity. Linear least squares over many noisy poses, with a prior on
-the errors, yield the estimate (one Gauss-Newton step about the model).
+parameters. To first order, the deviation of the base path is linear in the relative errors of these
+parameters, each multiplied by a path sensitivity. Linear least squares over many noisy poses, with
+a prior on the errors, yields the estimate (one Gauss-Newton step about the model).
 """
 
 from __future__ import annotations
@@ -47,13 +47,14 @@ _POSE_NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
 _MAX_PLAUSIBLE_ERROR = 6 * _PRIOR_DEVIATION
-"""Largest plausible relative mass or inertia error; larger estimates have another cause, such as a
-jump in the measurements."""
+"""Largest plausible relative mass or inertia error; if the estimate is larger, the deviation has
+another cause, such as a jump in the measurements."""
 
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
-"""Two fractions of the tolerances each, for early and late in a motion: the remaining motion is
-replanned if its expected error exceeds the first, and the new plan may end within the second.
-Base rotations left until late in a motion take a long time."""
+"""Fractions of the tolerances, with one value each for the early and the late phase of a motion:
+the remaining motion is replanned if its expected error exceeds the first fraction, and the expected
+error of the new plan may be at most the second fraction. Base rotations that are postponed until
+late in a motion take a long time."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +65,16 @@ class TrackingError:
     angle: float
 
     def __str__(self) -> str:
-        return f"Off the path by {quantity(self.distance, 'm')} and {quantity(self.angle, 'rad')}"
+        return (
+            f"Deviates from the path by {quantity(self.distance, 'm')} "
+            f"and {quantity(self.angle, 'rad')}"
+        )
 
 
 class PathCheck:
     """Compares measured states with a schedule's predicted base path.
 
-    The methods require a :meth:`due` state.
+    Call the other methods only for a state that is :meth:`due`.
 
     Parameters
     ----------
@@ -83,8 +87,8 @@ class PathCheck:
     config
         Planner parameters: tracking error bounds, and the shape deadband.
     average
-        Number of measured poses whose mean deviation from the path is used for plans in motion; 0:
-        none.
+        Number of measured poses whose mean deviation from the path is used for plans that begin in
+        motion; 0: none.
     sensitivity, masses
         Derivatives of the path with respect to mass errors, and their estimate: see
         :class:`PathDeviation`.
@@ -167,8 +171,8 @@ class PathCheck:
     ) -> Goal | None:
         """Return the goal for a new plan; None if the path is expected to end close to its goal.
 
-        Plans use the URDF masses. So the goal is shifted by the error expected
-        from the estimated masses, as far as it exceeds a fraction of the tolerance.
+        Plans use the URDF masses. So the goal is shifted by the part of the error expected from the
+        estimated masses that exceeds a fraction of the tolerance.
         """
         last = self._positions[-1]
         error = PoseError.between(*self.expected_end, goal, last, self._robot)
@@ -201,9 +205,9 @@ def _excess_share(error: float, allowed: float) -> float:
 class PathDeviation:
     """Mean deviation of the latest measured base poses from a predicted path.
 
-    At zero momentum, the base motion relative to its own pose depends only on the shape path: a
-    base that is off the predicted path by a rotation and a displacement continues on that path,
-    rotated and displaced.
+    At zero momentum, the base motion relative to the current base pose depends only on the shape
+    path. So a base that deviates from the predicted path by a rotation and a displacement continues
+    along that path, rotated and displaced.
 
     Parameters
     ----------
@@ -234,11 +238,12 @@ class PathDeviation:
         masses.begin_path()
 
     def add(self, k: int, position: Array, quaternion: Array, lag: Array | float = 0.0) -> None:
-        """Add a measured position (3,) and attitude (4,) at instant k of the path.
+        """Add a measured position (3,) and attitude (4,) to the mean deviation, for instant k of
+        the path.
 
-        ``lag`` (6,) is the part of its deviation, displacement (m) and rotation vector (rad) in W,
-        due to joints lagging behind the schedule. It vanishes when the joints catch up, so it is
-        excluded from the mean deviation.
+        ``lag`` (6,) is the part of the deviation, displacement (m) and rotation vector (rad) in W,
+        due to joints lagging behind the schedule. This part vanishes when the joints catch up, so
+        it is excluded from the mean deviation.
         """
         predicted = self._path.quaternion[k]
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
@@ -342,7 +347,7 @@ class PathSensitivity:
         """Return the derivatives (K, 6, P) of the K poses of a schedule's predicted path.
 
         The first three components are position, m, the others attitude (rotation vector, rad), all
-        in W. The derivatives of the first pose are zero, because it is measured.
+        in W. The derivatives of the first pose are zero, because this pose is measured.
         """
         path = schedule.path
         knots = len(path.time)
@@ -403,7 +408,7 @@ class MassEstimate:
         self._errors = None
 
     def begin_path(self) -> None:
-        """Begin another path, keeping the information from earlier paths."""
+        """Start a new path, but keep the information from earlier paths."""
         if self.errors.any():
             self._information, self._vector = self._normal_equations()
         self._clear_path()

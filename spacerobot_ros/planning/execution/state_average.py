@@ -21,8 +21,8 @@ _REST_RATE = 1e-9  # m/s or rad/s
 
 
 class BaseMeasurement(NamedTuple):
-    """Components of a measured state other than stamp and shape: ``pose`` (7,), ``twist`` (6,) of
-    the base, ``qdot`` (n,)."""
+    """Components of a measured state, except for its stamp and shape: ``pose`` (7,), ``twist`` (6,)
+    of the base, ``qdot`` (n,)."""
 
     pose: Array
     twist: Array
@@ -49,8 +49,8 @@ class StateAverage:
     """Averages measured states, and estimates the total momenta from states at rest.
 
     While joints move, the momentum of a robot with uncertain masses is uncertain; at rest, it
-    follows from the base motion alone, and without thrust it is constant. So the last momenta
-    measured at rest, if any, are used for a state.
+    follows from the base motion alone, and without thrust it is constant. So a state gets the last
+    momenta that were measured at rest, if there are any.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ class StateAverage:
     count
         States to average.
     rest_tolerance
-        Averaged base and joint rates up to this value are treated as noise about rest, m/s or
-        rad/s, with zero momentum. 0: every measured momentum is used.
+        Averaged base and joint rates up to this value, m/s or rad/s, are treated as noise at rest,
+        and the momentum as zero. 0: every measured momentum is used.
     """
 
     def __init__(self, robot: SpaceRobot, count: int = 1, rest_tolerance: float = 0.0) -> None:
@@ -71,7 +71,7 @@ class StateAverage:
         self._rates: list[Array] = []
         self._shapes: list[Array] = []
         self._momenta: tuple[Array, Array] | None = None
-        """Latest momenta measured at rest, (3,) each; None: none were."""
+        """Momenta last measured at rest, (3,) each; None: none were."""
 
     @property
     def count(self) -> int:
@@ -84,7 +84,7 @@ class StateAverage:
         return self.count >= self._full_count
 
     def restart(self) -> None:
-        """Discard the states, but keep the momenta."""
+        """Discard the averaged states, but keep the momenta."""
         self._poses, self._rates, self._shapes = [], [], []
 
     def forget(self) -> None:

@@ -35,7 +35,7 @@ from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal, PursuedG
 from spacerobot_ros.times import SECOND
 
 _LATE_TIME_SHARE = 1 / 3
-"""Remaining fraction of a motion's duration from which the motion counts as late."""
+"""Fraction of a motion's duration that remains when its late phase begins."""
 
 
 _LEVELS = {
@@ -95,14 +95,14 @@ class PlannerStatus:
     goal
         (7,) goal position in m and quaternion (x, y, z, w); empty if not reported.
     corrections
-        Number of new plans for this goal after the first that count as corrections.
+        Number of plans for this goal, after the first, that count as corrections.
     end_effector_goals
         End-effector goals by link: a position (3,), m, or position and quaternion (7,).
     end_effector_waypoints
         Number of waypoints on the given paths to these goals, by link.
     end_effector_position_error_m, end_effector_attitude_error_rad
-        Largest remaining end-effector errors; None if end-effectors have no goals, or were not
-        evaluated.
+        Largest remaining end-effector errors; None if there are no end-effector goals, or if they
+        were not evaluated.
     position_error_m, attitude_error_rad
         Remaining error of the measured base pose; None if it was not evaluated.
     manoeuvre_time_s
@@ -111,9 +111,10 @@ class PlannerStatus:
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
     remaining_s
-        Expected duration of later schedules until the goal is reached; 0: none needed.
+        Expected duration of later schedules until the goal is reached; 0: no further schedule is
+        needed.
     method
-        Gait method of the starting schedule; empty if none starts.
+        Gait method of the schedule that starts; empty if no schedule starts.
     duration_s
         Its duration.
     notes
@@ -184,7 +185,7 @@ class PlannerStatus:
         Raises
         ------
         SpaceRobotError
-            The values are not a planner status.
+            The values do not form a planner status.
         """
         return _FORMAT.from_values(cls, values, message=message)
 
@@ -211,7 +212,7 @@ _PARTS = TextFormat(
     " ".join,
     lambda text: tuple(part for part in ("position", "attitude", "shape") if part in text.split()),
 )
-"""Goal components that a method may leave uncontrolled; unknown words are omitted."""
+"""Goal components that a method may leave uncontrolled; unknown component names are ignored."""
 
 _FORMAT = KeyValueFormat(
     "status of a planner",
@@ -367,14 +368,15 @@ class ActiveGoal:
     next_plan: PlanReason = PlanReason.CORRECTION
     """Reason for the next plan, if one is needed."""
     stuck_positions: dict[str, float] = field(default_factory=dict)
-    """Stuck joint positions, m or rad, as measured for the last plan."""
+    """Positions of stuck joints, m or rad, as measured for the last plan."""
     required: frozenset[Controlled] = frozenset()
     """Goal components that plans without the stuck joints must control."""
     not_flown_reason: str = ""
-    """Clause with the reason why schedules are no longer flown; empty if they are."""
+    """Reason why schedules are no longer executed, as a clause; empty: schedules are executed."""
 
     def begin(self, schedule: GaitSchedule, stamp_ns: int) -> None:
-        """Pursue the goal by another schedule, from the stamp of its first tick on."""
+        """Pursue the goal with another schedule, starting at the stamp of that schedule's first
+        tick."""
         self.cut_off(stamp_ns)
         self.schedule = schedule
         self.manoeuvre_time += schedule.duration
@@ -382,7 +384,7 @@ class ActiveGoal:
         self.next_plan = PlanReason.CONTINUATION if schedule.partial else PlanReason.CORRECTION
 
     def cut_off(self, stamp_ns: int) -> None:
-        """Subtract the rest of the schedule after a stamp, which is not flown."""
+        """Subtract the part of the schedule after a stamp, because that part is not executed."""
         remainder = self.time_left(stamp_ns)
         if remainder > 0:
             self.manoeuvre_time -= min(remainder, self.schedule.duration)
@@ -402,7 +404,7 @@ class ActiveGoal:
         return self.time_left(stamp_ns) < _LATE_TIME_SHARE * self.manoeuvre_time
 
     def reached(self, error: PoseError, tolerance: Tolerance) -> PlannerStatus | None:
-        """Return the status of a goal that is reached with an error; None: it is not reached."""
+        """Return the status of a goal that is reached with this error; None: not reached."""
         goal, controls = self.identified.goal, self.schedule.controls
         if not tolerance.admits(error, controls):
             return None
@@ -443,7 +445,7 @@ def describe_remaining_error(
 ) -> str:
     """Return a clause with the remaining error in the controlled goal components.
 
-    If tolerances are given, the clause includes them; if a goal is given, it also names the
+    If tolerances are given, the clause includes them; if a goal is given, the clause also names the
     uncontrolled components.
     """
     parts: dict[Controlled, str] = {
@@ -483,8 +485,8 @@ def describe_remaining_error(
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
     """Return the duration of the executed schedules for the last goal, s.
 
-    This is the planner's value, minus the rest of the last schedule if the flight was cut off. If
-    the planner has no value, as after an abort, it is the result of :func:`time_to_end`.
+    This is the planner's value, minus the rest of the last schedule if the flight ended early. If
+    the planner has no value, for example after an abort, :func:`time_to_end` is returned.
 
     Parameters
     ----------
@@ -494,7 +496,7 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
     Returns
     -------
     float | None
-        None if no schedule was flown.
+        None if no schedule was executed.
     """
     given = list(statuses)
     flown = [
@@ -520,14 +522,14 @@ def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -
     Parameters
     ----------
     statuses
-        Time (s) and status, in order of time.
+        Times (s) and statuses, in order of time.
     end_s
         End time of the flight, s; used if no status reports that the goal has ended.
 
     Returns
     -------
     float | None
-        None if no schedule was flown.
+        None if no schedule was executed.
     """
     given = list(statuses)
     executing = [each for each in given if each[1].state is PlannerState.EXECUTING]

@@ -1,9 +1,9 @@
 """Teleoperation: joint rates for an end-effector twist while the base floats.
 
 At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the twist of an
-end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]``: the smallest rates that produce
-the twist, each relative to the joint's velocity limit. With ``keep_attitude``, the base rotation
-``-A qdot = 0`` is also required, so the rates lie in the reaction null space.
+end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]`` are the smallest rates that
+produce the twist, each relative to the joint's velocity limit. With ``keep_attitude``, the base
+must also not rotate (``-A qdot = 0``), so the rates lie in the reaction null space.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _LOOK_AHEAD = 1e-3
 """Motion of the fastest joint after which progress is checked again, rad."""
 
 _TRIED_SPEED_SHARES = (1.0, 0.5, 0.25, 0.0)
-"""Fractions of the rates tried if links come too close; with the last one, the joints brake."""
+"""Fractions of the rates tried if links come too close; at the last fraction, the joints brake."""
 
 _MAX_TWIST = 1e6
 """Largest value in a twist, m/s or rad/s: squares of much larger values overflow."""
@@ -116,9 +116,9 @@ class TwistCommand:
 class TwistStep(NamedTuple):
     """Result for one state while an end-effector follows twists.
 
-    ``rates`` (n,) are the joint rates; None if the joints hold their shape. ``message`` is for the
-    status; empty if there is nothing new. ``ended``: whether the joints are at rest and twists have
-    ended.
+    ``rates`` (n,) are the joint rates; None if the joints hold their shape. ``message`` is reported
+    in the status; empty if there is nothing new. ``ended``: whether the joints are at rest and no
+    more twists arrive.
     """
 
     rates: Array | None
@@ -134,23 +134,23 @@ class _Following:
     twist: TwistCommand | None
     """The last one; None: the joints brake."""
     received_ns: int
-    """Stamp of the state before the twist, ns."""
+    """Stamp, in ns, of the state that preceded the twist."""
     reported: str | None = None
-    """Start of the last reported reason; empty: the twist is followed."""
+    """First words of the last reported reason; empty: the twist is followed."""
     limited_ns: int = 0
     """Stamp of the last state at which the twist was not followed, ns."""
     pose: Array | None = None
     """(7,) last measured base pose."""
     pose_ns: int = 0
-    """Stamp of that state, ns."""
+    """Stamp, in ns, of the state with this pose."""
 
 
 class Teleoperation:
     """End-effectors that follow twists, one at a time, until no twist has arrived for
     ``twist_timeout``.
 
-    After a refusal or an abort, twists are rejected until none has arrived for that time, so that
-    an operator who keeps sending does not cause unexpected motion.
+    After a refusal or an abort, twists are rejected until none has arrived for this long, so that
+    an operator who keeps sending twists does not cause unexpected motion.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class Teleoperation:
         """By link."""
         self._following: _Following | None = None
         self._refused_ns: int | None = None
-        """Stamp of the state before the last rejected twist, ns."""
+        """Stamp, in ns, of the state that preceded the last rejected twist."""
 
     def use_clearance(self, clearance: Clearance | None) -> None:
         """Use other clearances from now on."""
@@ -190,7 +190,9 @@ class Teleoperation:
         try:
             if refused is not None and stamp_ns - refused <= self._timeout_ns:
                 timeout = self._config.twist_timeout
-                raise PlanningError(f"Twists are ignored until none has arrived for {timeout:g} s.")
+                raise PlanningError(
+                    f"Twists are ignored until no twist has arrived for {timeout:g} s."
+                )
             if following is not None and following.follower.link != twist.link:
                 raise PlanningError(
                     f"'{following.follower.link}' follows twists: '{twist.link}' waits until they "
@@ -206,11 +208,11 @@ class Teleoperation:
             following.twist, following.received_ns = twist, stamp_ns
 
     def refuse(self, stamp_ns: int) -> None:
-        """Record that a twist after the state with this stamp was rejected."""
+        """Record that a twist was rejected after the state with this stamp."""
         self._refused_ns = stamp_ns
 
     def abort(self, stamp_ns: int) -> None:
-        """Brake the joints, and reject twists that still arrive."""
+        """Brake the joints, and reject any twists that still arrive."""
         self.refuse(stamp_ns)
         if self._following is not None:
             self._following.twist = None
@@ -246,9 +248,9 @@ class Teleoperation:
             following.twist = None
         twist, reason = following.twist, ""
         if following.pose is None or stamp - following.pose_ns > self._timeout_ns:
-            twist, reason = None, "The base is not measured."
+            twist, reason = None, "The base motion is not measured."
         if not np.all(np.isfinite(q)):
-            return TwistStep(None, "The joints are not measured.", ended=True)
+            return TwistStep(None, "The joint motion is not measured.", ended=True)
         pose = np.eye(7)[6] if following.pose is None else following.pose
         rates, limited = following.follower.rates(twist, pose, q, before)
         if following.twist is None and not np.any(rates):
@@ -274,9 +276,9 @@ class Teleoperation:
 class TwistFollower:
     """Joint rates for twists of one link, within all limits.
 
-    The rotation follows the twist if the joints have enough freedom; otherwise only the link origin
-    does. The robot slows down and stops before a dynamic singularity, before joint limits,
-    and before links come too close; a twist that leads away is followed.
+    The rotation follows the twist if the joints have enough degrees of freedom; otherwise only the
+    link origin follows it. The robot slows down and stops before a dynamic singularity, before
+    joint limits, and before links come too close; a twist that leads away from them is followed.
 
     Parameters
     ----------
@@ -294,7 +296,7 @@ class TwistFollower:
     Raises
     ------
     PlanningError
-        The joints cannot move the link by twists.
+        The joints cannot make the link follow twists.
     """
 
     def __init__(
@@ -312,7 +314,7 @@ class TwistFollower:
         self._keeps_attitude = options.keep_attitude == 1
         self._clearance = clearance
         self._required: Array | None = None
-        """Distances (P,) kept between pairs of bodies from the first shape on, m."""
+        """Distances (P,), m, that pairs of bodies must keep, determined at the first shape."""
         turning = BaseRotations.of(robot)
         axes = turning.axes if turning.loops_turn_base else np.zeros((0, 3))
         (directions,) = EndEffectorRows(robot, [(link, True)], axes).directions
@@ -342,8 +344,8 @@ class TwistFollower:
         Parameters
         ----------
         twist
-            The wanted twist; None: rest. pose (7,) of the base: position, m, and quaternion. q (n,)
-            shape, m or rad. before (n,) last commanded rates.
+            The wanted twist; None: no twist, so the joints come to rest. pose (7,) of the base:
+            position, m, and quaternion. q (n,) shape, m or rad. before (n,) last commanded rates.
         """
         wanted, reason = np.zeros(len(q)), ""
         if twist is not None:
@@ -395,7 +397,7 @@ class TwistFollower:
         if by_stops[nearest] < factor:
             factor = float(by_stops[nearest])
             joint = self._robot.joint_names[nearest]
-            reason = f"Joint '{joint}' reaches its limit at {q[nearest]:.4g}."
+            reason = f"Joint '{joint}' reaches its limit of {q[nearest]:.4g}."
         return factor * rates, reason
 
     def _moves_away_from_singularity(

@@ -1,4 +1,4 @@
-"""Tracks schedules: from a schedule and the measured shape to the setpoint at every tick.
+"""Schedule tracking: computes the setpoint at every tick from a schedule and the measured shape.
 
 Joints that do not follow their commands are detected.
 """
@@ -43,16 +43,16 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class TakeOver:
-    """A schedule tick at which another schedule takes over.
+    """The tick of a schedule at which another schedule takes over.
 
     Attributes
     ----------
     stamp_ns
         Its stamp, ns.
     shapes
-        (K + 1, n) from the current tick to that tick, m or rad.
+        (K + 1, n) shapes from the current tick to the takeover tick, m or rad.
     motion
-        Joint motion at that tick.
+        Joint motion at the takeover tick.
     """
 
     stamp_ns: int
@@ -61,14 +61,15 @@ class TakeOver:
 
 
 class ScheduleFollower:
-    """Follows one schedule by time stamps, so that a missed tick does not delay later ones.
+    """Follows one schedule according to time stamps, so that a missed tick does not delay later
+    ticks.
 
     Parameters
     ----------
     schedule
         The schedule to follow.
     start_ns
-        Stamp of its first tick, ns.
+        Stamp of the schedule's first tick, ns.
     shape_gain
         Feedback gain from shape error to velocity, 1/s.
     deadband
@@ -105,7 +106,8 @@ class ScheduleFollower:
         self._velocities, self._deadband = velocities, deadband
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
-        """Whether the schedule is over and the shape ``q`` (n,) has reached the last shape."""
+        """Whether the schedule is over and the shape ``q`` (n,) has reached the final shape of the
+        schedule."""
         late = stamp_ns - self._end_ns
         if late < 0:
             return False
@@ -133,7 +135,7 @@ class ScheduleFollower:
         return self._positions[min(max(tick, 0), self._last_tick - 1) :].copy()
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
-        """Return the first tick at least ``after`` s from now; None after the last tick."""
+        """Return the first tick at least ``after`` s from now; None if no tick is left."""
         now = max((stamp_ns - self.start_ns) // self._period_ns, 0)
         tick = now + max(1, math.ceil(after / self.schedule.control_period - 1e-9))
         if tick >= self._last_tick:
@@ -165,9 +167,10 @@ class ScheduleFollower:
 def braking_schedule(schedule: GaitSchedule, begins: float, duration: float) -> GaitSchedule:
     """Return a schedule that slows down along another one and comes to rest on its path.
 
-    Gait time runs at the rate ``1 - t/T``: the shape stays on the gait's path and, since the base
-    path at zero momentum does not depend on speed, so does the base. Wheels that keep spinning
-    after the schedule change to their final rates, which bring the base to rest at its goal.
+    Gait time runs at the rate ``1 - t/T``: the shape stays on the path of the gait. At zero
+    momentum, the base path does not depend on speed, so the base also stays on its path. Wheels
+    that keep spinning after the end of the schedule are brought to their final rates, at which the
+    base comes to rest at its goal.
 
     Parameters
     ----------
@@ -215,7 +218,7 @@ class TrajectoryTracker:
         # No feedback here: a controller closes its own loop around the reference.
         self._commands_plant = config.output != "reference"
         self._ends_by_result = config.output == "trajectory"
-        """Whether the robot's own controller follows schedules, and reports their end."""
+        """Whether the robot's own controller executes schedules and reports when they end."""
         self._has_result = False
         self._follower: ScheduleFollower | None = None
         self._holds_position = False
@@ -234,7 +237,7 @@ class TrajectoryTracker:
         )
 
     def use_robot(self, robot: SpaceRobot) -> None:
-        """Track later schedules with a robot that has the same joints but other masses."""
+        """Track subsequent schedules for a robot that has the same joints but other masses."""
         self._robot = robot
         self._sensitivity = PathSensitivity(robot) if self._config.replanning > 0 else None
         self._mass_estimate = MassEstimate(
@@ -243,7 +246,7 @@ class TrajectoryTracker:
 
     @property
     def is_active(self) -> bool:
-        """Whether the tracker follows a schedule, or brakes along it."""
+        """Whether the tracker follows a schedule or brakes along its path."""
         return self._follower is not None
 
     @property
@@ -252,7 +255,7 @@ class TrajectoryTracker:
         return self._follower is not None and self._follower.brakes
 
     def start(self, schedule: GaitSchedule, stamp_ns: int, average: int = 0) -> None:
-        """Track a schedule with this stamp for its first tick.
+        """Track a schedule whose first tick has this stamp.
 
         ``average`` measured poses are averaged for plans that begin in motion; 0: none.
         """
@@ -272,7 +275,8 @@ class TrajectoryTracker:
         self._follower = self._begin_braking(stamp_ns)
 
     def braking_shapes(self, stamp_ns: int) -> Array | None:
-        """Return the shapes (N + 1, n) at the ticks if braking started now; None at rest."""
+        """Return the shapes (N + 1, n) that the joints would have at the ticks if braking started
+        now; None at rest."""
         follower = self._begin_braking(stamp_ns)
         return None if follower is None else follower.shapes_from(stamp_ns)
 
@@ -294,10 +298,11 @@ class TrajectoryTracker:
         return self._follower.braking(stamp_ns, self._config.abort_time)
 
     def take_over(self, stamp_ns: int, q: Array, after: float) -> TakeOver | None:
-        """Return the tick, at least ``after`` s from now, at which a plan may take over.
+        """Return the earliest tick, at least ``after`` s from now, at which a plan may take over.
 
-        Its first shape is the desired one, except for joints whose measured position in ``q`` (n,)
-        is off by more than noise. None if no schedule is tracked, or if it is over by then.
+        The first shape is the desired shape, except for joints whose measured position in ``q``
+        (n,) deviates by more than the noise. None if no schedule is tracked, or if the schedule is
+        over by then.
         """
         if self._follower is None or self._follower.brakes:
             return None
@@ -308,7 +313,7 @@ class TrajectoryTracker:
         return take_over
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the schedule or braking covers a given time."""
+        """Whether a given time is within the schedule or the braking phase."""
         return self._follower is not None and self._follower.covers(stamp_ns)
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
@@ -319,7 +324,7 @@ class TrajectoryTracker:
         return follower is not None and follower.has_ended(stamp_ns, q)
 
     def end_by_result(self) -> None:
-        """End the schedule at the next state, because the controller that follows it has ended
+        """End the schedule at the next state, because the controller that executes it has ended
         it."""
         self._has_result = True
 
@@ -340,8 +345,8 @@ class TrajectoryTracker:
     def track(self, stamp_ns: int, q: Array, *, obeyed: bool = True) -> list[int]:
         """Write the setpoint for the current shape ``q`` (n,), and return the stuck joints.
 
-        If the shape is not finite, the setpoint commands rest. While no command is in effect at the
-        plant (``obeyed`` is false), joints that do not move are not considered stuck.
+        If the shape is not finite, the setpoint commands zero velocities. While no command is in
+        effect at the plant (``obeyed`` is false), joints that do not move are not considered stuck.
         """
         assert self._follower is not None
         position, velocity = self.setpoint.position, self.setpoint.velocity
@@ -370,8 +375,8 @@ class TrajectoryTracker:
 
     @property
     def needs_wheel_rates(self) -> bool:
-        """Whether :meth:`hold` needs measured rates, because there are wheels without commanded
-        rates."""
+        """Whether :meth:`hold` needs measured rates, which is the case if some wheels have no
+        commanded rates."""
         return bool(len(self._wheels)) and not self._spins
 
     def forget_wheels(self) -> None:
@@ -405,14 +410,15 @@ class TrajectoryTracker:
 _STUCK_SHARE = 0.05
 
 _MIN_FOLLOWED_SHARE = 0.5
-"""Fraction of the commanded range above which a joint is considered to follow its commands. In
-between, it is slow, or its motion is hidden by noise."""
+"""Fraction of the commanded range above which a joint is considered to follow its commands. At
+smaller fractions, a joint that is not stuck is slow, or its motion is hidden by noise."""
 
 _MAX_STANDSTILL_WINDOWS = 8
-"""Number of windows without any joint motion before joints are considered stuck."""
+"""Number of windows without any joint motion after which joints are considered stuck."""
 
 _CHECK_PERIOD = 16
-"""Ticks between checks while all joints follow, because a check takes time."""
+"""Number of ticks between checks while all joints follow their commands (to save computing
+time)."""
 
 _MIN_JOINT_ERROR = 1e-6  # m or rad
 
@@ -431,11 +437,11 @@ class StuckJointWatch:
     joints
         Their number.
     ticks
-        N; 0: joints are never considered stuck.
+        The number N above; 0: joints are never considered stuck.
     control_period
         Command duration, s.
     band
-        Shape errors up to this value are noise, m or rad.
+        Shape errors up to this value are treated as noise, m or rad.
     """
 
     def __init__(self, joints: int, ticks: int, control_period: float, band: float = 0.0) -> None:

@@ -1,4 +1,4 @@
-"""Plans on request: synchronously while time is stopped, or in a thread while states are
+"""Plans on request: synchronously, with time stopped, or in a thread while states are
 processed."""
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.times import SECOND
 
 _COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
-"""Rest period at the start of a background plan if the robot drifts, s, and, if it was too short,
-the factor applied to the time from its start to the end of planning."""
+"""Rest period, s, at the start of a background plan for a drifting robot, and, if this period was
+too short, the factor by which the time from the start of the period to the end of planning is
+multiplied."""
 
 _MAX_COASTING_TIME = 600.0
 """Longest such time, s."""
@@ -51,13 +52,13 @@ class PlanJob:
     identified
         The goal.
     reason
-        The reason of the request.
+        Reason for the request.
     error
-        Remaining error of an active goal from rest, or deviation of the base from its path.
+        Remaining error of an active goal at rest, or deviation of the base from its path.
     take_over
-        Tick at which the plan takes over in motion; None: it begins at rest, or with braking.
+        Tick at which the plan takes over in motion; None: the plan begins at rest, or with braking.
     aim
-        The goal shifted, at which the plan ends; None: at the goal.
+        The shifted goal at which the plan ends; None: the goal itself.
     """
 
     identified: IdentifiedGoal
@@ -80,14 +81,14 @@ class PlanningTask:
     required
         Goal components that a plan without these joints must control.
     braking
-        (K + 1, n) shapes at the ticks, m or rad, while the joints brake before the gait, or are at
-        rest while the base drifts; None: the gait begins immediately.
+        (K + 1, n) shapes at the ticks before the gait, m or rad: the joints brake, or they rest
+        while the base drifts; None: the gait begins immediately.
     rates_after_braking
-        (n,) velocities held from there on, m/s or rad/s, for reaction wheels; None:
+        (n,) velocities held after braking, m/s or rad/s, for reaction wheels; None:
         zero.
     take_over
-        Tick at which the plan takes over from the schedule tracked until then; None: it
-        begins at rest, or with braking. The request's state is the current state.
+        Tick at which the plan takes over from the schedule that is tracked before it; None: the
+        plan begins at rest, or with braking. The request's state is the current state.
     """
 
     request: PlanRequest
@@ -107,8 +108,8 @@ class Planned:
     begins_ns: int = 0
 
     def for_goal(self, identified: IdentifiedGoal) -> Planned | Refused:
-        """Return the plan with its goal, which it may aim beside; refused if it controls too
-        little.
+        """Return the plan with the original goal in place of a shifted goal, or a refusal if the
+        plan controls too few components.
         """
         goal, schedule = identified.goal, replace(self.schedule, goal=identified.goal)
         try:
@@ -139,7 +140,7 @@ class _Coasting:
     duration: float
 
     def task(self, period: float) -> PlanningTask:
-        """Return the task for a plan that begins with the rest period; the control period is in
+        """Return the task for a plan that begins with the rest period; ``control_period`` is in
         s."""
         ticks, state = math.ceil(self.duration / period - 1e-9), self.planned.request.state
         shapes = np.tile(state.q, (ticks + 1, 1))
@@ -200,12 +201,13 @@ class PlanningWorker:
             self.clearance,
         )
         self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
-        """The latest method without stuck joints, and its task."""
+        """The latest method for the joints that are not stuck, and its task."""
         self._job: PlanningJob[GaitSchedule] | None = None
         self._time = 0.0
         """Wall time of the work on the requested plan so far, s."""
         self._coasting: _Coasting | None = None
-        """Rest period at the start of the requested plan, because the base drifts meanwhile."""
+        """Rest period at the start of the requested plan, because the base drifts during
+        planning."""
 
     @property
     def is_busy(self) -> bool:
@@ -213,7 +215,7 @@ class PlanningWorker:
         return self._job is not None
 
     def is_free(self) -> bool:
-        """Whether a plan can be requested, after dropping the result of a cancelled one."""
+        """Whether a plan can be requested, after discarding the result of a cancelled plan."""
         if self.is_busy:
             self.take_result()
             return False
@@ -264,8 +266,8 @@ class PlanningWorker:
             return replace(result, begins_ns=coasting.begins_ns)
         if elapsed > _MAX_COASTING_TIME:
             return Refused(
-                f"The robot drifts, and {elapsed:.3g} s of planning were not enough for a plan "
-                "that begins in time; a smaller optimal.starts takes less time",
+                f"The robot drifts, and {elapsed:.3g} s of planning were too short to find a plan "
+                f"that begins in time; a smaller optimal.starts shortens planning",
                 result.wall_time,
             )
         # The base has drifted past the start of the plan.
@@ -274,7 +276,8 @@ class PlanningWorker:
         return None
 
     def take_result(self) -> Planned | Refused | None:
-        """Return the result of the work once; None until it has ended, or if it was cancelled."""
+        """Return the result of the work, which can be retrieved only once; None until the work has
+        ended, or if it was cancelled."""
         job = self._job
         if job is None or not job.done:
             return None
@@ -287,7 +290,7 @@ class PlanningWorker:
             return Refused(str(refusal), job.wall_time)
 
     def cancel(self) -> None:
-        """Cancel the current plan, which then has no result."""
+        """Cancel the current plan; no result is returned for it."""
         job = self._job  # Another thread may clear the attribute meanwhile.
         if job is not None:
             job.cancel()
@@ -298,9 +301,11 @@ class PlanningWorker:
             self._job.close()
 
     def approach_ahead(self, schedule: GaitSchedule, begins: float, now: float) -> str:
-        """Return a clause that says where the rest of a schedule comes too close to obstacles.
+        """Return a clause that says at which point the rest of a schedule comes too close to
+        obstacles.
 
-        ``begins`` and ``now`` are times, s. Empty if nowhere, or if there are no obstacles.
+        ``begins`` and ``now`` are times, s. Empty if the schedule stays clear, or if there are no
+        obstacles.
         """
         if self.clearance is None or not self.clearance.has_obstacles:
             return ""

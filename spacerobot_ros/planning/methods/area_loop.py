@@ -1,16 +1,17 @@
-"""Closed motions of three joints that rotate a spacecraft about three axes: paper 2.
+"""Closed motions of three joints that rotate a spacecraft about three axes (paper 2).
 
-Small loops around a nominal shape rotate the base by ``dTheta = M S``: M (3, 3) the curvature of
-the connection for the joint pairs (1, 2), (2, 3), (3, 1), S the areas enclosed by the loop in their
-planes. Each cycle corrects the fraction k of the remaining rotation, ``S = k M^-1 dTheta``;
-the first-order error is corrected in the next cycle, which begins from the measured attitude.
+Small loops around a nominal shape rotate the base by ``dTheta = M S``: M (3, 3) is the curvature of
+the connection for the joint pairs (1, 2), (2, 3), (3, 1), and S contains the areas enclosed by the
+loop in their planes. Each cycle corrects the fraction k of the remaining rotation, ``S = k M^-1
+dTheta``; the first-order error is corrected in the next cycle, which begins from the measured
+attitude.
 
 All edges are straight lines in shape space, from rest to rest: the base rotation depends only on
 the path, and held commands follow it.
 
 Loops run along joint axes and enclose given areas (figure 5) in the planes of joints (1, 2),
 (2, 3) and (3, 1); an area is positive if the path is counter-clockwise. Six edges of a box enclose
-all three areas at once, rectangles enclose them one by one.
+all three areas at once; rectangles enclose them one by one.
 """
 
 from __future__ import annotations
@@ -40,19 +41,20 @@ from spacerobot_ros.planning.methods.nominal_shape import (
 )
 
 _MAX_SHRINKS = 14
-"""Attempts for a cycle in which links come too close to each other, each half as large as the one
-before.
+"""Number of attempts for a cycle in which links come too close to each other; each attempt uses a
+cycle half as large as the one before.
 """
 
 _MAX_CYCLE_TRIALS = 6
-"""Attempts for a cycle that would not bring the base closer, each half as large as the one
-before."""
+"""Number of attempts for a cycle that would not bring the base closer; each attempt uses a cycle
+half as large as the one before."""
 
 _MAX_CYCLE_SHARE = 1.0 - 1e-9
 """Fraction k of the remaining rotation above which one cycle corrects all of it."""
 
 _NEGLIGIBLE_AREA_SHARE = 1e-3
-"""Fraction of the largest area below which an area counts as zero: a later cycle corrects it."""
+"""Fraction of the largest area below which an area is treated as zero; a later cycle corrects the
+remaining error."""
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -75,7 +77,7 @@ class AreaLoopOptions:
     )
     nominal: tuple[float, ...] = parameter(
         (),
-        "nominal shape of all joints; []: the best",
+        "nominal shape of all joints; []: the best shape",
         "m or rad",
         minimum=-1e6,
         maximum=1e6,
@@ -97,7 +99,7 @@ class AreaLoopOptions:
 
 @dataclass(frozen=True)
 class AreaLoopProgress:
-    """Progress towards a goal, from which its next schedule continues.
+    """Progress towards a goal; the next schedule continues from there.
 
     ``nominal`` is the chosen nominal shape, ``cycles`` the number of cycles flown by the end of the
     schedule.
@@ -110,8 +112,8 @@ class AreaLoopProgress:
 class AreaLoopGait(GaitMethod):
     """Controls the attitude and final shape of a robot with three or more joints of any kind.
 
-    The base position follows from both (the centre of mass is at rest) and cannot be chosen. A
-    schedule is one cycle, or ``cycles_per_plan`` predicted cycles.
+    The base position follows from the attitude and the shape (the centre of mass is at rest), so it
+    cannot be chosen. A schedule is one cycle, or ``cycles_per_plan`` predicted cycles.
     """
 
     name: ClassVar[str] = "area_loop"
@@ -136,7 +138,7 @@ class AreaLoopGait(GaitMethod):
     @classmethod
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
-        """Reject robots whose base cannot be rotated about three axes by loops of three joints."""
+        """Reject robots in which loops of three joints cannot rotate the base about three axes."""
         if robot.n < 3:
             raise PlanningError(
                 f"area_loop needs three joints (paper 2); robot '{robot.description.name}' has "
@@ -149,7 +151,7 @@ class AreaLoopGait(GaitMethod):
         """Plan the path to the nominal shape and the next cycle; see :meth:`GaitMethod.plan`.
 
         The schedule is ``partial`` unless its own prediction reaches the goal. ``most_cycles`` and
-        ``longest`` bound the cycles for the goal, including earlier ones (``request.previous``).
+        ``longest`` limit the cycles for the goal, including earlier cycles (``request.previous``).
         """
         state, goal, tolerance = request.state, request.goal, request.tolerance
         self.require_rest(state)
@@ -430,8 +432,8 @@ class EdgePath:
     Attributes
     ----------
     loops
-        Each polygon (V, 3): vertices in order of travel, with the first repeated at the end; their
-        bounding box is centred at the origin.
+        Each polygon (V, 3): vertices in order of travel, with the first vertex repeated at the end;
+        the bounding box of the polygons is centred at the origin.
     edge_ratio
         Largest ratio of an edge to the longest allowed edge.
     """

@@ -29,17 +29,18 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule
 class AutoGait(GaitMethod):
     """Plans with all methods that suit the robot, and returns the shortest manoeuvre.
 
-    If a method that suits the robot controls the position, methods that do not are omitted. A
-    manoeuvre that ends off the goal, or controls less of it than another, is selected only if there
-    is no better one. A goal keeps the method of the last schedule flown for it, as long as that
-    method finds a plan. A schedule is the chosen method's schedule, except for its notes.
+    If a method that suits the robot controls the position, methods that do not control it are
+    omitted. A manoeuvre that misses the goal, or controls fewer goal components than another, is
+    selected only if there is no better one. The method of the last schedule flown for a goal is
+    kept for that goal as long as it finds a plan. The result is the schedule of the chosen method,
+    with additional notes.
 
     Parameters
     ----------
     candidates
         Methods by name; among equally long manoeuvres, that of the first method is selected.
     build
-        Returns the method of a name with its options for the robot.
+        Returns the named method with its options for the robot.
     """
 
     name: ClassVar[str] = "auto"
@@ -73,10 +74,9 @@ class AutoGait(GaitMethod):
         Raises
         ------
         PlanningError
-            No method finds a plan; the message contains all their reasons. It is an
-            `UnreachableError` if one
-            method proves that the goal is unreachable, else a `NotFoundError` if one method
-            searched.
+            No method finds a plan; the message contains the reasons of all methods. The error is an
+            `UnreachableError` if one method proves that the goal is unreachable, else a
+            `NotFoundError` if at least one method searched for a plan.
         """
         if not self.robot.n:
             raise PlanningError(NO_JOINTS.format(self.robot.description.name))
@@ -89,7 +89,7 @@ class AutoGait(GaitMethod):
         if request.motion is not None:
             for name in names:
                 if not self._candidates[name].starts_in_motion:
-                    refusals[name] = PlanningError(f"{name} plans from rest only.")
+                    refusals[name] = PlanningError(f"{name} plans only from rest.")
             names = [name for name in names if name not in refusals]
         flying = "" if request.previous is None else request.previous.method
         if flying in names:
@@ -97,7 +97,9 @@ class AutoGait(GaitMethod):
             kept = self._plan_by_method(flying, request, refusals, cancellation)
             if kept is not None:
                 result = {flying: _MethodResult.of(self.robot, kept, request)}
-                return _add_notes(kept, flying, f"{flying} planned this goal before.", result, {})
+                return _add_notes(
+                    kept, flying, f"{flying} planned for this goal before.", result, {}
+                )
         results: dict[str, _MethodResult] = {}
         for name in names:
             schedule = self._plan_by_method(name, request, refusals, cancellation)
@@ -112,7 +114,7 @@ class AutoGait(GaitMethod):
         because = f"{chosen} suits robot '{self.robot.description.name}' and " + (
             f"plans the shortest of {len(results)} manoeuvres to this goal."
             if len(results) > 1
-            else "is the only one that can plan this goal."
+            else "is the only method that can plan for this goal."
         )
         return _add_notes(results[chosen].schedule, chosen, because, results, refusals)
 
@@ -129,7 +131,8 @@ class AutoGait(GaitMethod):
                 names_by_reason.setdefault(str(refusals[name]), []).append(name)
         reasons = " ".join(f"{', '.join(each)}: {why}" for why, each in names_by_reason.items())
         message = (
-            f"No method can plan this goal for robot '{self.robot.description.name}'. {reasons}"
+            f"No method can plan for this goal with robot '{self.robot.description.name}'. "
+            f"{reasons}"
         )
         return refusal_of_all(message, of_goal)
 
@@ -195,7 +198,7 @@ class _MethodResult:
     @property
     def message(self) -> str:
         about = "about " if self.schedule.partial else ""
-        off = "" if self.reaches_goal else ", which ends off the goal"
+        off = "" if self.reaches_goal else ", which misses the goal"
         return f"{about}{self.schedule.expected_duration:.6g} s{off}"
 
 

@@ -1,14 +1,15 @@
-"""Planar robots, and their base rotation along a path in shape space: paper 3's geometric phase.
+"""Planar robots, and their base rotation along a path in shape space (the geometric phase of paper
+3).
 
 All joints of a planar robot rotate about parallel axes, and nothing tilts its base. The attitude is
-a single angle theta about the robot axis. At zero angular momentum
-``theta_dot = -s(psi)' psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the mechanical connection's
-component about the axis, ``D`` the locked robot's inertia about the axis, and ``N_i`` its coupling
-to joint i. The rotation along a shape path is the line integral of ``-s`` (eq. 11): it
-depends on the path, not on the speed.
+a single angle theta about the robot axis. At zero angular momentum, ``theta_dot = -s(psi)'
+psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the component of the mechanical connection about the
+axis, ``D`` the inertia of the locked robot about the axis, and ``N_i`` the coupling to joint i. The
+rotation along a shape path is the line integral of ``-s`` (eq. 11): it depends on the path, not on
+the speed.
 
-Small loops rotate the base most where the curvature is largest (remark 2). Boxes (2, 2) contain
-lower over upper bounds of two joints, rad.
+Small loops rotate the base most where the curvature is largest (remark 2). Boxes (2, 2) contain the
+lower, then the upper bounds of two joints, rad.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from spacerobot_ros.planning.core.controllability import (
 )
 
 _MAX_AXIS_TILT = 1e-5
-"""Largest axis tilt of a planar robot, and rotation about other axes per radian of a joint: the
-rounding error of angles with six digits."""
+"""Largest axis tilt, and largest rotation about other axes per radian of a joint, of a robot that
+is considered planar: the rounding error of angles with six digits."""
 
 _SAMPLED_SHAPE_COUNT = 8
 
@@ -114,13 +115,13 @@ def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
         raise PlanningError(
             f"Robot '{robot.description.name}' is not planar: joint "
             f"'{robot.joint_names[worst[1]]}' also rotates the base about axes other than its own, "
-            f"by up to {tilts[worst]:.2g} rad per rad; the causes are centres of mass outside one "
-            "plane, or products of inertia."
+            f"by up to {tilts[worst]:.2g} rad per rad; the causes are centres of mass that do not "
+            f"lie in one plane, or products of inertia."
         )
 
 
 def check_planar_chain(robot: SpaceRobot) -> Controllability:
-    """Test a robot by paper 3: a planar robot with three or more links and nonzero curvature."""
+    """Test a robot as in paper 3: a planar robot with three or more links and nonzero curvature."""
     names, rest = robot.joint_names, np.zeros(robot.n)
     try:
         phase = PlanarPhase(robot)
@@ -175,7 +176,7 @@ class PlanarPhase:
         return _integrate_legs(self._connection_row, starts, ends)
 
     def plane(self, psi: Array, i: int, j: int) -> PhasePlane:
-        """Return the phase in the plane of joints i and j, with the others at rest in ``psi``
+        """Return the phase in the plane of joints i and j, with the other joints at rest at ``psi``
         (n,)."""
         shapes = np.tile(psi, (9, 1))
         shapes[:, i], shapes[:, j] = np.repeat(_FITTED_ANGLES, 3), np.tile(_FITTED_ANGLES, 3)
@@ -190,12 +191,12 @@ class PlanarPhase:
 
 
 class PhasePlane:
-    """Base rotations by two joints, in closed form.
+    """Base rotations due to two joints, in closed form.
 
     Each joint rotates one rigid part of the robot relative to the rest, and ``N_i``, ``N_j`` and
-    ``D`` are sums of products of two vectors, each fixed in some body. They are trigonometric
-    polynomials of degree one in either angle: ``f = h(psi_i)' C h(psi_j)`` with
-    ``h(x) = [1, cos x, sin x]``.
+    ``D`` are sums of products of two vectors, each fixed in one body. These are trigonometric
+    polynomials of degree one in either angle: ``f = h(psi_i)' C h(psi_j)`` with ``h(x) = [1, cos x,
+    sin x]``.
 
     Parameters
     ----------
@@ -209,8 +210,8 @@ class PhasePlane:
     def curvature(self, points: Array) -> Array:
         """Return the base rotation per area of small loops, 1/rad, (...), at points (..., 2).
 
-        Loops are counter-clockwise in the plane (psi_i, psi_j): it is ``-H``, eq. (10), with
-        ``H = ds_j/dpsi_i - ds_i/dpsi_j``.
+        Loops are counter-clockwise in the plane (psi_i, psi_j): the result is ``-H``, eq. (10),
+        with ``H = ds_j/dpsi_i - ds_i/dpsi_j``.
         """
         left, right = _harmonics(points[..., 0]), _harmonics(points[..., 1])
         N_i, N_j, D = self._polynomials(left, right)
@@ -219,7 +220,8 @@ class PhasePlane:
         return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
 
     def turns_by_squares(self, centres: Array, sides: Array) -> Array:
-        """Return the base rotations (R,) by counter-clockwise squares with centres (R, 2)."""
+        """Return the base rotations (R,) caused by counter-clockwise squares with centres (R,
+        2)."""
         corners = square_corners(centres, sides)
         ends = np.roll(corners, -1, axis=1)
         legs = _integrate_legs(self._connection_row, corners.reshape(-1, 2), ends.reshape(-1, 2))

@@ -1,12 +1,12 @@
 """Sliding masses and first-order Lie brackets: the manoeuvre of paper 1, section 5.
 
 Step 1 finds the final shape ``zf`` that puts the base at the goal position (eq. 9). Step 2 slides
-the masses there (eq. 10). Step 3 rotates the base by n equal cycles with three frequencies, whose
-brackets sum to the remaining rotation.
+the masses to this shape (eq. 10). Step 3 rotates the base by n equal cycles with three frequencies,
+whose brackets sum to the remaining rotation.
 
-The plant holds each command for one tick, so the sliders trace polygons inside the smooth curves.
-Their area is smaller by ``sin(x)/x``, where ``x`` is the phase per tick; the amplitudes compensate
-for this.
+The plant holds each command for one tick. The sliders therefore trace polygons inside the smooth
+curves. The polygon area is smaller by ``sin(x)/x``, where ``x`` is the phase per tick; the
+amplitudes compensate for this.
 """
 
 from __future__ import annotations
@@ -134,17 +134,17 @@ class LieBracketGait(GaitMethod):
         return self.schedule_of(goal, positions, path, symbols | notes, is_clear=is_clear)
 
     def final_shape(self, state: RobotState, goal: Goal, enough: float = 0.0) -> Array:
-        """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the current one.
+        """Step 1: the shape ``zf`` (n,) that solves eq. (9), nearest to the current shape.
 
-        If strokes are too short, the shape may miss the position by ``enough``, m.
+        If strokes are too short, the base position may miss the goal by up to ``enough``, m.
 
         Raises
         ------
         UnreachableError
             ``zf`` exceeds a stroke, and the robot has only sliders.
         PlanningError
-            ``zf`` exceeds a stroke of another kind of robot, or there are no three independent
-            slots.
+            ``zf`` exceeds a stroke, and the robot has other joints, too; or there are no three
+            independent slots.
         """
         robot = self.robot
         R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
@@ -186,13 +186,13 @@ class LieBracketGait(GaitMethod):
             worst = int(np.argmax(np.maximum(lower - z, z - upper)))
             name = self.robot.joint_names[self.sliders[worst]]
             message = (
-                f"The goal is beyond stroke: it needs joint '{name}' at {z[worst]:.4g} m, but its "
-                f"stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
+                f"The goal is beyond the stroke: it requires joint '{name}' at {z[worst]:.4g} m, "
+                f"but its stroke is [{lower[worst]:.4g}, {upper[worst]:.4g}] m."
             )
         else:
             message = (
-                f"The goal is beyond stroke: {len(self.sliders)} sliders bring the base no closer "
-                f"to it than {gap:.3g} m."
+                f"The goal is beyond the stroke: {len(self.sliders)} sliders bring the base no "
+                f"closer to it than {gap:.3g} m."
             )
         # Other joints could move the centre of mass, but this method holds them.
         if len(self.sliders) < self.robot.n or self.robot.description.has_mimic_joints:
@@ -296,7 +296,7 @@ class LieBracketGait(GaitMethod):
             raise PlanningError(
                 "The sliders' first-order Lie brackets do not span the three axes of "
                 f"rotation at the final shape {np.round(z_f, 4).tolist()} (condition number "
-                f"{condition:.2g}): the attitude cannot be controlled there by lie_bracket."
+                f"{condition:.2g}): lie_bracket cannot control the attitude at this shape."
             )
         return triple, brackets
 
@@ -318,7 +318,7 @@ class LieBracketGait(GaitMethod):
                 raise PlanningError(
                     f"The rotation would take more than {longest:.6g} s within the strokes and "
                     f"rates of the sliders at the final shape {np.round(z_f, 4).tolist()}; "
-                    "a goal with more room for the sliders takes less."
+                    "a goal that leaves the sliders more room takes less time."
                 )
             shapes = self._cycle_shapes(amplitudes, n, triple, z_f)
             swing = np.abs(shapes - z_f).max(axis=0)

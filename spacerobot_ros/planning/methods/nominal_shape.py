@@ -1,8 +1,9 @@
 """Nominal shape for area loops: where three joints rotate the base best (paper 2).
 
-Loops run around the nominal shape. It is good if the curvature matrix M is well conditioned,
-rotations are large, and limits leave room for edges: the measure is the smallest singular value of
-M times the largest areas, that is, the rotation about the worst axis by the largest loops.
+Loops run around the nominal shape. The shape is good if the curvature matrix M is well conditioned,
+rotations are large, and the joint limits leave room for loop edges. The measure is the smallest
+singular value of M times the largest areas, that is, the rotation about the worst axis by the
+largest loops.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _GRID_POINTS = {1: 11, 2: 7}
 """Points per joint in the first grid, by number of triples; 5 for more triples."""
 
 _MAX_TRIPLES, _SAMPLED_SHAPE_COUNT = 8, 48
-"""Largest number of joint triples to examine closely, and of shapes at which to choose them."""
+"""Largest number of joint triples to examine closely, and of shapes at which triples are chosen."""
 
 _GRID_REFINEMENTS = 10
 _EQUAL_MEASURE_TOLERANCE = 1e-6
@@ -60,7 +61,7 @@ ClearanceTest = Callable[[Array], bool]
 """Whether links keep the clearance at all shapes (N, n)."""
 
 LoopRoomTest = Callable[[Array], npt.NDArray[np.bool_]]
-"""Whether links have room to move (N,) at shapes (N, n)."""
+"""Whether links have room to move, (N,), at each of the shapes (N, n)."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class NominalShape:
     joints
         Indices of the three.
     M
-        (3, 3) base rotation, rad, base components, per area of the pairs (1, 2), (2, 3), (3, 1).
+        (3, 3) base rotation, rad, in base components, per area of the pairs (1, 2), (2, 3), (3, 1).
     longest
         (3,) longest edges that fit within the joint limits, m or rad.
     """
@@ -109,7 +110,7 @@ class NominalShapeChooser:
     nominal
         The nominal shape (n,), m or rad; empty: the best shape.
     is_roomy
-        Returns whether (N,) links have room to move at shapes (N, n); None: everywhere.
+        Returns, for each shape (N, n), whether links have room to move (N,); None: everywhere.
 
     Attributes
     ----------
@@ -140,7 +141,7 @@ class NominalShapeChooser:
         self._repeating = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
 
     def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
-        """Return the nominal shape to use from shape ``q`` (n,).
+        """Return the nominal shape to use when starting from shape ``q`` (n,).
 
         The other joints rest; ``kept``, an earlier choice, is returned if the other joints have not
         moved.
@@ -175,7 +176,8 @@ class NominalShapeChooser:
             raise PlanningError(
                 f"The curvature matrix of joints {', '.join(names)} is singular at the nominal "
                 f"shape {np.round(chosen.shape, 4).tolist()} (condition number "
-                f"{chosen.condition:.2g}): loops there do not rotate the base about all axes."
+                f"{chosen.condition:.2g}): loops around this shape do not rotate the base about "
+                f"all axes."
             )
         return chosen
 

@@ -35,7 +35,7 @@ _MIN_BLEND_COSINE = -0.5
 """Cosine of the largest corner angle that is rounded; at sharper corners, the motion stops."""
 
 _BLEND_PARTS = 4
-"""Number of parts of a blend between whose ends the path is checked."""
+"""Number of parts into which a blend is divided; the path is checked at the ends of these parts."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class PosePath:
 
     @classmethod
     def from_poses(cls, positions: Array, quaternions: Array) -> PosePath:
-        """Return the path through poses; equal successive poses count as one."""
+        """Return the path through poses; identical successive poses are merged."""
         path = cls(positions, quaternions)
         kept = np.append(True, path.lengths > _SAME_POSE)
         return path if kept.all() else cls(positions[kept], quaternions[kept])
@@ -67,7 +67,8 @@ class PosePath:
 
     @cached_property
     def turns(self) -> Array:
-        """Rotation vectors (K - 1, 3) from attitude to attitude, rad, in the positions' frame."""
+        """Rotation vectors (K - 1, 3) from attitude to attitude, rad, in the frame of the
+        positions."""
         between = quaternion_multiply(
             self.quaternions[1:], quaternion_inverse(self.quaternions[:-1])
         )
@@ -84,7 +85,7 @@ class PosePath:
         return np.append(0.0, np.cumsum(self.lengths))
 
     def remaining_after(self, length: float) -> PosePath:
-        """Return the rest of the path after part of its length; at the end, it is a single pose."""
+        """Return the rest of the path after a given length; at the end, a single pose."""
         length = min(max(length, 0.0), float(self.lengths_at_poses[-1]))
         if len(self.positions) == 1:
             return self
@@ -105,7 +106,8 @@ class PosePath:
         )
 
     def simplified(self, tolerance: float) -> PosePath:
-        """Return a path through fewer poses that deviates from the others by at most a tolerance.
+        """Return a path through fewer poses that deviates from the omitted poses by at most a
+        tolerance.
 
         ``tolerance`` is in m and rad. (Douglas and Peucker; positions are compared at equal
         fractions of the length, so that a path there and back is preserved.)
@@ -175,16 +177,16 @@ class RoundedPath:
     tolerance
         Largest deviation from the lines, m, and from their attitudes, rad.
     before, total_length
-        Length before its start, and length of the whole path, m, for messages.
+        Path length before the start of this motion, and length of the whole path, m, for messages.
 
     Attributes
     ----------
     length
         Total length of the lines, m.
     is_straight
-        Whether it is one straight line.
+        Whether the path is one straight line.
     curvature_breaks
-        Fractions of the way at which its curvature changes.
+        Fractions of the way at which the curvature changes.
     """
 
     def __init__(

@@ -44,7 +44,7 @@ def build_method(
 ) -> GaitMethod:
     """Return a method for a robot; ``options`` contains instances of ``Options`` by method.
 
-    A method not in it uses its defaults. Schedules keep the clearance, if given.
+    A method without an entry uses its defaults. Schedules keep the clearance, if given.
 
     Raises
     ------
@@ -76,7 +76,9 @@ def method_options(name: str, values: Mapping[str, Any]) -> Any:
         There is no such method or option, or a value is invalid.
     """
     if name not in METHODS:
-        raise ParameterError(f"There is no gait method '{name}'; there are: {', '.join(METHODS)}.")
+        raise ParameterError(
+            f"There is no gait method '{name}'; the methods are: {', '.join(METHODS)}."
+        )
     require_known(name, METHODS[name].Options, values)
     return configured(METHODS[name].Options, values)
 

@@ -41,9 +41,9 @@ class _RemainingProgress:
 
 
 class RemainingJointsGait(GaitMethod):
-    """Plans for a robot with stuck joints, each of which fixes two bodies together.
+    """Plans for a robot with stuck joints, each of which rigidly connects two bodies.
 
-    Its schedules include every joint; stuck joints are at rest.
+    The schedules include every joint; stuck joints are at rest.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class RemainingJointsGait(GaitMethod):
         As for any :class:`GaitMethod`.
     stuck
         Positions of the stuck joints, m or rad, by name: the model is the robot with these joints
-        fixed there.
+        fixed at these positions.
     method, options
         The method for the remaining joints, as for :func:`build_method`; if it rejects the robot,
         ``auto`` is tried.

@@ -1,10 +1,10 @@
-"""Resolved-rate motion of end-effectors along given lines while the base floats.
+"""Resolved-rate motion of end-effectors along given lines, with a floating base.
 
 At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of
 an end-effector in the world (Umetani and Yoshida). The rates that move it along a line (straight,
 through waypoints, or a given path) are ``qdot = J*^+ xdot``. If ``J*`` loses rank, there are no
-such rates: a dynamic singularity. Whether the line meets one depends only on the shape, which
-depends on the path that led there (paper 4, section V; path-dependent workspaces).
+such rates: a dynamic singularity. Whether the line meets a singularity depends only on the shape,
+which depends on the path that led there (paper 4, section V; path-dependent workspaces).
 
 The path is parametrised by its length, not by time: its tangent is a vector in the null space of
 ``[J*, -x']``, which is finite up to the singularity, where the progress along the line becomes
@@ -76,7 +76,8 @@ _KNOT_TOLERANCE = 1e-6
 _ZERO_DISTANCE = 1e-10  # m or rad
 
 _SAMPLED_SHAPES = 8
-"""Number of shapes in general position at which the joints' freedom is examined."""
+"""Number of shapes in general position at which the degrees of freedom of the joints are
+examined."""
 
 _PATH_LENGTH_SAMPLES = 200
 _TIMING_INTERVALS = 160
@@ -86,7 +87,7 @@ _USED_ACCELERATION_SHARE = 0.99
 """Fraction of the acceleration limits for the path; corrections at the ticks may use the rest."""
 
 _MAX_CORRECTION_ITERATIONS = 8
-"""Newton steps per tick, and attempts to satisfy the limits with more ticks."""
+"""Number of Newton steps per tick, and number of attempts to satisfy the limits with more ticks."""
 
 _LIMIT_ROUNDING = 1e-9
 """Largest excess over a limit: relative, or in joint coordinates."""
@@ -117,8 +118,8 @@ class ResolvedRateOptions(MotionOptions):
     )
     corner_tolerance: float = nonnegative(
         0.005,
-        "largest deviation at the rounded corners of a path, in m and in as many rad; 0: stop at "
-        "every corner",
+        "largest deviation at the rounded corners of a path: this value in m, and the same value "
+        "in rad; 0: stop at every corner",
         "m",
         maximum=1000.0,
     )
@@ -167,7 +168,7 @@ class _SmoothPath:
         return self._turn
 
     def travelled_length(self, share: float) -> float:
-        """Return the length of the way, m, after a fraction of it."""
+        """Return the length, m, of a fraction of the way."""
         return share * self.length
 
 
@@ -188,7 +189,7 @@ class _LinkPath:
     path_from_start: _SmoothPath | RoundedPath
 
     def tracking_error(self, R: Array, r: Array, progress: float) -> Array:
-        """Return the errors (k + l,) from a pose to that at the fraction ``progress`` of the
+        """Return the errors (k + l,) from a pose to the pose at the fraction ``progress`` of the
         line."""
         target = quaternion_multiply(self.path_from_start.rotation(progress), self.start_attitude)
         found = quaternion_inverse(quaternion_from_matrix(R))
@@ -257,7 +258,8 @@ class _LinkPaths:
         return np.asarray(self._row_scales[:, np.newaxis] * self.jacobian(q, X) * self.joint_scales)
 
     def least_correction(self, q: Array, X: Array, progress: float) -> tuple[Array, float]:
-        """Return the least joint motion (n,) to the lines, and the scaled error."""
+        """Return the smallest joint motion (n,) that brings the links onto their lines, and the
+        scaled error."""
         R_X, missing = matrix_from_quaternion(X), []
         r_BC = self._robot.center_of_mass(q)
         for line in self._lines:
@@ -499,10 +501,11 @@ class PathProgress:
 class ResolvedRateGait(GaitMethod):
     """Moves end-effectors along straight lines or paths to their goals, with the base free.
 
-    From rest to rest, as fast as the joint limits allow. Handles positions, or poses with a
-    rotation about one axis, of one end-effector or several at once; along a given path, only one.
-    Lines that meet a dynamic singularity, a joint limit or a contact are rejected, or followed
-    until shortly before; ``optimal`` reaches most of their ends.
+    The motion is from rest to rest, as fast as the joint limits allow. Handles goal positions, or
+    goal poses with a rotation about one axis, of one or more end-effectors; only a single
+    end-effector can follow a given path. Lines that meet a dynamic singularity, a joint limit or a
+    contact are rejected, or followed until shortly before that point; ``optimal`` reaches the ends
+    of most of these lines.
     """
 
     name: ClassVar[str] = "resolved_rate"
@@ -659,7 +662,7 @@ class ResolvedRateGait(GaitMethod):
     def path(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> JointPath:
         """Return the path along the lines of a goal, to their ends or to a singularity.
 
-        A path in the goal is ignored: the lines lead straight to its end.
+        A path in the goal is ignored: the lines lead straight to the end of that path.
 
         The result does not depend on joint limits, which may end the motion earlier.
 
@@ -681,7 +684,8 @@ class ResolvedRateGait(GaitMethod):
         if len(goal.end_effectors) > 1:
             raise PlanningError(
                 f"{self.name}.waypoints are for one end-effector, but the goal is for "
-                f"{len(goal.end_effectors)}: give a goal for one, or omit the waypoints."
+                f"{len(goal.end_effectors)}: give a goal for one end-effector, or omit the "
+                f"waypoints."
             )
         return np.reshape(self.options.waypoints, (-1, 3))
 
@@ -784,8 +788,8 @@ class ResolvedRateGait(GaitMethod):
             joint = robot.description.movable_joints[int(np.argmax(beyond[k]))]
             return k - 1, (
                 f"Joint '{joint.name}' is at its limit "
-                f"{lines.position_text(path.path_fractions[k])}: optimal may reach the goal off "
-                "the line, as may a line from another shape."
+                f"{lines.position_text(path.path_fractions[k])}: optimal may reach the goal "
+                f"without following the line; so may a line from another shape."
             )
         if not len(slow):
             return None
@@ -793,7 +797,7 @@ class ResolvedRateGait(GaitMethod):
         name, value = lines.singularity_measure(path.shapes[nearest], path.turns[nearest])
         first = lines.singularity_measure(path.shapes[0], path.turns[0])[1]
         shape = ", ".join(f"{x:.6g}" for x in path.shapes[nearest])
-        meets, least, there = "meets", "zero", "no joint rates continue the line"
+        meets, least, there = "meets", "zero", "no joint rates continue the motion along the line"
         if path.is_complete:
             meets, least = "comes near to", f"{value:.3g}"
             there = "the joints would have to move fast for little progress"
@@ -802,7 +806,7 @@ class ResolvedRateGait(GaitMethod):
             f"The {line} {meets} a dynamic singularity "
             f"{lines.position_text(path.path_fractions[nearest])}: {name} falls from "
             f"{first:.6g} to {least} at the shape ({shape}), where {there}. optimal may reach "
-            "the goal off the line, as may a line from another shape."
+            "the goal without following the line; so may a line from another shape."
         )
 
     def _held_commands(self, lines: _LinkPaths, state: RobotState, timed: _TimedPath) -> Array:
@@ -818,8 +822,8 @@ class ResolvedRateGait(GaitMethod):
                 return positions
             ticks = max(ticks + 1, math.ceil(ticks * factor))
         raise PlanningError(
-            f"Held commands of {period:g} s along the line violate the joint limits: a "
-            "higher tick_rate of the planner may help, or lower limits."
+            f"Held commands of {period:g} s along the line violate the joint limits: a higher "
+            "tick_rate of the planner, or lower limits, may help."
         )
 
     def _shapes_on_lines(

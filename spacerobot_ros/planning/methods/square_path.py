@@ -1,16 +1,16 @@
 """Square paths in shape space for planar chains: the reorientation of paper 3, section III.
 
 Step 1 moves to the desired shape ``psi_e``. Step 2 moves to the nearest corner of a
-square, step 3 runs around the square, step 4 returns along the path of step 2. The geometric phase
-of the square is the base rotation that remains after step 1; steps 2 and 4 cancel.
+square, step 3 runs around the square, and step 4 returns along the path of step 2. The geometric
+phase of the square is the base rotation that remains after step 1; steps 2 and 4 cancel.
 
 Every leg is a straight line in shape space, from rest to rest; the paper's laws also start from
 nonzero joint rates (its property 3), for which this method does not plan. The plant holds each
-velocity for a tick: the shape then moves along the same straight lines with other speeds within a
+velocity for a tick. So the shape moves along the same straight lines, at other speeds within a
 tick, and the geometric phase, which depends only on the path, is exactly that of the smooth motion.
 
 The side ``z*`` of the square solves ``phase(z*) = wanted phase``; its centre ``psi*`` is where the
-curvature is largest, remark 2, among the centres around which it fits within the joint limits.
+curvature is largest (remark 2) among the centres around which it fits within the joint limits.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ _MAX_SIDE = math.pi
 revolution, a larger square adds curvature of opposite sign."""
 
 _SIDE_SAMPLES = 8
-"""Number of side lengths tried between zero and the largest that fits."""
+"""Number of side lengths tried between zero and the largest length that fits."""
 
 _USED_RANGE_SHARE = 1.0 - 1e-9
-"""Fraction of the free range used by the largest square: rounding must not put a corner beyond
-it."""
+"""Fraction of the free range used by the largest square: rounding must not put a corner beyond the
+range."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class SquarePathOptions:
     )
     t3: float = parameter(
         20.0,
-        "end of step 3, one loop; each further loop takes as long",
+        "end of step 3, one loop; each further loop takes the same time",
         "s",
         minimum=1e-3,
         maximum=1e9,
@@ -80,7 +80,7 @@ class SquarePathOptions:
     t4: float = parameter(24.0, "end of step 4, the motion back", "s", minimum=1e-3, maximum=1e9)
     most_loops: int = parameter(20, "largest number of loops", minimum=1, maximum=1000000)
     given_centre: int = nonnegative(
-        0, "1: squares around (centre_1, centre_2); 0: the best centre", maximum=1
+        0, "1: squares around (centre_1, centre_2); 0: squares around the best centre", maximum=1
     )
     centre_1: float = parameter(
         0.0, "first coordinate of a given centre", "rad", minimum=-1000.0, maximum=1000.0
@@ -139,7 +139,8 @@ class _SquareFamily:
 class SquarePathGait(GaitMethod):
     """Controls the attitude and shape of planar trees with three or more links and revolute joints.
 
-    The base position follows from both (the centre of mass is at rest) and cannot be chosen.
+    The base position follows from the attitude and the shape (the centre of mass is at rest), so it
+    cannot be chosen.
     """
 
     name: ClassVar[str] = "square_path"

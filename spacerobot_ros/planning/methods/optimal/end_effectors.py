@@ -6,12 +6,13 @@ attitude B_0 of the base,
 
 ``r_CE = X (r_BE(q) - r_BC(q))``,  ``R = X R_BE(q)``.
 
-An end-effector goal is a value of the first, or of both; the base position is treated as that of
-the base link. In the optimal control problem, these are :class:`EndEffectorRows`, only along
-directions in which the joints can move the link. Its guesses end in shapes found by inverse
-kinematics (:meth:`EndEffectorSpecification.boundary_conditions`), each with the base rotation along
-the direct path there (Umetani and Yoshida's generalised Jacobian), because the solver
-finds only the nearest minimum, and every family of shapes has a minimum of its own.
+An end-effector goal specifies ``r_CE``, or both ``r_CE`` and ``R``; a base position is treated as
+the goal of the base link. In the optimal control problem, the goals become
+:class:`EndEffectorRows`, only along directions in which the joints can move the link. The solver
+finds only the nearest minimum, and every family of shapes has its own minimum. So the guesses end
+in shapes found by inverse kinematics (:meth:`EndEffectorSpecification.boundary_conditions`), each
+with the base rotation along the direct path to that shape (Umetani and Yoshida's generalised
+Jacobian).
 """
 
 from __future__ import annotations
@@ -61,13 +62,14 @@ _SAMPLED_SHAPES = 8
 _SINGULAR_VALUE_TOLERANCE = 1e-7
 
 _MIN_MOTION = 1e-9
-"""Link motion per metre or radian of the joints that counts as zero, m or rad."""
+"""Largest link motion, m or rad, per metre or radian of the joints that is treated as zero."""
 
 _PARAMETERS_PER_LINK = 7
 """Number of values of a link's goal: r_CE and a quaternion."""
 
 _STARTS, _ADDITIONAL_STARTS = 16, 96
-"""Number of start shapes for inverse kinematics, and of additional ones if none succeeds."""
+"""Number of start shapes for inverse kinematics, and of additional start shapes if none
+succeeds."""
 
 _ITERATIONS = 40
 """Steps of inverse kinematics."""
@@ -76,21 +78,21 @@ _DAMPING = 1e-4
 """Least-squares damping in a step, relative to the largest matrix entry."""
 
 _END_ERROR = 2e-3
-"""Largest error of a shape used as the end of a guess, m or rad: the solver brings it to the
-goal."""
+"""Largest error, m or rad, of a shape at which an initial guess ends; the solver removes the
+error."""
 
 _DIRECT_PATH_STEPS = 12
 
 _MAX_STEP = 0.5  # m or rad
 
 _POSSIBLE_ENDS = 6
-"""Number of ends that the guesses of a search use in turn."""
+"""Number of end shapes that the initial guesses of a search use in turn."""
 
 _MIN_END_DIFFERENCE = 0.05
-"""Ends closer than this, as fractions of the joint ranges, are considered equal."""
+"""End shapes closer than this, as a fraction of the joint ranges, are considered equal."""
 
 _DAMPING_OF_EXACT_ENDS = 1e-9
-"""Same threshold if ends must meet their goals exactly."""
+"""The same threshold if end shapes must meet the goal exactly."""
 
 _GIVEN_SHAPE_ERROR = 1e-9
 """Smallest error at which given joint positions contradict an end-effector goal, m or rad."""
@@ -115,7 +117,7 @@ class EndEffectorRows:
     robot
         The model.
     links
-        Links, each with a flag whether its attitude is part of the goal.
+        Links, each with a flag that says whether the link attitude is part of the goal.
     axes
         (m, 3) directions in the base about which joint loops rotate it.
     """
@@ -133,7 +135,7 @@ class EndEffectorRows:
 
     @cached_property
     def function(self) -> ca.Function:
-        """The rows, a function of SX base rotation (4,), shape (n,) and parameters
+        """The rows as a function of the SX base rotation (4,), shape (n,) and parameters
         (:meth:`pack`)."""
         X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
         parameters = ca.SX.sym("p", self.parameters)
@@ -177,7 +179,7 @@ class EndEffectorRows:
         return ca.Function("end_effectors", [X, q, p], ca.cse(list(map(ca.densify, outputs))))
 
     def evaluate(self, X: Array, q: Array, parameters: Array) -> tuple[Array, Array, Array]:
-        """Return rows (K, m) and their derivatives (K, m, 3) and (K, m, n) at K ends.
+        """Return rows (K, m) and their derivatives (K, m, 3) and (K, m, n) at K motion ends.
 
         The derivatives are with respect to a base rotation, in base components, and to the shape;
         ``X`` (K, 4) and ``q`` (K, n).
@@ -202,7 +204,7 @@ class EndEffectorRows:
     def rank(self, fixed_attitude: bool) -> tuple[int, int]:
         """Return how many of the rows the joints can move independently, and the number of rows.
 
-        They are counted at shapes in general position, with the base attitude given or free.
+        Rows are counted at shapes in general position, with the base attitude given or free.
         """
         shapes, turns = self._samples()
         nowhere = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], len(self.links))
@@ -214,14 +216,14 @@ class EndEffectorRows:
     def require_directions(
         self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: tuple[float, float]
     ) -> None:
-        """Reject goals off the directions in which the links can move.
+        """Reject goals outside the directions in which the links can move.
 
         ``tolerance`` applies to positions, m, and attitudes, rad.
 
         Raises
         ------
         UnreachableError
-            The goal requires link motion off these directions.
+            The goal requires link motion in other directions.
         """
         R_WB = matrix_from_quaternion(state.quaternion)
         name = self.robot.description.name
@@ -353,7 +355,7 @@ class EndEffectorSpecification:
 
     @property
     def ends_in_one_shape(self) -> bool:
-        """Whether a motion is planned to a given shape, not to given end-effectors."""
+        """Whether a motion is planned to a given shape, not to end-effector goals."""
         return self.shape or self.overdetermined
 
     @property
@@ -367,7 +369,7 @@ class EndEffectorSpecification:
     def rows_at_end(self) -> EndEffectorRows | None:
         """Rows of the optimal control problem; none if it ends in a single shape.
 
-        The goal attitude is then the one that belongs to the shape.
+        The goal attitude then follows from that shape.
         """
         return None if self.ends_in_one_shape else self.rows
 
@@ -378,7 +380,8 @@ class EndEffectorSpecification:
         shape: Array | None,
         limits: MotionLimits,
     ) -> BoundaryConditions:
-        """Return the boundary conditions for a request, with possible ends for guesses.
+        """Return the boundary conditions for a request, and possible end states for the initial
+        guesses.
 
         The arguments are as in :meth:`GoalSpecification.boundary_conditions`.
 
@@ -537,7 +540,7 @@ class EndEffectorSpecification:
             rank, count = self.rows.rank(self.attitude)
             remedy = (
                 f"The goal requires {count} independent coordinates, but the joints move no more "
-                f"than {rank}: request a position instead of a pose, or less of the base."
+                f"than {rank}: request a position instead of a pose, or fewer base components."
             )
         return NotFoundError(
             f"No shape of robot '{robot}' with {names} at the goal was found from "
@@ -613,7 +616,7 @@ def _require_within_radius(
             raise UnreachableError(
                 f"The goal of '{each.link}' is out of reach: it is {distance:.4g} m from the "
                 "centre of mass, which stays where it is without thrust, and the joints of "
-                f"'{robot.description.name}' put '{each.link}' no farther from it than "
+                f"'{robot.description.name}' can move '{each.link}' no farther from it than "
                 f"{reach:.4g} m.",
                 Proof.LIMITS,
             )

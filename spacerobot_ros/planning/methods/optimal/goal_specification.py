@@ -1,6 +1,6 @@
 """Goal specification: the goal components to be reached, and whether the joints can reach them.
 
-At zero momentum, ``omega_WB_B = F(q) qdot``. If all columns of F are along one axis, the base
+At zero momentum, ``omega_WB_B = F(q) qdot``. If all columns of F are parallel to one axis, the base
 rotates only about that axis. Otherwise the brackets of the columns span all rotations, provided
 that the curvature of the connection is not zero everywhere (paper 1, section 4).
 """
@@ -47,17 +47,18 @@ _SINGULAR_VALUE_TOLERANCE = 1e-7
 _AXIS_TOLERANCE = 1e-6
 
 _MIN_BASE_TURN = 1e-12
-"""Base rotation per metre or radian of the joints that counts as zero, rad."""
+"""Largest base rotation, rad, per metre or radian of the joints that is treated as zero."""
 
 _MAX_SHAPE_GUESSES = 8
 
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
-"""Integration steps for the rotation by one joint, and the largest error, rad."""
+"""Number of integration steps for the base rotation caused by one joint, and the largest
+integration error, rad."""
 
 _JOINT_LIMIT_ROUNDING = 1e-9  # m or rad
 
 _QUADRATURE_NODES = 48
-"""Gauss-Legendre nodes along the path to a shape."""
+"""Number of Gauss-Legendre nodes along the path to a shape."""
 
 _POSITION_TOLERANCE = 1e-10  # m
 
@@ -115,7 +116,7 @@ class GoalSpecification:
         Raises
         ------
         PlanningError
-            The robot cannot reach any; the message says why.
+            The robot cannot reach any goal; the message says why.
         """
         name = robot.description.name
         if robot.n == 0:
@@ -173,7 +174,7 @@ class GoalSpecification:
             return BoundaryConditions(state.q, turn, likely, shape)
         if not self.attitude:
             raise PlanningError(
-                "The base position depends on its attitude: optimal reaches it together "
+                "The base position depends on the base attitude: optimal reaches it together "
                 "with the attitude (optimal.base_attitude 1)."
             )
         # The centre of mass r + R c(q) is fixed, which determines c(q_f).
@@ -216,9 +217,9 @@ class GoalSpecification:
         drifts = f"Robot '{name}' drifts, with an angular momentum of {size:.3g} kg m^2/s"
         if not self.base_rotations.loops_turn_base:
             raise PlanningError(
-                f"{drifts}, and loops of its joints do not rotate its base: optimal plans for "
-                "drifting robots only if they do. With optimal.base_attitude 0, the attitude is "
-                "ignored."
+                f"{drifts}, and loops of its joints do not rotate its base: optimal can plan for "
+                "a drifting robot only if such loops rotate its base. With "
+                "optimal.base_attitude 0, the attitude is ignored."
             )
         if len(self.base_rotations.axes) == 1:
             axis = self.base_rotations.axes[0]
@@ -228,8 +229,8 @@ class GoalSpecification:
             if off > _AXIS_TOLERANCE:
                 raise PlanningError(
                     f"{drifts}, which rotates its base about an axis other than that of its "
-                    "joints: no joint motion stops that. With optimal.base_attitude 0, the goal "
-                    "attitude is ignored."
+                    "joints: no joint motion can stop this rotation. With optimal.base_attitude "
+                    "0, the goal attitude is ignored."
                 )
 
     def require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
@@ -275,8 +276,8 @@ class BaseRotations:
     ----------
     axes
         (m, 3) in base components: one unit vector for a planar robot, the unit matrix if all
-        attitudes can be reached, none if the joints do not rotate the base, or only back and forth
-        along one attitude curve.
+        attitudes can be reached, none if the joints do not rotate the base, or rotate it only back
+        and forth along one attitude curve.
     turns_base
         Whether joints rotate the base at all.
     loops_turn_base
@@ -333,15 +334,16 @@ def _require_within_one_joint(
         joint = robot.description.movable_joints[0]
         angle = (wanted + np.pi) % whole - np.pi
         raise UnreachableError(
-            f"The goal attitude is beyond the joint limits: joint '{joint.name}', which is the "
-            f"only one, rotates the base by {least:.4g} to {most:.4g} rad from here, and the goal "
+            f"The goal attitude is beyond the joint limits: joint '{joint.name}', the only joint, "
+            f"can rotate the base by {least:.4g} to {most:.4g} rad from here, and the goal "
             f"is rotated by {angle:.4g} rad.",
             Proof.LIMITS,
         )
 
 
 def slides_anywhere(robot: SpaceRobot) -> bool:
-    """Whether sliders can put the base anywhere, because their slots are along three directions."""
+    """Whether sliders can move the base to any position, because their slots span three
+    directions."""
     try:
         require_three_slots(
             robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders_of(robot))
@@ -362,7 +364,7 @@ def shape_for_center(
 ) -> Array:
     """Return the shape (n,) near ``start`` whose centre of mass is at ``wanted`` (3,), m, in B.
 
-    If there is none, the centre of mass may be off by ``enough``, m.
+    If there is no such shape, the centre of mass may be off by up to ``enough``, m.
 
     Raises
     ------
@@ -433,8 +435,8 @@ def _unreachable_center_error(
     if gap <= _POSITION_TOLERANCE:
         return NotFoundError(
             f"No shape of '{name}' that puts the base at the goal position was found from "
-            f"{_MAX_SHAPE_GUESSES} starts: without thrust the centre of mass stays where it is, "
-            "and the nearest shape that was found puts the base "
+            f"{_MAX_SHAPE_GUESSES} starts: without thrust, the centre of mass stays where it is, "
+            f"and the nearest shape that was found puts the base "
             f"{distance:.3g} m from it. A closer position, another attitude, or "
             "optimal.base_position 2, which ignores the position, may help."
         )

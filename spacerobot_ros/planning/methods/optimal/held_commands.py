@@ -1,25 +1,25 @@
-"""Converts smooth trajectories to commands, each held for a tick, that end exactly at the goal.
+"""Converts smooth trajectories to commands that are held for one tick each and end exactly at the
+goal.
 
 The shapes at the ticks are points on the trajectory; between them, the shape moves along chords,
 with velocities averaged over a tick. So joints, velocities and accelerations stay within
-their limits, but chord loops enclose slightly different areas than the curves, and the solution's
-attitude differs slightly from the plant's integration. Newton's method adds a few smooth waves to
-the path until
-the plant's own prediction ends at the goal. The first variation of the final attitude is
+their limits, but chord loops enclose slightly different areas than the curves, and the attitude of
+the solution differs slightly from the attitude integrated by the plant. Newton's method adds a few
+smooth waves to the path until the plant's own prediction ends at the goal. The first variation of
+the final attitude is
 
-``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)``,  K the curvature of the connection,
+``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)`` (K is the curvature of the connection),
 
-for a change ``dq`` that vanishes at both ends, and more terms if the robot drifts
-(:class:`DriftVariation`). If this needs more speed or acceleration than the limits allow, a
-quadratic program finds the smallest change in the commands that stays within them. Its unknowns are
-the
-changes in all shapes at the ticks; to first order, the end is linear in them, and a few successive
-programs reach it (sequential quadratic programming). Otherwise the manoeuvre takes a few
-ticks longer.
+for a change ``dq`` that vanishes at both ends, with further terms if the robot drifts
+(:class:`DriftVariation`). If these waves need more speed or acceleration than the limits allow, a
+quadratic program finds the smallest change in the commands that stays within them. The unknowns are
+the changes in all shapes at the ticks. To first order, the end of the motion is linear in these
+changes, and a few successive programs reach the goal (sequential quadratic programming). If they do
+not reach the goal, the manoeuvre takes a few ticks longer.
 
-The program changes the last shape as well, if that is free: loops of some robots do not rotate the
-base. A manoeuvre of a few ticks is a polygon that does not resemble the curve any more; with
-two or three ticks it may have too few corners to end on the goal, and takes one more.
+If the last shape is free, the program changes it as well, because loops of some robots do not
+rotate the base. A manoeuvre of only a few ticks is a polygon that no longer resembles the curve.
+With two or three ticks, it may have too few corners to end at the goal, and takes one more tick.
 """
 
 from __future__ import annotations
@@ -57,18 +57,20 @@ _WAVES_PER_JOINT = 6
 _ATTITUDE_TOLERANCE = 1e-11  # rad
 _MAX_NEWTON_STEPS = 25
 _MAX_STRETCH_FACTOR = 1.25
-"""Largest factor by which a manoeuvre is stretched to meet its limits; beyond it, other starts are
-better."""
+"""Largest factor by which a manoeuvre is stretched to meet its limits; beyond it, other initial
+guesses are better."""
 
 _MAX_PROGRAMS = 4
-"""Number of durations, in ticks, tried in turn with all shapes changed to meet the limits."""
+"""Number of durations, in ticks, that are tried in turn when all shapes are changed to meet the
+limits."""
 
 _PROGRAM_STRETCH = 1.01
 """Factor between these durations, rounded up to a tick."""
 
 _MAX_PROGRAMS_IN_TURN = 6
 _FIT_TOLERANCE = 1e-5
-"""Error before the last program, rad, m or m/s; the remaining error is far smaller."""
+"""Error up to which one more program suffices, rad, m or m/s; the remaining error is far
+smaller."""
 
 _MIN_SMOOTH_TICKS = 20
 """Smallest number of ticks in a smooth manoeuvre; shorter manoeuvres are polygons."""
@@ -94,7 +96,7 @@ class HeldCommands:
 
 @dataclass(frozen=True)
 class ManoeuvreModel:
-    """Model and constraints of all manoeuvres of one robot, as which their commands are held.
+    """Converts all manoeuvres of one robot to held commands, with its model and its constraints.
 
     Attributes
     ----------
@@ -128,10 +130,11 @@ class ManoeuvreModel:
     ) -> HeldCommands | None:
         """Return commands for a trajectory that end at the goal shape and attitude.
 
-        They take the trajectory's time, rounded up to ticks, or longer if required by the limits
-        (``fixed``: not longer); None if none are found. If the boundary conditions leave the last
-        shape free, it is the trajectory's, or close to it. ``before`` are the velocities (n,)
-        held until then; None: as in the boundary conditions.
+        The commands take the trajectory's time, rounded up to whole ticks, or longer if required by
+        the limits (``fixed``: not longer); None if no such commands are found. If the boundary
+        conditions leave the last shape free, it is the trajectory's last shape, or close to it.
+        ``before`` are the velocities (n,) held until the start; None: as in the boundary
+        conditions.
         """
         before = boundary.velocity if before is None else before
         final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
@@ -255,11 +258,11 @@ class ManoeuvreModel:
     def corrected_end(
         self, trajectory: Trajectory, boundary: BoundaryConditions, ticks: int
     ) -> BoundaryConditions:
-        """Return boundary conditions whose solution ends at the goal when converted to commands of
-        ``ticks``.
+        """Return boundary conditions whose solution ends at the goal when converted to ``ticks``
+        commands.
 
         The goal attitude is rotated by the difference between the end attitudes of a trajectory and
-        of its commands. If the robot drifts, the solver's attitude is only of second order.
+        of its commands. If the robot drifts, the solver's attitude is only second-order accurate.
         """
         reached = self._attitudes(trajectory.at_ticks(ticks), boundary)[-1]
         error = quaternion_from_rotvec(attitude_error(reached, trajectory.quaternions[-1]))
@@ -408,10 +411,11 @@ class DriftVariation:
         self._n = robot.n
 
     def carried(self, shapes: Array, L_B: Array, R: Array, turned: Array, duration: float) -> Array:
-        """Return xi (K, 3, n) at the end of K steps of a duration, s, due to the change dq in each.
+        """Return xi (K, 3, n) at the end of K steps of equal ``duration``, due to the change dq in
+        each step.
 
         ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are the values at the steps, and
-        ``turned`` (K, 3, n) the contribution of curvature to xi in each.
+        ``turned`` (K, 3, n) the contribution of curvature to xi in each step.
         """
         columns = (each.full().T for each in self._function(shapes.T, L_B.T))
         G, M = (each.reshape(len(shapes), -1, 3).transpose(0, 2, 1) for each in columns)
@@ -480,7 +484,8 @@ def least_change(
     Returns
     -------
     :
-        The change with the least sum of squares, each joint's divided by its speed; None: none.
+        The change with the smallest sum of squares, where each joint's change is divided by its
+        speed; None: none.
     """
     N, n = len(positions) - 1, positions.shape[1]
     moving = slice(1, N + 1 if moves_end else N)

@@ -37,7 +37,8 @@ _CANDIDATES_PER_GUESS = 24
 """Number of random loops, of which the one closest to the goal becomes the guess."""
 
 _MIN_LOOP_SIZE = 0.1
-"""Smallest loop size on the path to a possible end, in half ranges, after the first guess."""
+"""Smallest loop size on the path to a possible end shape, in half ranges of the joints, for all
+guesses but the first."""
 
 _MAX_RANGE_SHARE = 0.85
 
@@ -76,7 +77,7 @@ class InitialGuesses:
         self._angular_momentum = angular_momentum
 
     def generate(self, boundary: BoundaryConditions, limits: MotionLimits) -> Iterator[Trajectory]:
-        """Yield guesses that end in the likely shape, or in all possible ends in turn."""
+        """Yield guesses that end in the likely shape, or in each possible end shape in turn."""
         rng = np.random.default_rng(1)
         half = limits.joint_ranges(boundary.start)[1]
         likely = PossibleEnd(boundary.likely_final_shape, boundary.goal_rotation)
@@ -112,9 +113,9 @@ class InitialGuesses:
     ) -> Iterator[Trajectory]:
         """Yield guesses in which reaction wheels rotate the base to its goal.
 
-        The base rotates about a fixed axis, in either direction, from its current rate to rest; the
-        other joints move to their final shape, later with loops on the way; and the wheel rates
-        follow from the momentum.
+        The base rotates about a fixed axis, in either direction, and slows down from its current
+        rate to rest. The other joints move to their final shape; in later guesses, with loops on
+        the way. The wheel rates follow from the momentum.
         """
         direct = self._direct_path(boundary.start, boundary.likely_final_shape)
         loops = self.generate(boundary, limits)
@@ -315,7 +316,7 @@ class InitialGuesses:
 
 def attitudes_along(turn: ca.Function, q: Array, u: Array, u_next: Array) -> Array:
     """Return the attitudes (..., N + 1, 4) along N steps (..., N, n) from rest, each from the one
-    before; ``turn`` is the function of a step (:func:`.turn_function`).
+    before; ``turn`` is the function that computes one step (:func:`.turn_function`).
     """
     Omega = turn(*(x.reshape(-1, x.shape[-1]).T for x in (q, u, u_next))).full().T
     rotations = quaternions_from_rotvecs(Omega).reshape(*q.shape[:-1], 4)

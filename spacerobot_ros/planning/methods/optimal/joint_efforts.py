@@ -1,10 +1,9 @@
 """Joint efforts during a motion, and their limits.
 
 The efforts under held commands (:class:`.JointEfforts`) are those of servos that follow the
-commands; if the plant is driven by efforts, they are a controller's command without feedback. At
-zero momentum,
-efforts are quadratic in the speed: a motion whose efforts are f^2 times their limits satisfies the
-limits if it takes f times as long.
+commands; if the plant is driven by efforts, they are the efforts that a controller would command
+without feedback. At zero momentum, efforts are quadratic in the speed: a motion whose efforts are
+f^2 times their limits satisfies the limits if it takes f times as long.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _PLANNED_EFFORT_SHARE = 0.98
-"""Fraction of the limits that a solution uses: the rest is for path changes."""
+"""Fraction of the limits that a solution may use; the rest is reserved for path changes."""
 
 
 class LimitedEfforts(JointEfforts):
@@ -44,7 +43,7 @@ class LimitedEfforts(JointEfforts):
         for name, value in zip(robot.joint_names, limit, strict=True):
             if not value > 0:
                 raise ParameterError(
-                    f"Joint '{name}' is limited to an effort of {value:g}, which moves nothing; "
+                    f"Joint '{name}' is limited to an effort of {value:g}, which cannot move it; "
                     "with optimal.effort_limits 2, efforts are not limited."
                 )
         super().__init__(robot, limit, control_period)

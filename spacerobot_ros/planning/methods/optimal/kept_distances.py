@@ -1,10 +1,11 @@
-"""Pairs of links, and of links and obstacles, that a solver keeps apart: only those that come too
-close in a solution without them.
+"""Pairs of links, and of links and obstacles, that a solver keeps apart: only pairs that come too
+close in a solution without such constraints.
 
 Rows for all pairs would be expensive, and few of them matter. So a problem is first solved without
-any. If the exact check finds links too close under held commands, rows are added for their pairs:
-their distances from planes between them (:mod:`spacerobot_ros.collision.planes`), which are valid
-only near the path for which they were computed.
+such rows. If the exact check finds links too close under held commands, rows are added for these
+pairs. The rows contain distances from planes between the links
+(:mod:`spacerobot_ros.collision.planes`), which are valid only near the path for which they were
+computed.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class DistanceLibrary:
         return [self._rows[pair] for pair in pairs]
 
     def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
-        """Return the pairs to keep apart between two ends: none initially.
+        """Return the pairs to keep apart between the two ends of a motion: none initially.
 
         ``turn_is_known``: the base rotation at the end is given by the boundary conditions.
 
@@ -98,7 +99,7 @@ class DistanceLibrary:
     ) -> BasePoses | None:
         """Return the base poses at shapes (K, n) and rotations (K, 4) since the start.
 
-        None if there are no obstacles, so that the base does not matter.
+        None if there are no obstacles, so that the base pose does not matter.
         """
         if boundary.state is None or not self.clearance.has_obstacles:
             return None
@@ -153,12 +154,11 @@ class KeptDistances:
         return self._library.clearance.approaches(positions, self._required, base)
 
     def message(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about an approach that is too close; without a control period, no
-        times."""
+        """Return a clause about an approach that is too close, with times if a period is given."""
         return self._library.clearance.clause(approach, control_period)
 
     def anew(self) -> KeptDistances:
-        """Return the same ends without pairs."""
+        """Return the same motion ends, with no pairs to keep apart."""
         return KeptDistances(self._library, self._boundary, self._required)
 
     def add(self, near: Sequence[Approach]) -> None:
@@ -167,7 +167,8 @@ class KeptDistances:
             self._room.setdefault(each.pair, _INITIAL_MARGIN)
 
     def widen(self, near: Sequence[Approach]) -> None:
-        """Add pairs that came too close; pairs already kept apart get the room they lack."""
+        """Add pairs that came too close; pairs that are already kept apart are given the missing
+        room."""
         kept = set(self._room)
         self.add(near)
         for each in near:
@@ -198,8 +199,8 @@ class KeptDistances:
         """Return limits with planes between all pairs at all instants in N intervals of a path.
 
         Planes are shifted by the required distances of pairs plus their room, or by the current
-        distances if smaller: so a clear path satisfies its own planes. ``pushing``:
-        whether pairs must have their room, except at the ends, whose shapes are given.
+        distances if these are smaller. So a clear path satisfies its own planes. ``pushing``:
+        whether pairs must have this room, except at the ends, whose shapes are given.
         """
         if not self.pairs:
             return limits

@@ -1,8 +1,8 @@
 """Time-optimal manoeuvres within real limits for any free-floating robot.
 
 The manoeuvre is the solution of an optimal control problem (:mod:`.multiple_shooting`) that starts
-from guesses with loops (:mod:`.initial_guesses`), converted to held commands that end at the goal
-(:mod:`.held_commands`).
+from guesses with loops (:mod:`.initial_guesses`). It is converted to held commands that end at the
+goal (:mod:`.held_commands`).
 """
 
 from __future__ import annotations
@@ -69,23 +69,23 @@ from spacerobot_ros.version import __version__
 
 _MAX_STARTS_IN_MOTION = 12
 """Largest number of guesses for a manoeuvre that starts with moving joints, which keep moving
-meanwhile."""
+during planning."""
 
 _ZERO_ERROR = 1e-10
-"""Largest error that counts as zero: the robot is at the goal; rad, m and joint coordinates."""
+"""Largest error considered zero, so that the robot is at the goal: rad, m and joint coordinates."""
 
 _ACTIVE_LIMIT_SHARE = 0.95
 
 _MAX_MOVING_AIMS = 4
-"""Largest number of fastest manoeuvres, each to the goal location at the end of the previous one,
-relative to a drifting centre of mass."""
+"""Largest number of successive fastest manoeuvres if the centre of mass drifts: each ends at the
+goal location, relative to the centre of mass, at the end of the previous one."""
 
 _MOVING_AIM_FACTORS = (1.05, 1.2, 1.5)
-"""Multiples of the last duration at which a manoeuvre is planned if the durations do not agree."""
+"""Multiples of the last duration for which manoeuvres are planned if the durations do not agree."""
 
 _STARTS_BEFORE_COASTING = 8
-"""Guesses without a solution after which a robot that drifts coasts with its joints at rest, and
-those for the rotation that remains when its base passes the goal."""
+"""Number of guesses without a solution after which a drifting robot coasts with its joints at rest,
+and number of guesses for the rotation that remains when its base passes the goal."""
 
 _STARTS_AFTER_COASTING = 3
 """Number of guesses without a solution after which the next pass of the goal is tried."""
@@ -103,7 +103,8 @@ _MAX_COASTING_ENDS = 3
 """Largest number of instants tried at which the coasting base passes the goal."""
 
 _MAX_DURATION_RATIO = 2.5
-"""Longest duration of a manoeuvre that ends at a pass, as a multiple of that at zero momentum."""
+"""Longest duration of a manoeuvre that ends at a pass, as a multiple of the duration at zero
+momentum."""
 
 _STARTS_BEFORE_FASTEST = 8
 """Number of guesses without a manoeuvre in the requested time after which the fastest manoeuvre is
@@ -140,13 +141,13 @@ class _Plan(NamedTuple):
 
 
 class OptimalGait(GaitMethod):
-    """Minimum time, or least effort in a given time, from rest to rest.
+    """Plans manoeuvres of minimum time, or of least effort in a given time, from rest to rest.
 
-    It reaches the attitude; the position, if sliders can put the base anywhere or the options
-    request it; and the final shape, if the goal has one. For end-effector goals, it reaches these
-    and the requested components of the base pose. The search has a budget of starts and
-    solver steps, so equal requests yield equal schedules on any machine, idle or busy, unless the
-    user also limits its wall time.
+    A manoeuvre reaches the attitude; the position, if sliders can move the base to any position or
+    the options request it; and the final shape, if the goal has one. For end-effector goals, it
+    reaches these goals and the requested components of the base pose. The search has a budget of
+    starts and solver steps, so identical requests yield identical schedules on any machine, idle or
+    busy, unless the user also limits its wall time.
     """
 
     name: ClassVar[str] = "optimal"
@@ -210,8 +211,9 @@ class OptimalGait(GaitMethod):
         """Plan within the search budget; see :meth:`GaitMethod.plan`.
 
         A correction uses the smallest motion instead of the fastest, and may use the margins. If
-        the centre of mass drifts, planning uses its frame, in which goal positions move: their
-        location at the end of the manoeuvre depends on its duration.
+        the centre of mass drifts, planning uses a frame that moves with it; goal positions move in
+        this frame. So the goal location at the end of a manoeuvre depends on the duration of the
+        manoeuvre.
         """
         self._require_suitable_setup()
         # Measured shapes may be a little beyond the joint limits.
@@ -282,8 +284,8 @@ class OptimalGait(GaitMethod):
             axes = self._kind_of(request.goal).specification.axes
             if not len(axes):
                 raise PlanningError(
-                    f"The robot has an angular momentum of {np.linalg.norm(L_B):.3g} kg m^2/s, "
-                    "which its wheels absorb depending on the final attitude: give the goal a "
+                    f"The robot has an angular momentum of {np.linalg.norm(L_B):.3g} kg m^2/s; "
+                    f"the wheel rates that absorb it depend on the final attitude: give the goal a "
                     "base attitude (with optimal.base_attitude 1)."
                 )
             L_B = matrix_from_quaternion(boundary.goal_rotation).T @ L_B
@@ -314,7 +316,7 @@ class OptimalGait(GaitMethod):
         if self._has_obstacles:
             raise PlanningError(
                 f"The robot drifts: its centre of mass moves at {np.linalg.norm(velocity):.3g} "
-                "m/s, but optimal plans around obstacles only if it is at rest."
+                "m/s, but optimal plans around obstacles only if the centre of mass is at rest."
             )
         in_frame = replace(request, state=replace(state, linear_momentum=np.zeros(3)))
         if not goal.end_effectors and "position" not in self._specification.controls:
@@ -354,8 +356,8 @@ class OptimalGait(GaitMethod):
             except PlanningError as reason:
                 refusal = str(reason)
         raise NotFoundError(
-            "The robot drifts, and no manoeuvre was found that ends at the goal's location at "
-            f"that time, relative to the centre of mass: {refusal}"
+            "The robot drifts, and no manoeuvre was found that ends where the goal is at that "
+            f"time, relative to the centre of mass: {refusal}"
         )
 
     def _plan_about_center(

@@ -1,13 +1,12 @@
-"""Bounds proved before a search: on base positions, and on manoeuvre durations.
+"""Bounds on base positions and on manoeuvre durations, proved before a search.
 
 :class:`CenterReach` bounds the centre of mass in the base, which proves that goals beyond the bound
 are out of reach. Without thrust, the centre of mass is at rest in the world, so a base pose
-determines it
-in the base. Sliders with directions fixed in the base move it along straight slots, exactly.
-Everything that rotates stays within a ball around the first joint that rotates it (triangle
-inequality over the links beyond that joint). The sum of both is a convex set that contains the
-centre of mass
-for all shapes; for robots with only such sliders, it is the set of all centres of mass.
+determines its position in the base. Sliders with directions fixed in the base move the centre of
+mass exactly along straight slots. Everything that rotates stays within a ball around the first
+joint that rotates it (triangle inequality over the links beyond that joint). The sum of the slots
+and the balls is a convex set that contains the centre of mass for all shapes; for robots with only
+such sliders, it is the set of all centres of mass.
 
 :class:`ConnectionBounds` bounds the base motion caused by each joint. While one joint moves and the
 others are at rest, the robot consists of two rigid bodies with masses ``m_P`` and ``m_D``, inboard
@@ -15,12 +14,12 @@ and outboard of
 the joint. With the locked inertia ``H`` about the centre of mass, and the angular momentum ``h_i``
 about it due to the joint at unit rate with the base at rest, the base rotates at ``-H^-1 h_i``.
 The distances of the centres of mass from the joint bound ``|h_i|`` for all shapes, and the smallest
-principal moments of all bodies bound ``H`` from below. The energy is another bound: the energy of
-the base motion is missing outboard of the joint, ``omega . (H + I_base) omega <= M_ii``. The
+principal moments of all bodies bound ``H`` from below. Energy yields another bound: the energy of
+the base motion is not available outboard of the joint, ``omega . (H + I_base) omega <= M_ii``. The
 smaller bound counts.
 
-:class:`DurationBound` follows from both, and from the largest joint travel in a given time. No
-shape is sampled.
+:class:`DurationBound` follows from both bounds, and from the largest joint travel in a given time.
+No shape is sampled.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ _PARALLEL = 1e-12
 """Sine of the angle between two directions below which they are considered equal."""
 
 _MIN_SLIDER_RANGE = 1e-12
-"""Slider bounds differ by at least this, m: the solver needs room between them."""
+"""Smallest difference between the two bounds of a slider, m: the solver needs room between them."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ class CenterReach:
 
 
 def moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return independent ranges (m,) of all moving joints: a larger set than that of (n,)."""
+    """Return independent ranges (m,) of all moving joints: a larger set than the ranges (n,)."""
     G, offsets = robot.description.coupling
     leaders = np.argmax(np.abs(G), axis=1)
     factors = G[np.arange(len(G)), leaders]
@@ -163,7 +162,7 @@ class ConnectionBounds:
     Attributes
     ----------
     turn
-        (n,) largest base rotation by each joint, rad per rad or m; infinite: unknown.
+        (n,) largest base rotation caused by each joint, rad per rad or m; infinite: unknown.
     center
         (n,) largest centre-of-mass displacement in the base, m per rad or m.
     inertia
@@ -215,11 +214,11 @@ class LinkBounds:
     Attributes
     ----------
     turn
-        (n,) largest link rotation by each joint, rad per rad or m.
+        (n,) largest link rotation caused by each joint, rad per rad or m.
     place
-        (n,) largest displacement of its origin, m per rad or m.
+        (n,) largest displacement of the link origin, m per rad or m.
     distance
-        Largest distance of its origin from the centre of mass, m.
+        Largest distance of the link origin from the centre of mass, m.
     """
 
     turn: Array
@@ -265,15 +264,16 @@ class _Tree:
         return cls(bodies, hinges, travels, [max(0.0, moment) for moment in moments])
 
     def reach(self, body: int, point: Array) -> float:
-        """Return the largest distance, m, of a point (3,) of a body from the centre of mass: it is
-        the mean of the vectors from those of all bodies, weighted by their masses.
+        """Return the largest distance, m, of a point (3,) of a body from the centre of mass: the
+        vector between them is the mass-weighted mean of the vectors from the centres of mass of all
+        bodies.
         """
         masses = [each.inertia.mass for each in self.bodies]
         apart = self.distances(body, point, -1, np.eye(3))
         return float(sum(masses[k] * distance for k, distance in apart) / sum(masses))
 
     def moved_by(self, joint: int, *, planar: bool) -> tuple[float, float, float]:
-        """Return bounds on the angular momentum ``h`` about the centre of mass (kg m^2/s), of the
+        """Return bounds on the angular momentum ``h`` about the centre of mass (kg m^2/s), the
         inertia ``M`` (kg m^2 or kg) and the centre-of-mass displacement (m), at unit rate of the
         joint that carries a body.
         """
@@ -312,7 +312,7 @@ class _Tree:
 
     def chain(self, body: int, point: Array) -> tuple[Array, Array]:
         """Return the largest rotation (rad/rad) and displacement (m/rad or m/m) of a ``point`` (3,)
-        of a body by each moving joint (m,) with the base at rest.
+        of a body caused by each moving joint (m,) with the base at rest.
         """
         turning, levers = (np.zeros(len(self.bodies) - 1) for _ in range(2))
         way = 0.0
@@ -453,7 +453,7 @@ class DurationBound:
         bounds = list(zip(times.tolist(), (each.reason for each in demands), strict=True))
         if base_rate_limit > 0:
             least = angle * (1 - _BOUND_ROUNDING) / base_rate_limit
-            bounds.append((least, f"{turns} at optimal.max_base_rate at most"))
+            bounds.append((least, f"{turns} at no more than optimal.max_base_rate"))
         seconds, reason = max(bounds, key=lambda each: each[0], default=(0.0, ""))
         if not seconds > 0:
             return cls(0.0, "")
@@ -478,7 +478,8 @@ def link_demands(
     boundary: BoundaryConditions,
     connection: ConnectionBounds,
 ) -> Iterator[Demand]:
-    """Yield the end-effector motions to the goals in a request, minus its tolerances."""
+    """Yield the end-effector motions that the goals in a request require; each is reduced by the
+    tolerances."""
     state, tolerance, drift = request.state, request.tolerance, connection.drift(boundary)
     for goal in request.goal.end_effectors:
         of_link = connection.of_link(robot, goal.link)

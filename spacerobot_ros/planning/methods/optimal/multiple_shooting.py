@@ -26,10 +26,10 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
 )
 
 _FEASIBILITY_TOLERANCE = 1e-4
-"""Constraint violation below which an iterate counts as a trajectory, SI units."""
+"""Constraint violation below which an iterate is accepted as a trajectory, SI units."""
 
 _INFEASIBLE = "Infeasible_Problem_Detected"
-"""Solver status if it ends at a minimum of the constraint violation."""
+"""Solver status if the solver ends at a minimum of the constraint violation."""
 
 TOLERANCE = 1e-5
 """Durations are accurate to a thousandth of a control period for manoeuvres of several seconds."""
@@ -64,14 +64,15 @@ _REFINING_OPTIONS = {"ipopt.mu_init": 1e-3}
 """The guess is a solution on a coarser grid."""
 
 _WARM_STRETCH = 1.5
-"""With distances: factor applied to the guess duration. At full speed, velocities and accelerations
-are at their limits, which leaves the solver no room to move around obstacles."""
+"""With distances: factor by which the duration of the guess is multiplied. At full speed,
+velocities and accelerations are at their limits, which leaves the solver no room to move around
+obstacles."""
 
 _LARGEST_REACH, _LARGEST_REACH_SHARE = 0.3, 0.15
 """Largest reach of a neighbourhood, rad or m, and as a fraction of a joint's range."""
 
 _COST_OF_LACK = 300.0
-"""Cost of missing distance per m, in durations or efforts of the guess."""
+"""Cost per metre of missing distance, in durations or efforts of the guess."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +84,10 @@ class StopRule:
     iterations
         Largest number of solver steps.
     cancellation
-        Stops it at its next iterate.
+        Stops the solver at its next iterate.
     is_over
-        Whether the wall time is used up, if there is a feasible iterate or not.
+        Returns whether the wall time is used up; the argument says whether there is a feasible
+        iterate.
     watch
         Called at every iterate.
     """
@@ -118,8 +120,8 @@ class Neighbourhood:
     reach
         (n,) largest shape change anywhere on the path, m or rad.
     largest_lack
-        Distance by which links may be closer than required, m. Its cost is high, so that it
-        vanishes if the solver finds a path.
+        Distance by which links may be closer than required, m. The cost of this distance is high,
+        so that it vanishes if the solver finds a path.
     """
 
     reach: Array
@@ -157,8 +159,8 @@ class MultipleShooting:
         self._program = program(stages, intervals)
         self._layout = Layout.of(stages, intervals)
         self.nonzeros = int(self._program.jac_g.nnz_out(1))
-        """Number of nonzeros in the constraint Jacobian; the time of a step is proportional to
-        it."""
+        """Number of nonzeros in the constraint Jacobian; the computing time of a step is
+        proportional to it."""
         self._monitor = SolverMonitor(
             self._program.problem, self._program.lower, self._program.upper
         )
@@ -187,8 +189,8 @@ class MultipleShooting:
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
 
-        For a fixed time, it is the one of least effort, with the least mean square of accelerations
-        divided by joint speeds.
+        For a fixed time, return the trajectory of least effort, that is, of the least mean square
+        of accelerations divided by joint speeds.
 
         Parameters
         ----------
@@ -338,7 +340,7 @@ class SolverMonitor(ca.Callback):
         return int(ca.nlpsol_n_out())
 
     def get_n_out(self) -> int:
-        """Return one, the number of outputs: whether to stop."""
+        """Return 1, the number of outputs; the output says whether to stop."""
         return 1
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:

@@ -43,7 +43,7 @@ class MotionOptions:
     )
     ramp_time: float = parameter(
         0.5,
-        "time from rest to full speed, without max_acceleration",
+        "time from rest to full speed, if max_acceleration is not given",
         unit="s",
         minimum=1e-6,
         maximum=1e9,
@@ -63,14 +63,15 @@ class OptimalOptions(MotionOptions):
     )
     effort_limits: int = parameter(
         0,
-        "joint effort limits: 0: enforced if such a manoeuvre is found, with "
-        "effort_reserve if a controller tracks it, 1: enforced, with effort_reserve, 2: ignored",
+        "joint effort limits: 0: enforced if a manoeuvre within them is found, with "
+        "effort_reserve if a controller tracks the manoeuvre, 1: enforced, with effort_reserve, "
+        "2: ignored",
         minimum=0,
         maximum=2,
     )
     max_effort: tuple[float, ...] = parameter(
         (),
-        "effort limit of every joint, below the URDF limit; []: the URDF limit",
+        "effort limit of every joint, if below the URDF limit; []: the URDF limit",
         unit="N or N m",
         minimum=0.0,
         maximum=1e12,
@@ -93,12 +94,15 @@ class OptimalOptions(MotionOptions):
         by_name=True,
     )
     base_position: int = parameter(
-        0, "0: reached if sliders can, 1: reached, 2: ignored", minimum=0, maximum=2
+        0,
+        "goal position: 0: reached if sliders allow it, 1: reached, 2: ignored",
+        minimum=0,
+        maximum=2,
     )
     base_attitude: int = parameter(1, "1: reached, 0: ignored", minimum=0, maximum=1)
     final_shape: int = parameter(
         0,
-        "final joint positions if the goal has none: 0: any, 1: the current ones",
+        "final joint positions if the goal has none: 0: any, 1: the current positions",
         minimum=0,
         maximum=1,
     )
@@ -134,8 +138,8 @@ class OptimalOptions(MotionOptions):
     starts: int = parameter(24, "largest number of guesses", minimum=1, maximum=10000)
     answers: int = parameter(
         16,
-        "number of solutions to find, unless enough starts agree; several are computed on a "
-        "coarse grid, and the best is refined",
+        "number of solutions to find, unless enough starts agree; several solutions are computed "
+        "on a coarse grid, and the best one is refined",
         minimum=1,
         maximum=10000,
     )
@@ -150,8 +154,8 @@ class OptimalOptions(MotionOptions):
     )
     time_budget: float = parameter(
         0.0,
-        "wall time for the search, five times as long if nothing is found; 0: no limit. If it "
-        "ends the search, the plan depends on the machine load",
+        "wall time for the search, five times as long if nothing is found; 0: no limit. If the "
+        "budget ends the search, the plan depends on the machine load",
         unit="s",
         minimum=0.0,
         maximum=1e9,
@@ -163,7 +167,7 @@ class OptimalOptions(MotionOptions):
 
 
 _UNLIMITED_HALF_RANGE = np.pi
-"""Half of the range used by a guess for an unlimited joint, rad or m."""
+"""Half of the range that guesses use for an unlimited joint, rad or m."""
 
 _SMOOTH_BODY_EXPONENT = 8
 
@@ -171,7 +175,7 @@ _UNBOUNDED_FROM = 1e6
 """Box bounds beyond this value, m or rad, are ignored for joints without limits."""
 
 _CONSTRAINT_RESERVE = 0.02
-"""Relative margin of a solution from its path constraints, which are imposed only at steps."""
+"""Relative margin of a solution to its path constraints, which are imposed only at the steps."""
 
 
 class UnusableCandidateError(PlanningError):
@@ -203,7 +207,7 @@ class BoundaryConditions:
     center
         (3,) system's centre of mass in the base at the end, m; None: anywhere.
     direction
-        (3,) kept direction in the path constraints, in the initial base frame.
+        (3,) ``keep_direction`` of the path constraints, in the initial base frame.
     velocity
         (n,) initial joint velocities, m/s or rad/s; a scalar applies to all.
     final_velocity
@@ -211,7 +215,7 @@ class BoundaryConditions:
     end_effectors
         (7 k,) goals of k links (:meth:`.EndEffectorRows.pack`).
     possible_ends
-        Ends used for the guesses in turn; none: the likely shape, and the rotation.
+        Ends that the guesses use in turn; none: only the likely shape and the goal rotation.
     state
         State at the start.
     angular_momentum
@@ -238,8 +242,8 @@ class BoundaryConditions:
 
     @property
     def is_timed(self) -> bool:
-        """Whether the end depends on the duration, because the robot drifts or joints move at an
-        end."""
+        """Whether the end depends on the duration, because the robot drifts or because joints move
+        at the start or the end."""
         return self.drifts or bool(np.any(self.velocity) or np.any(self.final_velocity))
 
     def momenta_in_base(self, quaternions: Array) -> Array | None:
@@ -269,7 +273,7 @@ class MotionLimits:
     def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:
         """Return the robot's limits, narrowed by a method's options.
 
-        Without ``max_acceleration``, the acceleration limit of reaction wheels is that due to their
+        Without ``max_acceleration``, the acceleration limit of reaction wheels follows from their
         motor torque with the base at rest.
 
         Raises
@@ -320,7 +324,8 @@ class MotionLimits:
         )
 
     def joint_ranges(self, q: Array) -> tuple[Array, Array]:
-        """Return the middle and the half width (n,) of the range, finite around ``q`` (n,)."""
+        """Return the middle and the half width (n,) of the joint ranges; unlimited ranges are
+        replaced by finite ones around ``q`` (n,)."""
         lower = np.maximum(self.lower, q - 2 * _UNLIMITED_HALF_RANGE)
         upper = np.minimum(self.upper, q + 2 * _UNLIMITED_HALF_RANGE)
         middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
@@ -336,9 +341,9 @@ class MotionLimits:
         """Return the factor by which held commands must be slowed down, and the largest overrun.
 
         ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds; the velocities
-        ``velocity`` and ``after`` (n,) are held before and after. The factor is at most 1 if
-        velocities and accelerations are within their limits; the overrun is the largest distance of
-        a joint beyond its limits, m or rad.
+        ``velocity`` and ``after`` (n,) are held before and after these ticks. The factor is at most
+        1 if velocities and accelerations are within their limits; the overrun is the largest
+        distance of a joint beyond its limits, m or rad.
         """
         speed, change = self.limit_shares(positions, period, velocity, after)
         beyond = np.maximum(self.lower - positions, positions - self.upper)
@@ -367,7 +372,7 @@ class MotionLimits:
 class Trajectory:
     """N steps of ``step`` seconds with constant accelerations.
 
-    ``shapes`` and ``velocities`` (N + 1, n) at the knots between them, and the attitude
+    ``shapes`` and ``velocities`` (N + 1, n) at the knots between the steps, and the attitude
     ``quaternions`` (N + 1, 4) relative to the initial attitude.
     """
 
@@ -488,7 +493,7 @@ class PathConstraints:
     def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:
         """Return the inequality constraints (nonnegative if satisfied) at a shape and an attitude.
 
-        ``direction`` (3,) is the kept direction in the quaternion's reference frame.
+        ``direction`` (3,) is ``keep_direction`` in the reference frame of the quaternion.
         """
         rows = [ca.SX(0, 1)]
         for body in self.smooth_keep_out_bodies:

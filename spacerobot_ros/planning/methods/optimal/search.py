@@ -1,20 +1,23 @@
 """Search for the fastest manoeuvre, from guesses to held commands, in the order of this file.
 
-1. **Guesses**: the direct path with loops; in motion, the remainder of the motion comes first.
-2. **Coarse solutions**: guesses are solved on a coarse grid, at a small part of the cost of the
-   full one, until some solutions agree.
-3. **Full grid**: the best solution is refined; the next, if that fails.
-4. **Held commands**: a solution becomes commands that end on the goal. If its duration matters (the
-   robot drifts, or joints move at an end), it cannot be stretched to whole control periods: the
-   path of least effort in as many periods, or a few more, is solved for.
-5. **Clear**: if held commands bring links too near to each other or to obstacles, clear paths are
-   searched for near them, then near other solutions, then near guesses, and made faster.
+1. **Guesses**: the direct path with loops; if the joints move at the start, the first guess is the
+   remainder of their motion.
+2. **Coarse solutions**: solutions are computed from the guesses on a coarse grid, at a small
+   fraction of the cost of the full grid, until some solutions agree.
+3. **Full grid**: the best solution is refined; if that fails, the next best one.
+4. **Held commands**: a solution is converted to commands that end at the goal. If the duration
+   matters (the robot drifts, or joints move at the start or the end), the solution cannot be
+   stretched to whole control periods. So the path of least effort is computed for that number of
+   periods, or a few more.
+5. **Clear**: if held commands bring links too close to each other or to obstacles, clear paths are
+   searched for near these commands, then near other solutions, then near guesses; these paths are
+   then made faster.
 
 Each step consists of a few methods of :class:`ManoeuvreSearch`.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
-checking", International Journal of Robotics Research 33, 2014, clear paths in steps that are
-quadratic programs; here, each step is the manoeuvre's own problem.
+checking", International Journal of Robotics Research 33, 2014, clear paths in steps, each of which
+is a quadratic program; here, each step is the full problem of the manoeuvre.
 """
 
 from __future__ import annotations
@@ -69,32 +72,32 @@ _NO_HELD_COMMANDS = "held commands could not be brought to the goal within the l
 # -- constants, each with its reason --------------------------------------------------------------
 
 _MIN_TICKS = 2
-"""Smallest number of ticks of a manoeuvre: one to start, another one to stop."""
+"""Smallest number of ticks in a manoeuvre: one tick to start and one to stop."""
 
 _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 """Ticks or time, s, of a gentle manoeuvre, whichever is less: it corrects a small error, whereas a
 faster one would leave a larger error."""
 
 _GENTLE_DURATION_FACTOR = 4.0
-"""A gentle manoeuvre is the path of least effort with this multiple of its guess's duration, then
-as fast as the limits allow."""
+"""A gentle manoeuvre is the path of least effort in this multiple of the duration of its guess,
+then made as fast as the limits allow."""
 
 _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
 """As ``optimal.time_budget`` is documented."""
 
 _COARSE_GRID_RATIO, _MIN_COARSE_INTERVALS = 5, 8
-"""Ratio of the full grid to the coarse one, and the smallest number of intervals of that; with
-fewer there is none."""
+"""Ratio of the full grid to the coarse grid, and the smallest number of intervals of a coarse grid;
+with fewer, there is no coarse grid."""
 
 _COARSE_TOLERANCE = 1e-4
 """Tolerance on a coarse grid, whose solutions differ more from later ones."""
 
 _SAME_COST_TOLERANCE, _AGREEING_COST_TOLERANCE = 1e-3, 3e-3
-"""Relative differences of costs up to which two solutions count as the same, and up to which they
+"""Relative cost differences up to which two solutions are considered the same, and up to which they
 agree: the coarse grid and the solver's tolerance cause such differences."""
 
 _MAX_FULL_GRID_STARTS = 3
-"""Number of other paths that are made clear on the full grid alone: it costs the most."""
+"""Number of other paths that are made clear only on the full grid, which costs the most."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Solver steps from a guess in which wheels stop the base: most take twenty. With 300, one of nine
@@ -112,16 +115,16 @@ _HELD_REACH_SHARE = 0.3
 """Fraction of the largest reach by which a clear path may change in a solution in whole ticks."""
 
 _CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
-"""Time ratios of a path to be made clear to a path in collision, and to a clear path on a coarse
-grid: slow joints leave room to move around obstacles."""
+"""Duration of a path to be made clear, relative to the duration of a path in collision, and to that
+of a clear path on a coarse grid: slow joints leave room to move around obstacles."""
 
 _MAX_CLEARING_ITERATIONS = 80
 """Largest number of solver steps between paths for which planes are computed: more steps
 diverge."""
 
 _MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
-"""Largest number of paths on the way to a clear path, and from there to a fast one: most take a
-few, but a servicer's plan is not found in seven."""
+"""Largest number of paths on the way to a clear path, and from there to a fast one: most searches
+take a few, but one plan for a servicer is not found with seven paths."""
 
 _LARGEST_LACK = 0.15
 """Distance by which links on the way to a clear path may be closer than required, m. With 0.3, a
@@ -134,7 +137,7 @@ _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 plan."""
 
 _MIN_SHORTENING_ROUNDS = 3
-"""Number of paths on the way to a fast one that are always tried."""
+"""Number of paths that are always tried on the way to a fast path."""
 
 _NO_LACK = 1e-3
 """Missing distance below which all planes are kept, m."""
@@ -155,12 +158,12 @@ unless the base drifts, only the rest of the motion: from rest, after braking, o
 sooner. With 8 guesses, a plan for a quadruped took 40 % longer."""
 
 _REPORT_PERIOD = 1.0
-"""Wall time after which a solver reports that it is still busy, s."""
+"""Wall time, s, after which a solver reports that it is still busy."""
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """A manoeuvre found, as held commands with search results.
+    """A manoeuvre that was found: held commands and search results.
 
     Attributes
     ----------
@@ -197,7 +200,7 @@ class Manoeuvre:
 
 @dataclass(frozen=True)
 class SearchClock:
-    """Wall time of a plan, shared by all its searches.
+    """Wall time allowed for a plan, shared by all searches for the plan.
 
     Attributes
     ----------
@@ -230,7 +233,7 @@ class SearchProblem:
     request
         The request. If the joints move, the remainder of their motion is the first guess.
     boundary, limits
-        Both ends, and the joint limits.
+        Both ends of the motion, and the joint limits.
     options
         The options of this search.
     clock, cancellation
@@ -264,8 +267,8 @@ class SearchProblem:
 
     @property
     def gentle(self) -> bool:
-        """Whether the manoeuvre takes the path of least effort, whose rotation of the base depends
-        least on errors of masses.
+        """Whether the manoeuvre takes the path of least effort, whose base rotation is least
+        sensitive to mass errors.
         """
         # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
         return self.request.correction and not self.is_timed
@@ -324,7 +327,7 @@ class ManoeuvreSearch:
         NotFoundError
             None was found.
         PlanningError
-            No manoeuvre is as short as requested, or links are too close at an end.
+            No manoeuvre is as short as requested, or links are too close at the start or the end.
         PlanningCancelled
             The search was cancelled.
         """

@@ -1,11 +1,11 @@
 """Direct multiple shooting: the optimal control problem as a nonlinear program, stage by stage.
 
-Knots k = 0..N contain the attitude X, the joint velocity v and the vertex s; the control of
-interval
-k is its constant joint acceleration a; all intervals take the same time h, which is free. The
-shape runs along a parabola in each interval, from ``q_k = s_k - h v_k / 2`` to ``q_{k+1}``, whose
-tangents at both ends meet in the vertex ``s_k``. As the parabola lies in the triangle of these
-three points, simple bounds on s enforce the joint limits also between the knots. The dynamics are
+Each knot k = 0..N contains an attitude X, a joint velocity v and a vertex s. The control of
+interval k is its constant joint acceleration a. All intervals take the same time h, which is free.
+In each interval, the shape runs from ``q_k = s_k - h v_k / 2`` to ``q_{k+1}`` along a parabola
+whose tangents at both ends meet in the vertex ``s_k``. As the parabola lies in the triangle of
+these three points, simple bounds on s enforce the joint limits also between the knots. The dynamics
+are
 
 ``v+ = v + h a``, ``s+ = s + h v+``, ``X+ = X exp(Omega(s, h v, h v+))``.
 
@@ -16,11 +16,11 @@ and attitude determine the position.
 
 If a robot drifts, its angular momentum L about the centre of mass is constant in the world, so
 ``D(q) w + D_q(q) u = h X' L_0``, with L_0 in the initial base frame. X at a Gauss point is the
-weighted mean of the quaternions at both knots, normalised, which makes the attitude second-order
-accurate.
-These functions differ from the ones at zero momentum, and are derived only if a robot drifts.
+weighted mean of the quaternions at both knots, normalised, so the attitude is only second-order
+accurate. These functions differ from those for zero momentum, and are derived only if a robot
+drifts.
 
-All stages have the same functions. Their derivatives are computed once, and inserted into the
+All stages have the same functions. The derivatives are computed once, and inserted into the
 program's sparse matrices.
 
 Method: H. G. Bock and K. J. Plitt, "A multiple shooting algorithm for direct solution of optimal
@@ -57,7 +57,7 @@ GAUSS = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
 """Gauss points of an interval, from 0 to 1."""
 
 _DIRECTION_SIZE = 3
-"""Size of the kept direction, the first parameter of an interval."""
+"""Number of components of ``keep_direction``, the first parameter of an interval."""
 
 _LEAST_MULTIPLIER = 3e-2
 """Multiplier below which a distance has no effect, in durations or efforts (of about one) per m."""
@@ -98,7 +98,7 @@ class ConstraintBlock:
         *,
         repeated: bool = False,
     ) -> ConstraintBlock:
-        """Return a block from the cache, or derive it; ``facts`` are everything it depends on.
+        """Return a block from the cache, or derive it; the block depends only on ``facts``.
 
         Derivatives are compiled if the block is ``repeated`` in a program.
         """
@@ -147,7 +147,7 @@ class Stages:
     beginning, interval, end
         Rows for the first knot, for two neighbouring knots, and for the last knot.
     path_row_count
-        Number of inequality rows (``>= 0``) in the interval, its last ones.
+        Number of inequality rows (``>= 0``) in the interval, which come last.
     rotation_of_step
         Rotation vector (3,) of a step (:func:`turn_function`).
     distances
@@ -194,8 +194,8 @@ class Stages:
             Constraints of the path.
         inequality
             Of SX: shape, velocities and accelerations of the joints, each (n,), and, if the robot
-            drifts, its angular momentum (3,) about the centre of mass in the base. Its rows are not
-            negative at both ends of every interval; None: there are none.
+            drifts, its angular momentum (3,) about the centre of mass in the base. Its rows are
+            nonnegative at both ends of every interval; None: there are none.
         end_effectors
             Of SX: ``(rotation (4,), shape (n,), parameters)``, rows that vanish at the end.
         drifting
@@ -226,7 +226,7 @@ class Stages:
 
 
 def beginning_block(joints: int) -> ConstraintBlock:
-    """Return the rows for the first knot, in ``[h; s; v]``: its shape is the start (n,)."""
+    """Return the rows for the first knot, in ``[h; s; v]``: the shape there is the start (n,)."""
     h, s, v = ca.SX.sym("h"), ca.SX.sym("s", joints), ca.SX.sym("v", joints)
     start = ca.SX.sym("start", joints)
     return ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
@@ -260,7 +260,7 @@ def _cached_interval(
 
 
 def hash_of(facts: Sequence[str]) -> str:
-    """Return the cache key for an object derived from given facts."""
+    """Return the cache key for an object derived from ``facts``."""
     return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
 
@@ -345,8 +345,8 @@ class AttitudeRows:
             The arguments of ``rotation`` at the Gauss points.
         rotation
             Rotation, its Jacobian and the Hessian of its product with multipliers. Common
-            subexpressions are searched for in it; a search in the interval expressions takes
-            several times as long, and finds only 1 % more.
+            subexpressions are searched for in this function; a search in the interval expressions
+            takes several times as long, and finds only 1 % more.
         defect
             A parameter (3,) that is added to the rotation vector of the step; None: none.
         """
@@ -512,7 +512,7 @@ def rotation_with_derivatives(robot: SpaceRobot, *, drifting: bool) -> ca.Functi
     """Return the rotation w, its Jacobian, and the Hessian of ``mu' w``, as functions of the point
     and mu.
 
-    Obtained by differentiating ``D w + D_q u = 0``, or l on the right, once and twice.
+    The derivatives follow from differentiating ``D w + D_q u = 0`` (or ``= l``) once and twice.
     """
     q, u, impulse = (ca.SX.sym(name, k) for name, k in _rotation_symbols(robot, drifting))
     w, mu, eta = (ca.SX.sym(name, 3) for name in ("w", "mu", "eta"))
@@ -538,10 +538,10 @@ def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
 
 
 def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
-    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, base components.
+    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, in base components.
 
     If the robot drifts, the fourth argument is the angular impulse (3,) of the step: the angular
-    momentum in the base about half-way, times the step duration.
+    momentum in the base at about half of the step, times the step duration.
     """
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
     impulse = ca.SX.sym("impulse", 3 if drifting else 0)
@@ -621,7 +621,7 @@ class PlacedBlock:
         variables: Indices,
         parameters: ca.MX,
     ) -> PlacedBlock:
-        """Place a block after the rows of the others."""
+        """Place a block after the rows of the other blocks."""
         count = len(variables)
         rows = sum(each.rows.size for each in placed)
         of_block = rows + np.arange(count * block.rows).reshape(count, block.rows)
@@ -639,7 +639,7 @@ class PlacedBlock:
         return [ca.vec(result.nz[:]) for result in results]
 
     def multipliers(self, lam_g: ca.MX) -> ca.MX:
-        """Return the multipliers of its rows, one column per place."""
+        """Return the multipliers of the block's rows, one column per place."""
         return ca.reshape(lam_g[self.rows.ravel().tolist()], -1, len(self.rows))
 
 

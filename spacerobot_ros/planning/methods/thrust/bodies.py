@@ -41,7 +41,8 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
 )
 
 _ROOM = 4e-3
-"""Distance beyond the required one at these instants: paths bend between them, m."""
+"""Distance, m, in excess of the required distance at these instants, because paths bend between the
+instants."""
 
 _NO_DISTANCE = 1e3
 """m; rows for a plane this far away are always satisfied."""
@@ -82,7 +83,7 @@ class _Surroundings:
         return self.geometry.poses(path.shapes, self.base(path))
 
     def planes(self, pair: int, path: _Samples, at: npt.NDArray[np.int64]) -> Array:
-        """Return planes (K, 7) of a pair at instants (K,) of a path, those of obstacles in W."""
+        """Return planes (K, 7) of a pair at instants (K,) of a path; obstacle planes are in W."""
         R, r = self.poses(path)
         _, planes = self.geometry.planes(pair, (R[at], r[at]))
         if self.target is not None and self.geometry.with_obstacles[pair]:
@@ -94,8 +95,8 @@ class _Surroundings:
 
 
 class Bodies:
-    """Pairs of solids for one motion: those of a robot and its obstacles, then those of a robot and
-    a target.
+    """Pairs of solids for one motion: first the pairs of a robot and its obstacles, then those of
+    the robot and a target.
 
     Parameters
     ----------
@@ -131,9 +132,10 @@ class Bodies:
             first = sum(len(each.geometry.pairs) for each in self._around)
             self._around.append(_Surroundings(kept, first, grapple.motion))
         self.rows = cache(self._derived_rows)
-        """Returns the rows of a pair, by its number."""
+        """Returns the rows of a pair with a given number."""
         self._kept: dict[int, tuple[float, Array]] = {}
-        """Room of the pairs that are kept apart, m, and whether they are at each instant (N K,)."""
+        """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
+        (N K,)."""
         shape = start.q[np.newaxis]
         begin = _Samples(shape, _poses(start.pose), np.zeros(1))
         for each in self._around:
@@ -187,8 +189,8 @@ class Bodies:
         return around.geometry.distances(pair, around.poses(self._along(knots)))
 
     def room(self, knots: ThrustKnots, pairs: Collection[int] | None = None) -> float:
-        """Return by how much obstacles, the target and some other pairs (None: all) are farther
-        away along a path than required, at least, m.
+        """Return the smallest difference between actual and required distance along a path, m, for
+        obstacles, the target and some other pairs (None: all).
         """
         path, least = self._along(knots), np.inf
         for around in self._around:
@@ -202,9 +204,9 @@ class Bodies:
         return least
 
     def keep(self, near: Sequence[Approach], knots: ThrustKnots) -> None:
-        """Keep more pairs apart: at the instants of a path at which they are near, by the size of
-        the first solid, and around their approaches in an exactly integrated motion. Give those
-        that are kept as much room as they lack.
+        """Keep more pairs apart: at the instants of a path at which they are closer than the size
+        of the first solid, and around their approaches in an exactly integrated motion. Pairs that
+        are already kept apart are given the missing room.
         """
         for approach in near:
             around, pair = self._pair(approach.pair)
@@ -224,7 +226,7 @@ class Bodies:
 
     @property
     def kept(self) -> KeptPlaces:
-        """The pairs that are kept apart, and where."""
+        """The pairs that are kept apart, and their places."""
         numbers = sorted(self._kept)
         return tuple((k, tuple(np.flatnonzero(self._kept[k][1]).tolist())) for k in numbers)
 

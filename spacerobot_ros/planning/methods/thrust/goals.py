@@ -15,7 +15,7 @@ from spacerobot_ros.planning.core.goal import end_effector_pose
 
 @dataclass(frozen=True)
 class Grapple:
-    """The goal to meet a target at any time: the end-effector then has the pose and the velocities
+    """The goal to meet a target at any time, with the end-effector at the pose and the velocities
     of the grapple frame.
 
     Attributes
@@ -32,7 +32,8 @@ class Grapple:
         Whether the total angular momentum of the robot and the target at the grasp must be zero or
         minimal.
     standoff
-        (3,) a position in the grapple frame from which the end-effector would approach straight, m.
+        (3,) position in the grapple frame, m, from which the end-effector would approach in a
+        straight line.
     """
 
     motion: TorqueFreeMotion
@@ -45,11 +46,11 @@ class Grapple:
 
 @dataclass(frozen=True)
 class ThrustGoal:
-    """Goal of a motion at rest.
+    """Goal of a motion that ends at rest.
 
-    ``base`` and ``end_effector`` are poses (7,), position and quaternion in W, the latter or None.
-    ``shape`` are joint positions (n,), NaN for joints that are free, None for all free.
-    ``keeps_shape``: joints that are not free keep the positions of the start all the way.
+    ``base`` and ``end_effector`` are poses (7,), position and quaternion in W; ``end_effector`` may
+    be None. ``shape`` contains joint positions (n,); NaN: a free joint; None: all joints are free.
+    ``keeps_shape``: joints that are not free keep their initial positions throughout.
     """
 
     base: Array

@@ -90,7 +90,7 @@ def base_poses(robot: SpaceRobot, states: Array) -> BasePoses:
 
 
 class ThrustMotion:
-    """A planned motion as flown by its controls, integrated from the start.
+    """A planned motion as it results from its controls, integrated from the start.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class ThrustMotion:
         for k in range(len(knots.levels)):
             states.append(self._through(k, states[-1][-1]))
         self._grid = np.vstack(states)
-        """States (N EXACT_STEPS + 1, 13 + 2 n) at equal distances in time."""
+        """States (N EXACT_STEPS + 1, 13 + 2 n) at equal time intervals."""
 
     @property
     def joints(self) -> int:
@@ -141,7 +141,7 @@ class ThrustMotion:
         return np.asarray(self._functions.interval(begin, controls, t).full().T)
 
     def defects(self) -> Array:
-        """Return the defects (N, 12) for which the knots would be an exact flight."""
+        """Return the defects (N, 12) with which the knots would be exact states of a flight."""
         states = self._knots.states
         ends = np.array([self._through(k, x)[-1] for k, x in enumerate(states[:-1])])
         # Knots obey the program with their own defects: what they miss is the rest.
@@ -179,8 +179,8 @@ class ThrustMotion:
         return state_parts(self._grid)[4], base_poses(self._functions.robot, self._grid)
 
     def joined_momentum(self, target: TorqueFreeMotion) -> Array:
-        """Return the angular momentum (3,) of the robot and a target, whose motion begins with this
-        one, about their centre of mass at its end, in W, N m s.
+        """Return the final angular momentum (3,) of the robot and a target about their common
+        centre of mass, in W, N m s; the target motion begins at the same time as this motion.
         """
         _, L, r, V, *_ = state_parts(self.final_state)
         at, mass = target.numbers(self.duration), self._functions.robot.total_mass
@@ -216,7 +216,7 @@ def _sample(robot: SpaceRobot, link: str) -> ca.Function:
         return robot.function(f"jacobian:{name}", compile=False)(q)
 
     def frame(name: str) -> ca.SX:
-        """Return the numbers of a link's frame."""
+        """Return a link frame as numbers."""
         i, z = robot.link_names.index(name), ca.SX.sym("z", 6 + n)
         moving = ca.substitute(ca.jtimes(jacobian(name) @ z, q, qdot), z, velocities)
         twist, rate = jacobian(name) @ velocities, jacobian(name) @ rates + moving

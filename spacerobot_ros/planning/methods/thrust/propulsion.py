@@ -1,4 +1,5 @@
-"""Base propulsion: a thruster table, or a wrench in any direction within two norms."""
+"""Base propulsion: a thruster table, or a wrench in any direction with bounded force and torque
+norms."""
 
 from __future__ import annotations
 
@@ -20,14 +21,14 @@ class Propulsion:
     Attributes
     ----------
     wrenches
-        (6, m) force (N) over torque (N m) at the base link origin, in base components, at level
+        (6, m) force (N), then torque (N m) at the base link origin, in base components, at level
         one.
     cost
         (m,) cost per second at level one: kg of propellant if there is a table, else N s of
         impulse.
     norms
-        Groups of levels with a Euclidean norm of at most one, which range from -1 to 1. All other
-        levels range from 0 to 1.
+        Groups of levels with a Euclidean norm of at most one; these levels range from -1 to 1. All
+        other levels range from 0 to 1.
     """
 
     wrenches: Array
@@ -77,8 +78,8 @@ class Propulsion:
         for name, value in (("force", force), ("torque", torque)):
             if not (value > 0 and math.isfinite(value)):
                 raise ParameterError(
-                    f"The thruster {name} limit is {value:g}; a motion under thrust is "
-                    f"planned within a finite limit: set max_{name}."
+                    f"The thruster {name} limit is {value:g}; motions under thrust require a "
+                    f"finite limit: set max_{name}."
                 )
         limits = (1.0 - reserve) * np.repeat([force, torque], 3)
         return cls(np.diag(limits), limits, ((0, 1, 2), (3, 4, 5)))
@@ -92,7 +93,7 @@ class Propulsion:
         return float(np.linalg.norm(one_way))
 
     def cost_of(self, levels: ca.MX | ca.DM, rounding: ca.MX | float = 0.0) -> ca.MX | ca.DM:
-        """Return the cost of levels (m, N) that each last for a second; norms are rounded off at a
+        """Return the cost of levels (m, N) that each last for a second; norms are smoothed at a
         level.
         """
         single = np.delete(np.arange(self.size), [i for group in self.norms for i in group])

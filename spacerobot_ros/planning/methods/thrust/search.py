@@ -1,11 +1,12 @@
-"""Motions under thrust to goals: a guess, the shortest time, the least propellant, and clearance.
+"""Search for motions under thrust to goals: a guess, then the shortest time, the least propellant,
+and clearance.
 
 The search is short, because the base and the arm can be pushed in every direction: in most cases, a
 straight guess leads to the solution. The problem is solved for the shortest time, then in a longer
 time for the
 least propellant, then again with the interval defects until it is exact. For pairs that come too
-close in the exact check, planes are added along a path clear of them, which is found by bending it
-away from obstacles.
+close in the exact check, planes are added along a clear path, found by bending a path away from
+obstacles.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ _ROUNDINGS = (0.1, 0.01, 0.003)
 steps."""
 
 _EXACT_END, _MAX_CORRECTIONS = 1e-5, 10
-"""Largest error at the end, m and rad, and largest number of corrections to reach it."""
+"""Largest error at the end, m and rad, and largest number of corrections to achieve it."""
 
 _NEAR_END = 1e-2
 """Final error below which the nearest exact motion is searched for, m and rad."""
@@ -91,7 +92,8 @@ _LARGEST_END_ERROR = 1e-3
 """Final error above which a motion is not a solution, m and rad."""
 
 _END_REACH = 0.3
-"""Distance of the joints at the end from the shape found by inverse kinematics, m or rad."""
+"""Largest distance of the final joint positions from the shape found by inverse kinematics, m or
+rad."""
 
 _COST_OF_LACK = 1e3
 """Weight of missing distance between pairs, per metre."""
@@ -108,7 +110,7 @@ _GRASP_REACH = 0.6
 and the arm stays clear of it."""
 
 _SHALLOW = 0.1
-"""Contact depth on a path above which it is not tried with planes, m."""
+"""Contact depth on a path above which the path is not tried with planes, m."""
 
 _SHARES_LEFT = (0.0, 0.25, 0.5)
 """Fractions of the angular momentum that may be left after a grasp."""
@@ -131,7 +133,8 @@ class ThrustOptions(MotionOptions):
 
     time_factor: float = parameter(
         1.5,
-        "duration of a least-propellant motion, relative to the shortest; 1: the shortest",
+        "duration of a least-propellant motion, relative to the shortest motion; 1: the shortest "
+        "motion",
         minimum=1.0,
         maximum=1e3,
     )
@@ -154,7 +157,7 @@ class ThrustOptions(MotionOptions):
     )
     clearance: float = parameter(
         DEFAULT_CLEARANCE,
-        "smallest distance between links and from obstacles; 0: contacts are ignored",
+        "smallest distance between links, and between links and obstacles; 0: contacts are ignored",
         unit="m",
         minimum=0.0,
         maximum=1e3,
@@ -169,7 +172,7 @@ class ThrustPlanner:
     robot
         The model, including its world, if any.
     propulsion
-        Base propulsion, minus the reserve.
+        Base propulsion, reduced by the reserve.
     options
         The options.
     link
@@ -255,7 +258,7 @@ class ThrustPlanner:
         return motion
 
     def solver(self, kind: EndKind, bodies: Bodies) -> ThrustSolver:
-        """Return the solver of a kind of goals, with the pairs that are kept apart."""
+        """Return the solver for a kind of goal, with the pairs that are kept apart."""
         kept = bodies.kept
         if (kind, kept) not in self._solvers:
             self._solvers[kind, kept] = ThrustSolver(
@@ -310,7 +313,7 @@ class ThrustPlanner:
         if least > grapple.horizon:
             raise UnreachableError(
                 f"The target is {distance:.3g} m away and recedes at {leaving:.3g} m/s: with a "
-                f"force of {force:.3g} N the robot meets it after {least:.4g} s at the earliest, "
+                f"force of {force:.3g} N, the robot meets it after {least:.4g} s at the earliest, "
                 f"and 'target.horizon' is {grapple.horizon:g} s.",
                 Proof.LIMITS,
             )
@@ -364,9 +367,9 @@ class ThrustPlanner:
                 )
 
     def guess(self, boundary: ThrustBoundary, base: Array, end: Array, bow: Array) -> ThrustKnots:
-        """Return a straight line and geodesic of the base to a pose (7,), straight ways of the
-        joints to a shape (n,), along a quintic at full thrust; half-way ``bow`` (3,), m, beside the
-        line.
+        """Return a guess at full thrust along a quintic: the base moves on a straight line and
+        geodesic to a pose (7,), and the joints move straight to a shape (n,). Half-way, the base is
+        displaced from the line by ``bow`` (3,), m.
         """
         robot, N = self.robot, self.options.intervals
         u = np.linspace(0.0, 1.0, N + 1)[:, np.newaxis]
@@ -472,7 +475,7 @@ class _Search:
         return guess.stretched(time / guess.duration) if guess.duration <= time else None
 
     def first_meeting(self) -> ThrustKnots:
-        """Return the guess to where a target is as soon as the robot can be there."""
+        """Return the guess that meets a target at the earliest time possible for the robot."""
         # There is one: distances grow with time, and what full thrust covers with its square.
         guesses = map(self._meeting, itertools.count(_MEETING_PERIOD, _MEETING_PERIOD))
         return next(guess for guess in guesses if guess is not None)
@@ -507,8 +510,8 @@ class _Search:
             raise self._failure("no motion to the goal was found")
         if 0 < options.duration < fastest.duration:
             raise UnreachableError(
-                f"The motion takes {fastest.duration:.4g} s at least, but plan.duration is "
-                f"{options.duration:g} s: set it to more, or to 0.",
+                f"The motion takes at least {fastest.duration:.4g} s, but plan.duration is "
+                f"{options.duration:g} s: increase it, or set it to 0.",
                 Proof.LIMITS,
             )
         self.is_timed = is_timed
@@ -528,7 +531,7 @@ class _Search:
         raise self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
 
     def run_near(self, other: _Search) -> ThrustMotion:
-        """Return the motion near that of another search, with its duration."""
+        """Return a motion near the path of another search, with the same duration."""
         self.is_timed, path = True, replace(other.path, multipliers=None)
         self.earliest = self.latest = path.duration
         path = self._solve(path, _NEAREST, center=path) or path
@@ -537,7 +540,7 @@ class _Search:
             motion = self._settled(cleared)
             if motion.effort_share(self.planner.effort_limit) <= 1.0:
                 return motion
-        raise self._failure("no motion near the other one was found")
+        raise self._failure("no motion near the other motion was found")
 
     def _motion(self, fastest: ThrustKnots, time: float) -> ThrustMotion:
         """Return the exact and clear motion near the fastest one, in a time if that is given; to a
@@ -644,8 +647,8 @@ class _Search:
             raise self._failure("no motion to the goal was found")
         if error > _LARGEST_END_ERROR:
             raise self._failure(
-                f"its plan ends {error:.3g} m or rad off the goal; set plan.intervals to more than "
-                f"{planner.options.intervals}"
+                f"its plan ends {error:.3g} m or rad from the goal; set plan.intervals to more "
+                f"than {planner.options.intervals}"
             )
         return best
 

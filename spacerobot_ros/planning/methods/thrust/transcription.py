@@ -1,20 +1,20 @@
 """Motions under thrust as a nonlinear program, by direct multiple shooting, solved by IPOPT.
 
-A knot is ``x = [X; L; r; V; s; v]``: to the attitude X, the vertices s and the velocities v of the
-joints' parabolas (:mod:`spacerobot_ros.planning.methods.optimal.transcription`) it adds the angular
+A knot is ``x = [X; L; r; V; s; v]``: the attitude X, the vertices s and the velocities v of the
+joints' parabolas (:mod:`spacerobot_ros.planning.methods.optimal.transcription`), and the angular
 momentum L about the centre of mass, its position r and its velocity V, in W. The controls of an
-interval are the joint accelerations a and the levels u of the propulsion, whose wrench
-``(f, n) = W u`` is constant in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass
-in the base at the Gauss points tau_i of an interval,
+interval are the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W
+u`` is constant in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass in the base
+at the Gauss points tau_i of an interval,
 
 ``V+ = V + h/m sum R_i f / 2``, ``r+ = r + h V + h^2/m sum (1 - tau_i) R_i f / 2``,
 ``L+ = L + h sum R_i (n - c_i x f) / 2``, ``X+ = X exp(Omega)``,
 
 and Omega is the Magnus expansion of the rates at the Gauss points, ``D w + D_q u = h R_i' L_i``.
-With the momenta as states, conservation is exact: without thrust, both are constant for any joint
-motion. Every interval has a defect parameter that is added to its end: the precomputed
-difference from an exact integration of the same controls, so that solutions obey the equations
-themselves, not their discretisation (deferred correction).
+With the momenta as states, conservation is exact: without thrust, both momenta are constant for any
+joint motion. Every interval has a defect parameter that is added to its end: the precomputed
+difference from an exact integration of the same controls. So solutions satisfy the exact equations,
+not just their discretisation (deferred correction).
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ INSTANTS = 2
 """Instants in an interval at which pairs are kept apart."""
 
 KeptPlaces = tuple[tuple[int, tuple[int, ...]], ...]
-"""Pairs that are kept apart, and the places where they are, among all K instants of the N
-intervals, from 0 to N K - 1.
+"""Pairs that are kept apart, and their places among all K instants of the N intervals, from 0 to N
+K - 1.
 """
 
 
@@ -120,7 +120,7 @@ def state_parts(states: Array) -> list[Array]:
 
 
 def with_joints_moved(states: Array, time: float) -> Array:
-    """Return states whose joints are where they would be in a time at their velocities."""
+    """Return states whose joints have moved at their velocities for a given time, s."""
     moved = states.copy()
     *_, q, qdot = state_parts(moved)
     q += time * qdot
@@ -133,9 +133,9 @@ class ThrustKnots:
 
     ``states`` (N + 1, 13 + 2 n) are ``[X; L; r; V; q; qdot]``: the quaternion of R_WB, the angular
     momentum about the centre of mass, N m s, its position and velocity, all in W, and positions and
-    velocities of the joints. ``accelerations`` (N, n) are those of the joints, ``levels`` (N, m)
-    those of the propulsion. A solution has the multipliers of its variables and of its rows.
-    ``defects`` (N, 12) are those of the intervals; None: zero.
+    velocities of the joints. ``accelerations`` (N, n) are joint accelerations, ``levels`` (N, m)
+    propulsion levels. A solution has the multipliers of its variables and of its rows. ``defects``
+    (N, 12) are the interval defects; None: zero.
     """
 
     step: float
@@ -170,10 +170,10 @@ class ThrustBoundary:
     start
         (13 + 2 n,) state at the start (:class:`ThrustKnots`).
     goals
-        Values given at the end (:class:`.EndKind`).
+        Values prescribed at the end of the motion (:class:`.EndKind`).
     bounds
-        (2, N + 1, 13 + 2 n) least and largest states at the knots, with the vertices of the joints'
-        parabolas in place of their positions.
+        (2, N + 1, 13 + 2 n) smallest and largest states at the knots, with the vertices of the
+        joints' parabolas in place of their positions.
     """
 
     start: Array
@@ -184,9 +184,9 @@ class ThrustBoundary:
 class Weights(NamedTuple):
     """Weights of the terms in the objective.
 
-    They weight the duration (1/s), the propulsion cost, the squares of joint accelerations over
-    their limits and of levels, and the missing distance of pairs (1/m); the last value is the level
-    at which the cost of a norm is smoothed.
+    The weights apply to the duration (1/s), the propulsion cost, the squares of joint accelerations
+    over their limits and of levels, and the missing distance of pairs (1/m); the last value is the
+    level at which the cost of a norm is smoothed.
     """
 
     duration: float
@@ -198,9 +198,9 @@ class Weights(NamedTuple):
 
 
 class EndKind(NamedTuple):
-    """Quantities given at the end: the pose of the base, and that of a link (empty: none), or that
-    the link has the pose and the velocities of a target's grapple frame; then the angular momentum
-    of robot and target together may be given, too.
+    """Quantities prescribed at the end of a motion: the base pose and a link pose (empty: none);
+    or, with a target, the pose and the velocities of its grapple frame for the link, and optionally
+    the total angular momentum of the robot and the target.
     """
 
     link: str = ""
@@ -216,13 +216,13 @@ class EndKind(NamedTuple):
 
 
 Stages = tuple[ConstraintBlock, ConstraintBlock, ConstraintBlock]
-"""Rows of the first knot, of two neighbouring knots, and of the last one."""
+"""Rows of the first knot, of two neighbouring knots, and of the last knot."""
 
 
 def thrust_stages(robot: SpaceRobot, levels: int, kind: EndKind) -> Stages:
     """Derive the functions of a robot's problem, or read them from the cache.
 
-    The wrenches of the levels are parameters, so the functions stay the same if thrusters break.
+    The wrenches of the levels are parameters, so the functions stay the same if thrusters fail.
     """
     facts = [
         source_hash(
@@ -242,7 +242,7 @@ def thrust_stages(robot: SpaceRobot, levels: int, kind: EndKind) -> Stages:
 
 
 def state_symbols(n: int) -> tuple[ca.SX, list[ca.SX]]:
-    """Return a knot, and ``X, L, r, V, s, v`` of it."""
+    """Return a knot, and its components ``X, L, r, V, s, v``."""
     x = ca.SX.sym("x", 13 + 2 * n)
     return x, ca.vertsplit(x, [0, 4, 7, 10, 13, 13 + n, 13 + 2 * n])
 
@@ -332,8 +332,8 @@ def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
     """Return the distance of a pair from a plane at an instant in an interval, plus the lack.
 
     ``distance`` is :func:`.support_distance`. The variables are ``[h; x; x+; lack]``, the
-    parameters the plane and a point, in W if one of the pair is an obstacle, and the instant from 0
-    to 1.
+    parameters the plane and a point, in W if one body of the pair is an obstacle, and the instant
+    from 0 to 1.
     """
     h, lack, p = ca.SX.sym("h"), ca.SX.sym("lack"), ca.SX.sym("p", PLANE_SIZE + 1)
     x, (X, _, r, V, s, v) = state_symbols(joints)
@@ -433,7 +433,7 @@ class ThrustSolver:
     Parameters
     ----------
     stages, propulsion, intervals
-        The functions of the problem, what pushes the base, and the number of intervals N.
+        The functions of the problem, the base propulsion, and the number of intervals N.
     acceleration
         (n,) largest accelerations of the joints.
     pairs
