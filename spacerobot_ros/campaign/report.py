@@ -99,7 +99,7 @@ def _picture_part(drawn: Figure, name: str, caption: str) -> str:
 
 
 def _figure_with_axes(count: int, across: int, height: float = 2.2) -> tuple[Figure, list[Any]]:
-    """Return a figure and its axes, ``across`` per row."""
+    """Return a figure and its axes, with ``across`` axes per row."""
     rows = -(-count // across)
     figure = Figure(figsize=(9.6, height * rows + 0.2), layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
@@ -306,7 +306,7 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
         panel.set_xlabel(each.cause)
         panel.set_ylabel(metric_label(each.metric))
         panel.locator_params(axis="x", nbins=5)
-    caption = "The strongest correlations; orange: flights that did not pass."
+    caption = "The strongest correlations. Flights that did not pass are orange."
     return _picture_part(figure, "scatter", caption)
 
 
@@ -331,7 +331,10 @@ def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> st
         panel.set_xlabel(name)
         panel.set_ylabel("success")
         panel.tick_params(axis="x", labelsize=7)
-    caption = "Success over drawn values, in bins with about equal flight counts; 95 % intervals."
+    caption = (
+        "Success rate over the drawn values, in bins with approximately equal numbers of flights; "
+        "95 % intervals."
+    )
     return _picture_part(figure, "success", caption)
 
 
@@ -429,7 +432,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
             getattr(ours_is, key) == getattr(theirs_is, key) for key in ("distribution", "weights")
         )
         if not same:
-            raise ParameterError(f"{sentence}'disperse' has {a} and {b} at the same place.")
+            raise ParameterError(f"{sentence}'disperse' has {a} and {b} in the same position.")
 
 
 def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
@@ -450,8 +453,8 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     rows_b = np.searchsorted(second.flight_numbers, common)
     if not common.size:
         raise ParameterError(
-            f"'{first.campaign.name}' and '{second.campaign.name}' share no flown draws: fly more "
-            "flights of one of them."
+            f"'{first.campaign.name}' and '{second.campaign.name}' have no flown draws in common: "
+            "fly more flights of one of them."
         )
     # Metrics required by one campaign only are compared too, if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
@@ -518,8 +521,8 @@ def _notes_on_failures(first: Results, second: Results) -> list[str]:
 
 def _notes_on_control(first: Results, second: Results) -> list[str]:
     return [
-        f"{each.campaign.name} does not control the {' and '.join(parts)}: the error is ignored "
-        "unless a criterion names it."
+        f"{each.campaign.name} does not control the {' and '.join(parts)}: this error is ignored "
+        "unless it is named in a criterion."
         for each in (first, second)
         if (parts := each.not_controlled)
     ]

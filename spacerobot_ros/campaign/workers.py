@@ -173,7 +173,7 @@ class LocalWorkers:
                 return self._pool.submit(fly_task, *arguments)
 
     def ended(self, tasks: list[_Task]) -> list[_Task]:
-        """Return the finished tasks, or an empty list if none finishes for a while."""
+        """Return the finished tasks, or an empty list if no task finishes for some time."""
         return list(wait(tasks, _POLL_PERIOD, FIRST_COMPLETED).done)
 
     def result(self, task: _Task) -> list[Row | Fallback]:

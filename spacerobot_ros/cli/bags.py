@@ -240,7 +240,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     default=1e-9,
     show_default=True,
     type=click.FloatRange(min=0.0),
-    help="Largest deviation considered equal (SI units; relative above 1).",
+    help="Largest deviation treated as agreement (SI units; relative for values above 1).",
 )
 @click.option(
     "--engine",

@@ -296,7 +296,7 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     default=1.0,
     show_default=True,
     type=click.FloatRange(min=0.0, min_open=True),
-    help="Simulated time per wall time.",
+    help="Speed: ratio of simulated time to wall time.",
 )
 @click.option(
     "--nodes",

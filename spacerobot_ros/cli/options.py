@@ -261,7 +261,7 @@ def end_effector_goals(
     Raises
     ------
     click.UsageError
-        The numbers of names and goals differ.
+        The number of names differs from the number of goals.
     GoalError
         A goal is not a position, pose or path, or a link has two goals.
     """

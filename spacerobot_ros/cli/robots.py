@@ -106,7 +106,9 @@ def analysis_lines(found: Analysis) -> list[str]:
     robot = found.robot
     base = robot.description.bodies[0].inertia.mass
     n, name = robot.n, robot.description.name
-    lines = [f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which the base {base:.6g} kg"]
+    lines = [
+        f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which {base:.6g} kg for the base"
+    ]
     lines += [*_joint_rows(robot), "", *_rotation_lines(found)]
     lines += [f"{'position':<13}{_position_text(found)}", ""]
     for method, objection in found.objections.items():

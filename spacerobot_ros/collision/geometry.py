@@ -71,7 +71,7 @@ class ObstaclePair(LinkPair):
 
     @property
     def subject(self) -> str:
-        """Both names, as the lower-case subject of a sentence."""
+        """Both names, worded as the subject of a sentence, in lower case."""
         return f"link '{self.first}' and obstacle '{self.second}'"
 
 

@@ -23,10 +23,10 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import nonnegative, parameter
 
 _REST_RATE = 2.0
-"""Decay rate of joint rates and momenta as a robot is brought to rest, 1/s."""
+"""Decay rate of joint rates and momenta while a robot is brought to rest, 1/s."""
 
 _REST_RATE_PER_PERIOD = 0.5
-"""Largest product of that decay rate and the control period."""
+"""Largest product of this decay rate and the control period."""
 
 
 @dataclass(frozen=True)

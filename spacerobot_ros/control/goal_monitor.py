@@ -189,23 +189,22 @@ _LAG_SHARE = 0.5
 """Largest lag of an unimpeded robot behind its reference, as a fraction of the distance."""
 
 _LEAST_SMALLEST_TOLERANCE = 1e-9
-"""Tolerance (m, rad) used in place of zero."""
+"""Tolerance (m, rad) used if the given tolerance is zero."""
 
 _STOP_SHARE = 0.005
-"""Distance, as a fraction of its range, at which a joint is considered to be at its stop."""
+"""Distance, as a fraction of the joint range, at which a joint is considered to be at its stop."""
 
 _SINGULAR_SHARE = 0.7
 """Fraction of the error in singular directions above which a singularity is taken as the cause."""
 
 
 class StallMonitor:
-    """Compares the largest error, as a fraction of its tolerance, between successive time windows.
+    """Compares the largest ratio of an error to its tolerance between successive time windows.
 
     A window is the time in which the slowest error of the closed loop decays to a third
-    (:meth:`.ControlLaw.slowest_decay`), clamped to 2 to 10 s; 5 s while commands are limited. The
-    robot
-    is stalled if the largest error shrinks from one window to the next by less than 2 % and by less
-    than before:
+    (:meth:`.ControlLaw.slowest_decay`), at least 2 s and at most 10 s; while commands are limited,
+    it is 5 s. The robot is stalled if the largest error shrinks from one window to the next by less
+    than 2 % and by less than before:
 
     * after the reference has come to rest, and while an error is beyond its tolerance;
     * while the reference moves, if the robot lags behind by more than half the distance and more
@@ -220,16 +219,18 @@ class StallMonitor:
         self.restart()
 
     def restart(self) -> None:
-        """Restart, at a new goal or after a jump in time or position."""
+        """Restart the monitor, at a new goal or after a jump in time or position."""
         self.cause = ""
         self._ends = self._next_sample = -math.inf
         self._window = 0.0
         self._at_rest = False
         """Whether the reference was at rest when the current window began."""
         self._largest: list[float] = []
-        """Largest fractions in the current and earlier windows, the latest first."""
+        """Largest ratios of an error to its tolerance in the current and earlier windows, the
+        latest first."""
         self._share = self._lag = 0.0
-        """Largest fraction, and lag behind the reference, in the last state."""
+        """Largest ratio of an error to its tolerance, and lag behind the reference, in the last
+        state."""
         self._samples = self._limited = 0
 
     def observe(

@@ -426,7 +426,7 @@ def decided_message(
 
 @dataclass(frozen=True)
 class PlannedGoals:
-    """Pending goals, their poses and joints, the requested parts of the base pose, and the job that
+    """Pending goals, their poses and joints, the requested base pose components, and the job that
     plans their reference.
     """
 
@@ -473,8 +473,8 @@ class GoalPlanning:
         pending: Mapping[str, IdentifiedGoal],
         aims: Callable[[], tuple[Aims, frozenset[Controlled]]],
     ) -> PlannedGoals | None:
-        """Return pending goals with their planned reference; None while it is being planned, and
-        before it begins.
+        """Return pending goals with their planned reference; None while the reference is being
+        planned, and before planning begins.
 
         ``aims`` returns the goal poses and joints, and the requested components.
 
@@ -542,7 +542,7 @@ class GoalPlanning:
             plan.job.cancel()
 
     def drop(self) -> None:
-        """Cancel the job and drop its result."""
+        """Cancel the job and discard its result."""
         self.cancel()
         self._plan = None
 

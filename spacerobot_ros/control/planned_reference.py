@@ -115,7 +115,7 @@ class PlannedReference(ReferenceProfile):
 
     @property
     def propellant(self) -> float | None:
-        """Propellant required by the plan, kg; None without a thruster table."""
+        """Propellant required by the plan, kg; None if there is no thruster table."""
         return sum(leg.spent for leg in self._legs) if self.uses_table else None
 
     def at(self, time: float) -> Reference:

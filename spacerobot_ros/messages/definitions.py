@@ -252,7 +252,7 @@ class MessageType:
         self._store = get_typestore(Stores.EMPTY)
         try:
             if not _TYPE_NAME.fullmatch(type_name):
-                raise ValueError("a type is named 'package/msg/Type'")
+                raise ValueError("a type name must have the form 'package/msg/Type'")
             self._store.register(_parsed(text.decode(), type_name))
             self._definition = self._store.get_msgdef(type_name)
         # The parser raises any kind of error, depending on the text.

@@ -82,7 +82,8 @@ class Layout:
     fields
         Definitions of the type and of all nested types; by default, those of the installed types.
     elements
-        Whether fields inside lists get paths, such as ``markers[2].pose.position.x``.
+        Whether to include the fields inside lists, with paths such as
+        ``markers[2].pose.position.x``.
 
     Attributes
     ----------
@@ -106,7 +107,7 @@ class Layout:
     Raises
     ------
     IndexError
-        The message ends before its fields.
+        The message ends before its last field.
     """
 
     def __init__(

@@ -51,7 +51,8 @@ class InertialParameters:
     centers
         (..., B, 3) centres of mass in the body frames (the frames of their first links), m.
     inertias
-        (..., B, 3, 3) about the centres of mass, along the axes of the body frames, kg m^2.
+        (..., B, 3, 3) inertias about the centres of mass, along the axes of the body frames, kg
+        m^2.
     """
 
     masses: Array

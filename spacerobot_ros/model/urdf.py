@@ -218,9 +218,9 @@ def parse_robot(text: str) -> RobotDescription:
     if description.bodies[0].inertia.mass <= 0:
         raise RobotDescriptionError(
             f"The base link '{description.base_link}' has no mass; a free-floating base needs an "
-            "<inertial> with mass and inertia. Give it those of the spacecraft that carries the "
-            'robot, for instance <inertial><mass value="100"/><inertia ixx="10" iyy="10" '
-            'izz="10" ixy="0" ixz="0" iyz="0"/></inertial>.'
+            "<inertial> with mass and inertia. Give it the mass and inertia of the spacecraft "
+            'that carries the robot, for instance <inertial><mass value="100"/><inertia ixx="10" '
+            'iyy="10" izz="10" ixy="0" ixz="0" iyz="0"/></inertial>.'
         )
     require_reaction_wheels(description)
     return description

@@ -229,9 +229,10 @@ _OUTCOMES = {
 
 
 class TrajectoryClients:
-    """A planner node's FollowJointTrajectory clients; they exist as long as the node.
+    """The FollowJointTrajectory clients of a planner node, which exist as long as the node.
 
-    If a node cleanup destroyed them, an executor might still hold a response for one of them.
+    If a node cleanup destroyed the clients, an executor might still hold a response for one of
+    them.
 
     Raises
     ------
@@ -243,14 +244,15 @@ class TrajectoryClients:
         kind = action_class("control_msgs", "FollowJointTrajectory")
         if kind is None:
             raise ParameterError(
-                "Parameter 'output' is 'trajectory', which needs the package control_msgs: install "
+                "Parameter 'output' is 'trajectory', which requires the package control_msgs: "
+                "install "
                 "it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
             )
         self._kind, self._node = kind, node
         self._clients: dict[str, ActionClient] = {}
 
     def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
-        """Return an output to an action server; it calls `on_end` when a schedule ends."""
+        """Return an output to an action server; the output calls `on_end` when a schedule ends."""
         if name not in self._clients:
             self._clients[name] = ActionClient(self._node, self._kind, name)
         connection = _Connection(self._kind, self._clients[name])
@@ -312,9 +314,9 @@ class _Connection:
 
 
 def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
-    """Return a schedule as a trajectory that begins when it arrives.
+    """Return a schedule as a trajectory that begins on arrival.
 
-    Its points have only positions, so that controllers interpolate linearly. This reproduces the
+    The points have only positions, so that controllers interpolate linearly. This reproduces the
     schedule, whose velocities are constant over a tick.
     """
     message = deserialize_message(trajectory_message(schedule, 0, ""), JointTrajectory)

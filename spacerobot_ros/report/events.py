@@ -142,7 +142,8 @@ def shown_events(events: Iterable[Event]) -> list[tuple[float, Event]]:
 
 
 def draw_events(axes: Axes, events: Sequence[tuple[float, Event]]) -> None:
-    """Draw a strip below a time axis with the events in its span, and a legend of their marks."""
+    """Draw a strip below a time axis, with the events in the time span of the axis and a legend of
+    the event marks."""
     start, end = axes.get_xlim()
     shown = [(time, each) for time, each in events if start <= time <= end][:_MAX_MARKS]
     figure = axes.figure

@@ -422,8 +422,8 @@ def set_time(axes: Axes, start: float, end: float) -> None:
 
 
 def end_labels(axes: Axes, labels: Sequence[tuple[float, str, str]]) -> None:
-    """Write the labels (value, text, colour) to the right of the axes at their values, without
-    overlaps."""
+    """Write the labels (value, text, colour) to the right of the axes, at the heights of the values
+    and without overlaps."""
     ordered = sorted(labels)
     to_axes = axes.transData - axes.transAxes
     wanted = np.clip([to_axes.transform((0.0, value))[1] for value, _, _ in ordered], 0.0, 1.0)
@@ -576,7 +576,8 @@ class ReportFigure:
     figure
         The picture.
     groups
-        The traces of its panels over the whole flight; none if the figure is not over time.
+        The traces of its panels over the whole flight; none if the figure does not show values over
+        time.
     """
 
     name: str

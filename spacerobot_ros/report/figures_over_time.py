@@ -67,8 +67,8 @@ _EVENTS_CAPTION = (
 
 
 def draw_group(axes: Axes, group: TraceGroup, end: float, later: Sequence[float] = ()) -> None:
-    """Draw traces from zero to an end time, s, and marks at the start times of ``later`` schedules,
-    s.
+    """Draw traces from zero to an end time, s, and marks at the start times ``later`` of further
+    schedules, s.
     """
     set_time(axes, 0.0, max([end, *(float(each.time[-1]) for each in group.signals)]))
     if group.rows:
@@ -341,7 +341,7 @@ def position_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def pose_figure(flight: FlightReport) -> ReportFigure | str:
-    """Base position above base attitude, and goals."""
+    """Base position (top), base attitude (bottom), and goals."""
     if not len(flight.time):
         return NO_POSES_TEXT
     caption = "Base link position in the world frame, and base attitude as a rotation vector"
@@ -363,7 +363,7 @@ def attitude_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def shape_figure(flight: FlightReport) -> ReportFigure | str:
-    """Joint positions, with URDF limits that are in range."""
+    """Joint positions, with the URDF limits that lie within the axis range."""
     if not len(flight.q) or not flight.joint_names:
         return _why_no_joints(flight)
     caption = "Joint positions" + (", and wheel rates" if flight.wheel_columns else "")

@@ -217,8 +217,7 @@ _FLIGHT_COLOURS = (BASE_COLOUR, PALETTE[1], *PALETTE[5:])
 
 
 def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> ReportFigure | str:
-    """The base path in three views, together with the paths of the end-effector and of other
-    flights."""
+    """The base path in three views, with the end-effector path and the paths of other flights."""
     if not len(flight.time):
         return NO_POSES_TEXT
     if len(flight.time) < 2 and not beside:

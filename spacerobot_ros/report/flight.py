@@ -385,7 +385,7 @@ class FlightReport(Flight):
         return f" {count} are not drawn. The bag does not contain them."
 
     def samples(self, count: int) -> list[int]:
-        """Recorded states at about equal intervals, including the first and the last."""
+        """Recorded states at approximately equal intervals, including the first and the last."""
         last = len(self.time) - 1
         return np.unique(np.linspace(0, last, count).astype(int)).tolist()
 

@@ -219,7 +219,7 @@ class PlantWithFaults(WrappedPlant):
         self.injected: tuple[Fault | Disturbance, ...] = ()
         """Active faults and disturbances; a new tuple object after every change."""
         self.loads: PlantLoads | None = None
-        """External loads; None: there have been none so far."""
+        """External loads; None if no load has acted so far."""
         self._disturbances = Timeline(
             disturbances, lambda line, now: parse_disturbance(line, plant.robot.link_names, now)
         )

@@ -147,7 +147,7 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
 
 
 def command_of(control: BatchController, tick: int, state: ControlState) -> list[Array]:
-    """Return the efforts and wrench for a state of the last started flight."""
+    """Return the efforts and the wrench for a state of the last started flight."""
     time = control.time_of_tick(tick)
     realised = control.controller.command(time, state, state.q, state.qdot).realised
     return [realised.tau, realised.wrench_B]

@@ -186,8 +186,8 @@ class Goal:
         components may be requested, or none of them; the motion determines the components that are
         not requested.
     asked
-        Base pose components given explicitly by the sender. Other components are
-        kept from the start (:meth:`kept_at`), and are not required for the goal to be reached.
+        Base pose components that the sender has specified explicitly. Other components keep their
+        values at the start (:meth:`kept_at`), and the goal can be reached without them.
     waypoints
         Base poses (K, 7) before the goal, at each of which the robot comes to rest; None: none.
     """

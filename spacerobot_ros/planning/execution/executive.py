@@ -719,7 +719,9 @@ class Executive:
             self._in_motion_attempts += 1
             last = self._in_motion_attempts == _MAX_IN_MOTION_ATTEMPTS
             again = "from rest" if last else "from a later tick"
-            message = f"No plan begins in motion, so the goal is planned for {again}: {why}"
+            message = (
+                f"No plan that begins in motion was found, so planning is repeated {again}: {why}"
+            )
             self._add_notice("warning", message)
         elif reason is PlanReason.SHRINKING_HORIZON:
             message = f"The remaining motion is not planned again: {why}"
@@ -808,8 +810,8 @@ class Executive:
         before, now = self._stamp_ns / SECOND, stamp_ns / SECOND
         self._add_notice(
             "warning",
-            f"The state time has jumped from {before:.9g} s to {now:.9g} s, for which no "
-            "motion is planned.",
+            f"The state time has jumped from {before:.9g} s to {now:.9g} s; no motion is planned "
+            f"for that time.",
         )
 
     def _handle_stuck_joints(self, active: ActiveGoal, stuck: Sequence[int]) -> None:

@@ -99,7 +99,8 @@ class StateAverage:
         self._shapes.append(q.copy())
 
     def take(self, measured: MeasuredState, *, alone: bool = False) -> bool:
-        """Add a state if its base was measured, or let it stand ``alone``; return whether."""
+        """Add a state if its base was measured, as the only state if ``alone``, otherwise to the
+        other states; return whether it was added."""
         base = measured.base
         if base is None:
             return False

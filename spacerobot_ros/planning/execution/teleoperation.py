@@ -55,7 +55,7 @@ _ROUNDING = 1e-12
 
 
 TwistFrame = Literal["world", "base", "link"]
-"""Frame of the components of a twist."""
+"""Frame in which the components of a twist are given."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,8 @@ class TwistCommand:
         return cls(link, np.asarray(linear, float), np.asarray(angular, float), found)
 
     def in_base(self, R_WB: Array, R_BE: Array) -> tuple[Array, Array]:
-        """Return both velocities (3,) in base components."""
+        """Return the velocity and the angular velocity of a twist, (3,) each, in base
+        components."""
         R = {"world": R_WB.T, "base": np.eye(3), "link": R_BE}[self.frame]
         return R @ self.linear, R @ self.angular
 

@@ -73,7 +73,7 @@ class ScheduleFollower:
     shape_gain
         Feedback gain from shape error to velocity, 1/s.
     deadband
-        Shape errors up to this value are noise and not fed back, m or rad.
+        Shape errors up to this value are treated as noise and not fed back, m or rad.
     brakes
         Whether the schedule is a :func:`braking_schedule`, whose end does not wait for the joints.
     """
@@ -120,7 +120,7 @@ class ScheduleFollower:
         return stamp_ns - self._end_ns > self._settling_ns
 
     def covers(self, stamp_ns: int) -> bool:
-        """Whether the schedule, or the settling time after it, covers a given time."""
+        """Whether a given time is within the schedule or the settling time after it."""
         return self.start_ns <= stamp_ns <= self._end_ns + self._settling_ns
 
     def braking(self, stamp_ns: int, duration: float) -> ScheduleFollower:
@@ -251,7 +251,7 @@ class TrajectoryTracker:
 
     @property
     def is_braking(self) -> bool:
-        """Whether the joints brake along a schedule."""
+        """Whether the joints are braking along the path of a schedule."""
         return self._follower is not None and self._follower.brakes
 
     def start(self, schedule: GaitSchedule, stamp_ns: int, average: int = 0) -> None:

@@ -248,8 +248,8 @@ class PlanningWorker:
             self._job.start(in_background=self.plans_in_background)
 
     def poll(self, stamp_ns: int) -> Planned | Refused | None:
-        """Return the result at the state with this stamp; None until the plan has ended, or if it
-        was cancelled.
+        """Return the result of planning when the state with this stamp is processed; None until the
+        plan has ended, or if it was cancelled.
 
         Unexpected method errors are raised here.
         """

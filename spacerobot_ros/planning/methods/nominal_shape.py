@@ -182,8 +182,8 @@ class NominalShapeChooser:
         return chosen
 
     def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
-        """Return the nominal shape with unlimited joints moved by whole revolutions close to
-        ``q``."""
+        """Return the nominal shape with unlimited joints moved close to ``q`` by whole
+        revolutions."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
@@ -222,10 +222,10 @@ class NominalShapeChooser:
     def with_clearance(
         self, held: Array, share: float, is_clear: ClearanceTest
     ) -> NominalShape | None:
-        """Return the best nominal shape on a grid around which links keep the clearance, or None.
+        """Return the best nominal shape on a grid at which links keep the clearance, or None.
 
-        They keep it in a box with a fraction of the longest edges, which bounds the loop edges.
-        Other joints are as in ``held`` (n,).
+        Links keep the clearance in a box around the shape. The box edges are a fraction of the
+        longest edges, and bound the loop edges. Other joints are as in ``held`` (n,).
         """
         ranked: list[tuple[float, NominalShape]] = []
         for triple in self._best_triples():

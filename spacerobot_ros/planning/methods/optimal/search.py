@@ -237,7 +237,7 @@ class SearchProblem:
     options
         The options of this search.
     clock, cancellation
-        The wall time of the plan, and whether it is cancelled.
+        The wall time of the plan, and its cancellation.
     max_failed_starts
         Number of guesses without any solution after which the search ends.
     """
@@ -356,7 +356,7 @@ class ManoeuvreSearch:
             raise NotFoundError(
                 f"No manoeuvre to the goal{in_motion} was found from {search.starts} start(s)"
                 f"{within}: {search.rejection}. {longer} optimal.starts, optimal.iterations or "
-                f"optimal.intervals, a longer optimal.{limit}, or a smaller goal may help."
+                f"optimal.intervals, a longer optimal.{limit}, or a closer goal may help."
             )
         return replace(found, starts=search.starts, cut_short=cut_short)
 
@@ -854,7 +854,7 @@ class _Search:
             self._report("begun")
 
     def _report(self, result: str, duration: float = math.inf) -> None:
-        """Report a result; ``duration``, s, is that of a path that may be the best."""
+        """Report a result; ``duration`` is the duration, s, of a path that may be the best."""
         self._best = min(self._best, duration)
         self._reported = elapsed = self._problem.clock.elapsed
         most = self._problem.options.starts
