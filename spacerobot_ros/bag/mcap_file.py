@@ -89,6 +89,8 @@ class QosProfile:
         from rosbags.rosbag2.metadata import parse_qos
 
         try:
+            if len(text) > _MAX_YAML_CHARACTERS:
+                raise ValueError("it is too long")
             entries = [cls().to_dict() | entry for entry in load_yaml(text) or []]
             return [cls(**_profile_arguments(profile)) for profile in parse_qos(entries)]
         except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
@@ -126,6 +128,8 @@ def _profile_arguments(profile: Qos) -> dict[str, Any]:
 LATCHED = QosProfile(depth=1, durability="transient_local")
 """Reliable, transient local, depth 1: late subscribers receive the last message."""
 
+
+_MAX_YAML_CHARACTERS = 65_536
 
 _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 

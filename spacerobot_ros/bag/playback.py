@@ -16,6 +16,9 @@ from spacerobot_ros.times import SECOND
 _LATEST_TIME_NS = 2**63 - 1
 _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
 
+_MAX_REPLAYED_TOPICS = 1000
+"""Largest number of replayed topics: each requires a publisher, memory and discovery."""
+
 
 @dataclass(frozen=True)
 class ReplayTopic:
@@ -182,6 +185,11 @@ class Playback:
     ) -> None:
         if not bag.message_count():
             raise RecordingError(f"The bag {bag.path} has no messages to replay.")
+        if len(topics or bag.topics) > _MAX_REPLAYED_TOPICS:
+            raise RecordingError(
+                f"The bag {bag.path} has {len(bag.topics)} topics, but only "
+                f"{_MAX_REPLAYED_TOPICS} can be replayed at once: name the topics to replay."
+            )
         self._bag = bag
         self._loop = loop
         self._start_ns = min(bag.start_time_ns + round(start * SECOND), _LATEST_TIME_NS)

@@ -45,6 +45,10 @@ Array = NDArray[np.float64]
 
 _STRING_TYPE = "std_msgs/msg/String"
 
+_MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO = 16_000_000, 50
+"""Largest topic to decode, in bytes or relative to the file size.
+Decoded objects need ten times as much."""
+
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
     """Open a bag for reading; initially, only its summary is read.
@@ -144,6 +148,8 @@ class Bag(Mapping[str, TopicSeries]):
     def __init__(self, path: Path, files: Sequence[Path] | None = None) -> None:
         self.path = path
         self._files = [BagFile(file) for file in files or [path]]
+        size = sum(file.size for file in self._files)
+        self._max_decoded_bytes = max(_MAX_DECODED_BYTES, _MAX_DECODED_TO_FILE_RATIO * size)
         self._series_by_topic: dict[str, TopicSeries] = {}
         self._prismatic_by_namespace: dict[str, dict[str, bool]] = {}
 
@@ -470,6 +476,7 @@ class Bag(Mapping[str, TopicSeries]):
                 np.concatenate(times[number]).astype(np.int64),
                 data[number],
                 kind,
+                self._max_decoded_bytes,
             )
 
 

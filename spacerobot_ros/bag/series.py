@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -21,6 +22,8 @@ from spacerobot_ros.times import SECOND
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 _BY_JOINT = ("name", "position", "velocity", "effort")
+_MAX_JOINTS = 50
+"""Largest number of joint names on a topic, relative to the size of its longest message."""
 
 _HEADER = (Nodetype.NAME, "std_msgs/msg/Header")
 
@@ -47,6 +50,7 @@ class TopicSeries:
         time_ns: NDArray[np.int64],
         data: Sequence[bytes],
         kind: MessageType,
+        max_decoded_bytes: float = math.inf,
     ) -> None:
         self.topic = topic
         self.type_name = type_name
@@ -55,6 +59,7 @@ class TopicSeries:
         self.time_ns.flags.writeable = False
         self.data = data
         self._kind, self._fields = kind, kind.fields
+        self._max_decoded_bytes = max_decoded_bytes
 
     def __len__(self) -> int:
         return len(self.data)
@@ -168,7 +173,7 @@ class TopicSeries:
             named = [message.name for message in self._messages]
         joints = list(dict.fromkeys(name for names in named for name in names))
         repeated = any(len(set(names)) < len(names) for names in named)
-        return [] if repeated else joints
+        return [] if repeated or len(joints) > _MAX_JOINTS * max(map(len, named)) else joints
 
     @cached_property
     def _names_are_constant(self) -> bool:
@@ -239,16 +244,27 @@ class TopicSeries:
         RecordingError
             A message is damaged.
         """
+        self._require_decodable()
         for time_ns, data in zip(self.time_ns.tolist(), self.data, strict=True):
             yield time_ns, self._decode_message(data)
 
     @cached_property
     def _messages(self) -> list[Any]:
+        self._require_decodable()
         return [self._decode_message(data) for data in self.data]
 
     @cached_property
     def _columns(self) -> Columns | None:
         return read_columns(self.data, self.type_name, self._fields)
+
+    def _require_decodable(self) -> None:
+        """Refuse to decode a topic that is much larger than the bag's file."""
+        size = sum(map(len, self.data))
+        if size > self._max_decoded_bytes:
+            raise RecordingError(
+                f"The messages on {self.topic} total {size} bytes; the limit "
+                f"for a bag of this size is {self._max_decoded_bytes:.0f} bytes."
+            )
 
     def _decode_message(self, data: bytes) -> Any:
         try:

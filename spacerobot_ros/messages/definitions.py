@@ -1,6 +1,8 @@
 """Message type definitions, from installed packages and from schemas in bags.
 
-``rosbags`` generates Python code for every decoded type, so the names of types are checked.
+``rosbags`` generates Python code for every decoded type, with one line per element of a message
+array, and never terminates if a type contains itself. Definitions in bags are untrusted, so
+names, lengths, nesting and the number of fields are limited.
 """
 
 from __future__ import annotations
@@ -13,6 +15,8 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+from rosbags.interfaces import Nodetype
 
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.resources import installed_share_directory
@@ -230,6 +234,12 @@ def fields_of(type_name: str) -> Fields:
 # -- types of bags ----------------------------------------------------------------------------
 
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
+_MAX_TEXT_BYTES = 262_144
+_MAX_LINES = 5_000
+_MAX_FIELDS = 1_000
+"""Largest number of fields; in arrays of messages and strings, every element is counted."""
+
+_MAX_NESTING = 32
 
 
 class MessageType:
@@ -243,7 +253,7 @@ class MessageType:
     Raises
     ------
     ValueError
-        The schema cannot be parsed.
+        The schema cannot be parsed or exceeds a limit.
     """
 
     def __init__(self, type_name: str, text: bytes) -> None:
@@ -251,9 +261,7 @@ class MessageType:
 
         self._store = get_typestore(Stores.EMPTY)
         try:
-            if not _TYPE_NAME.fullmatch(type_name):
-                raise ValueError("a type name must have the form 'package/msg/Type'")
-            self._store.register(_parsed(text.decode(), type_name))
+            self._store.register(_parsed_within_limits(type_name, text))
             self._definition = self._store.get_msgdef(type_name)
         # The parser raises any kind of error, depending on the text.
         except Exception as error:
@@ -287,3 +295,45 @@ def _parsed(text: str, type_name: str) -> Any:
     parsed_name = type_name.replace("/srv/", "/msg/")
     types = get_types_from_msg(text, parsed_name)
     return {type_name if name == parsed_name else name: of for name, of in types.items()}
+
+
+def _parsed_within_limits(type_name: str, text: bytes) -> Any:
+    if not _TYPE_NAME.fullmatch(type_name):
+        raise ValueError("a type name must have the form 'package/msg/Type'")
+    if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
+        raise ValueError(
+            f"its definition is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, more "
+            "than any message needs"
+        )
+    types = _parsed(text.decode(), type_name)
+    _count_fields(types, type_name, {})
+    return types
+
+
+def _count_fields(types: Fields, name: str, counts: dict[str, int], depth: int = 0) -> int:
+    """Return the number of fields of a type; ValueError if too large, unknown or recursive."""
+    if name in counts:
+        return counts[name]
+    if name not in types:
+        raise ValueError(f"it does not define {name}")
+    if depth > _MAX_NESTING:
+        raise ValueError(f"its types are nested more than {_MAX_NESTING} deep, or recursive")
+    count = 0
+    for field, (kind, detail) in types[name][1]:
+        length = 1
+        if kind == Nodetype.ARRAY:
+            (kind, detail), length = detail
+            if length < 1:
+                raise ValueError(f"the array {field} of {name} has no elements")
+        elif kind == Nodetype.SEQUENCE:
+            kind, detail = detail[0]
+        if kind == Nodetype.NAME:
+            count += length * _count_fields(types, detail, counts, depth + 1)
+        else:
+            count += length if detail[0] == "string" else 1
+        if count > _MAX_FIELDS:
+            raise ValueError(
+                f"{name} has more than {_MAX_FIELDS} fields, including those of nested messages"
+            )
+    counts[name] = max(count, 1)
+    return counts[name]

@@ -47,6 +47,10 @@ BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
 _TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 
 
+class TooLongError(Exception):
+    """A list of strings or messages has more elements than the layout reader allows."""
+
+
 @dataclass(frozen=True)
 class Leaf:
     """Position of a number, a numeric array or a string in a message.
@@ -84,6 +88,8 @@ class Layout:
     elements
         Whether to include the fields inside lists, with paths such as
         ``markers[2].pose.position.x``.
+    max_elements
+        Largest number of strings or messages in a list.
 
     Attributes
     ----------
@@ -108,6 +114,8 @@ class Layout:
     ------
     IndexError
         The message ends before its last field.
+    TooLongError
+        A list has more strings or messages than ``max_elements``.
     """
 
     def __init__(
@@ -117,6 +125,7 @@ class Layout:
         fields: Fields | None = None,
         *,
         elements: bool = False,
+        max_elements: float = math.inf,
     ) -> None:
         self.leaves: dict[str, Leaf] = {}
         self.counts: dict[str, int] = {}
@@ -126,7 +135,7 @@ class Layout:
         self.lengths: list[int] = []
         self.fixed: list[tuple[int, int]] = []
         self.end = ENCAPSULATION
-        self._message, self._elements = message, elements
+        self._message, self._elements, self._max_elements = message, elements, max_elements
         self._fields = fields_of(type_name) if fields is None else fields
         self._walk(type_name, "")
 
@@ -149,6 +158,10 @@ class Layout:
         if kind == Nodetype.BASE and detail[0] != "string":
             self._add_numbers(DTYPES[detail[0]], path, (count,))
             return
+        if count > self._max_elements:
+            raise TooLongError(
+                f"it has a list of {count} entries, more than {self._max_elements:.0f}"
+            )
         begin, inner = self.end, None
         for i in range(count):
             if self._elements and path is not None:

@@ -24,6 +24,7 @@ from spacerobot_ros.messages.layout import (
     BIG_ENDIAN,
     LITTLE_ENDIAN,
     Layout,
+    TooLongError,
     encode,
 )
 from spacerobot_ros.model import SpaceRobot
@@ -39,8 +40,15 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 ODOMETRY = "nav_msgs/msg/Odometry"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 
+_OTHER_JOINTS_BYTES = 65536
+"""Size allowed for unknown joints in a measured state, bytes."""
+
 _NOT_FINITE_RATES = "velocities are not finite"
 
+_MAX_LIST_TEXTS = 10_000
+"""Largest number of strings in a list; a faulty publisher may send a million."""
+
+_HEADER_BYTES = 4096
 _POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
 _WRENCH_PATH = "wrench.force.x"
 
@@ -126,10 +134,15 @@ class TemplateReader:
     spans
         Paths to read, and the number of float64 values at each: ``{"pose.pose.position.x": 7}``;
         None for an array of any length.
+    max_size
+        Largest size of messages with a different layout, bytes; larger messages are rejected
+        without being read.
     """
 
-    def __init__(self, type_name: str, spans: Mapping[str, int | None]) -> None:
-        self._type_name, self._spans = type_name, spans
+    def __init__(
+        self, type_name: str, spans: Mapping[str, int | None], max_size: float = math.inf
+    ) -> None:
+        self._type_name, self._spans, self._max_size = type_name, spans, max_size
         self._fields = fields_of(type_name)
         self._size = -1
         self.raw = bytes(2)  # The initial template matches no message.
@@ -181,16 +194,23 @@ class TemplateReader:
         return int(seconds * SECOND + nanoseconds)
 
     def _learn_layout(self, raw: bytes) -> None:
+        if len(raw) > self._max_size:
+            raise UnreadableError(f"it has {len(raw)} bytes; at most {self._max_size} are expected")
         name = self._type_name
         try:
             if raw[:2] == BIG_ENDIAN:
                 raw = _as_little_endian(raw, name)
             if raw[:2] != LITTLE_ENDIAN:
                 raise IndexError("it is not in CDR")
-            layout = Layout(raw, name, self._fields, elements=True)
+            layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
         except IndexError as error:
             short = name.rpartition("/")[2]
             raise UnreadableError(f"its bytes are not a {short}") from error
+        except TooLongError as error:
+            # The stamp of the refused message stays readable, but its bytes do not count as
+            # accepted.
+            self.raw, self._size = raw[: HEADER_STAMP.stop], -1
+            raise CommandError(str(error)) from error
         self.raw, self._size, self._layout = raw, len(raw), layout
         fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
         self._fixed_spans = [(slice(a, b), raw[a:b]) for a, b in fixed]
@@ -225,7 +245,7 @@ class JointReader:
     quantities
         Quantities to read; the first is required in every message.
     measured
-        Whether messages are measured states, which have bounded stamps.
+        Whether messages are measured states, which have bounded stamps and sizes.
     followers
         Names of mimic joints, which are not model coordinates.
     """
@@ -242,9 +262,14 @@ class JointReader:
         self._followers = followers
         self.ignored: Counter[str] = Counter()
         """Number of ignored parts of accepted messages, by description."""
+        max_size = math.inf
+        if measured:
+            # Every joint adds a name with its length and three numbers; a machine has other joints.
+            own = sum(len(name.encode()) + 32 for name in joint_names)
+            max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
         spans: dict[str, int | None] = dict.fromkeys(quantities)
-        self._reader = TemplateReader(JOINT_STATE, spans)
+        self._reader = TemplateReader(JOINT_STATE, spans, max_size)
         self._problem = ""
         self._order = _JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._missing = ""

@@ -228,6 +228,16 @@ def test_what_cannot_be_played_is_refused(path: Path, tmp_path: Path) -> None:
         Playback(read_bag(bag_of(tmp_path / "empty.mcap", [])))
 
 
+def test_a_bag_of_too_many_topics_is_played_by_name(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("spacerobot_ros.bag.playback._MAX_REPLAYED_TOPICS", 2)
+    bag = read_bag(path)
+    with pytest.raises(RecordingError, match="has 3 topics, but only 2 can be replayed at once"):
+        Playback(bag)
+    assert [topic.name for topic in Playback(bag, topics=["/a", "/b"]).topics] == ["/a", "/b"]
+
+
 @pytest.fixture(scope="module")
 def far(tmp_path_factory: pytest.TempPathFactory) -> Bag:
     """A message now, and one in a hundred years."""

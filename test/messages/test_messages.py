@@ -373,9 +373,47 @@ def test_types_have_names_of_three_parts(name: str) -> None:
     assert refused("int32 x\n", name) == "a type name must have the form 'package/msg/Type'"
 
 
-def test_types_in_themselves_and_without_definition_are_refused() -> None:
-    assert "recursion" in refused("B x\n")
-    assert "a/msg/C" in refused("C x\n")
+def test_texts_of_types_are_limited() -> None:
+    line = "int32 x\n"
+    full = line + "#" * (262_144 - len(line))
+    assert MessageType(NAME, full.encode())
+    long = "its definition is longer than 262144 bytes or 5000 lines, more than any message needs"
+    assert refused(full + "#") == long
+    lines = line + "\n" * 4_999
+    assert MessageType(NAME, lines.encode())
+    assert refused(lines + "\n") == long
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        # Of strings and messages every element counts, of numbers the list.
+        ("int32[5000] x\n", 1),
+        ("string[1000] x\n", 1000), ("string[999] x\nint8 y\n", 1000),
+        ("string[] x\nint8[] y\n", 2),
+        ("C[500] c\n" + "=" * 80 + "\nMSG: a/C\nint8 x\nint8 y\n", 1000),
+        ("C[] c\n" + "=" * 80 + "\nMSG: a/C\nint8 x\nint8 y\n", 2),
+    ],
+)  # fmt: skip
+def test_fields_are_counted_with_those_of_messages_in_them(text: str, count: int) -> None:
+    assert NAME in MessageType(NAME, text.encode()).fields
+    if count < 1000:
+        assert MessageType(NAME, f"string[{1000 - count}] z\n{text}".encode())
+    more = f"string[{1001 - count}] z\n{text}"
+    assert refused(more).startswith("a/msg/B has more than 1000 fields")
+
+
+def chain(depth: int) -> str:
+    parts = [f"C{i + 1} x\n" if i < depth else "int8 x\n" for i in range(depth + 1)]
+    rule = "=" * 80
+    return "".join(p if not i else f"{rule}\nMSG: a/C{i}\n{p}" for i, p in enumerate(parts))
+
+
+def test_types_are_nested_at_most_32_deep_and_never_in_themselves() -> None:
+    assert MessageType(NAME, chain(32).encode())
+    deep = "its types are nested more than 32 deep, or recursive"
+    assert refused(chain(33)) == refused("B x\n") == deep
+    assert refused("C x\n") == "it does not define a/msg/C"
 
 
 @pytest.mark.parametrize("wrong", ["String", "std_msgs/msg/", "a/msg/B/c", "/String"])
@@ -391,6 +429,21 @@ def state(names: list[str], sec: int = 0, nanosec: int = 0, frame: str = "", **m
     values: dict[str, Any] = {"position": [float(i + 1) for i in range(len(names))], **more}
     header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=frame)
     return serialize_message(JointState(header=header, name=names, **values))
+
+
+def test_a_measured_state_may_be_as_long_as_that_of_a_machine_with_other_joints() -> None:
+    reader = JointReader(["arms", "ü"], ["position"], measured=True)
+    longest = 4096 + 2 * (4 + 32 + 2 + 32) + 65536
+    short = state(["arms", "ü"], frame="f")
+    fits = state(["arms", "ü"], frame="f" * (longest - len(short) + 1))
+    assert len(fits) == longest
+    assert reader.accept(fits) == 0
+    longer = state(["arms", "ü"], frame="f" * (longest - len(short) + 9))
+    with pytest.raises(UnreadableError) as caught:
+        reader.accept(longer)
+    said = f"it has {len(longer)} bytes; at most {longest} are expected"
+    assert str(caught.value) == said
+    assert JointReader(["arms", "ü"], ["position"]).accept(longer) == 0
 
 
 @pytest.mark.parametrize("measured", [False, True])
@@ -430,6 +483,17 @@ def test_what_a_measured_state_says_beyond_the_robot_is_counted_with_its_reason(
     assert whole is not None
     decoder.decode_joints(whole)
     assert (decoder.q.tolist(), decoder.qdot.tolist()) == ([1, 1], [0.25, 0.125])
+
+
+@pytest.mark.parametrize("count", [10_000, 10_001])
+def test_a_list_of_texts_has_ten_thousand_at_most(count: int) -> None:
+    reader = JointReader(["a"], ["position"])
+    raw = state(["a"] * count, 3, position=[])
+    with pytest.raises(CommandError) as caught:
+        reader.accept(raw)
+    long = f"it has a list of {count} entries, more than 10000"
+    assert (str(caught.value) == long) is (count > 10_000)
+    assert reader.stamp_ns == 3 * S
 
 
 def test_messages_of_big_endian_machines_are_read() -> None:

@@ -19,10 +19,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from support.hostile import containers
+from support.hostile import containers, contents
 from support.hostile.records import CASES, GIB, MOST
 
-MAKERS = (containers,)
+MAKERS = (containers, contents)
 """What fills the cases when it is imported."""
 
 TIME_LIMIT = 10.0
@@ -189,7 +189,12 @@ QUICK = (
     *("a record of 2^64 - 1 bytes", "a message index at byte 2^64 - 1"),
     *("messages inside of messages", "a footer that names byte 2^64 - 1"),
     *("an attachment of 2^64 - 1 bytes", "messages at 2^64 - 1 ns"),
-    "statistics of messages that are not there",
+    *("schema: an array of 3e7 messages", "schema: types that double twenty times"),
+    *("schema: a type in itself", "schema: empty lists in lists"),
+    *("schema: a list of 4e9 messages", "schema: a type of two lines"),
+    *("QoS: sixty thousand brackets", "QoS: references that multiply"),
+    *("QoS: a deadline without end", "statistics of messages that are not there"),
+    "flight: cut messages",
 )
 """Cases that are tried with all tests."""
 

@@ -26,6 +26,7 @@ from mcap.writer import MCAP0_MAGIC
 
 MOST = 2**64 - 1
 GIB = 2**30
+SEPARATOR = "=" * 80 + "\n"
 
 CASES: dict[str, Callable[[], bytes]] = {}
 """Makers of bags by name."""
