@@ -524,7 +524,9 @@ def _read_pose(element: Element, where: str) -> Pose:
         return Pose(matrix_from_rpy(_numbers(origin, "rpy", where, "0 0 0")), r)
     quaternion = _numbers(origin, "quat_xyzw", where)
     if origin.get("rpy") is not None:
-        raise RobotDescriptionError(f"The origin of {where} has 'rpy' and 'quat_xyzw': give one.")
+        raise RobotDescriptionError(
+            f"The origin of {where} has both 'rpy' and 'quat_xyzw': give one."
+        )
     if not (length := float(np.linalg.norm(quaternion))):
         raise RobotDescriptionError(
             f"'quat_xyzw' in the origin of {where} is zero: give a unit quaternion."

@@ -475,8 +475,8 @@ class MultiProcessStack:
 def _require_flyable(scenario: Scenario) -> None:
     if scenario.kills and scenario.lockstep:
         raise ParameterError(
-            f"The scenario '{scenario.name}' kills nodes in flight: fly it with --nodes and "
-            "--realtime."
+            f"The scenario '{scenario.name}' kills nodes during the flight: fly it with --nodes "
+            "and --realtime."
         )
     goal = scenario.goal
     if goal.end_effectors and goal.base not in (frozenset(), POSE):

@@ -261,7 +261,7 @@ def test_topics_that_cannot_be_read_are_named_and_the_rest_is_written(
     bag = read_bag(mixed)
     assert bag.to_pandas().keys() == bag.to_xarray().keys() == {"/joint_states"}
     refused = CliRunner().invoke(main, ["export", str(mixed), "--topic", "chatter"]).stderr
-    assert_one_sentence(refused, "in 'cdr' defined by 'ros2idl'")
+    assert_one_sentence(refused, "'cdr' defined by 'ros2idl'")
 
 
 def test_columns_of_joints_follow_names(tmp_path: Path) -> None:

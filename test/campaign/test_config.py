@@ -124,7 +124,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"plant.tick_rate[0]": NORM}}, "it is not a list"),
     ({"disperse": {"plant.initial_orientation[0]": NORM}}, "disperse initial.rotvec"),
     ({"disperse": {"initial.joints.slider": NORM}}, "no joint 'slider'.*Did you mean 'slider_"),
-    ({"disperse": {"goal.position.u": NORM}}, "none of goal.position.x"),
+    ({"disperse": {"goal.position.u": NORM}}, "is not one of goal.position.x"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
     ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 fault\(s\)"),
     (

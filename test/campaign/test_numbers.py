@@ -222,9 +222,12 @@ def test_criteria_include_their_bounds() -> None:
         ),
         (
             {"disperse": {"mass": {"norm": 3}}},
-            "'mass': norm must have arguments: loc, scale.",
+            "'mass': norm takes loc, scale, not 3",
         ),
-        ({"disperse": {"mass": {"poisson": [1, 2, 3]}}}, "'mass': poisson takes mu, loc, not 3"),
+        (
+            {"disperse": {"mass": {"poisson": [1, 2, 3]}}},
+            "'mass': poisson takes mu, loc, not [1, 2, 3]",
+        ),
         ({"longest": -1}, "'longest' is -1; it must be a finite number of at least 0."),
         (
             {"longest": True},

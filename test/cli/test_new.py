@@ -232,7 +232,7 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
         ([], None),
         ([('value="120"', 'value="4.7"')], "'base_link' has a mass of 4.7 kg and carries 24 kg"),
         ([('value="120"', 'value="4.9"')], None),
-        ([('value="120"', 'value="12120"')], "has 1.212e+04 kg, 505 times its load"),
+        ([('value="120"', 'value="12120"')], "has a mass of 1.212e+04 kg, 505 times its load"),
         ([('value="120"', 'value="11880"')], None),
         ([(BASE, 'ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"')], "'base_link' is a point"),
         ([(RATES, '<limit velocity="0" effort="1"/>')], "'pin_1' has a velocity limit of 0"),

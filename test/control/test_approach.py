@@ -159,7 +159,7 @@ def test_rotation_counts_only_where_it_is_controlled() -> None:
 
 def test_joints_that_are_too_slow_are_named() -> None:
     said = refusal(target((1.7, -0.5)), reach=reach(0.005))
-    assert_one_sentence(said, "The target cannot be met within the next 3 s", "of 0.005/s")
+    assert_one_sentence(said, "The target cannot be met within the next 3 s", "limit is 0.005/s")
     assert re.search(r"joint '(shoulder|elbow)' would move at 0\.0\d+/s", said)
 
 

@@ -260,7 +260,7 @@ def test_gains_may_be_matrices_of_all_outputs(seed: int) -> None:
 @pytest.mark.parametrize(
     ("matrix", "sentence"),
     [
-        ([1.0, 0.0, 0.0, 1.0], "has 4 values; the 5 outputs of the law .* take 25"),
+        ([1.0, 0.0, 0.0, 1.0], "has 4 values; the 5 outputs of the law .* require 25"),
         (np.triu(np.ones((5, 5))), "is not symmetric"),
         (np.diag([1.0, 1.0, 0.0, 1.0, 1.0]), "is not positive definite"),
     ],

@@ -307,7 +307,7 @@ def test_only_methods_that_start_in_motion_are_asked_for_moving_joints() -> None
     schedule = choice_of(rests, moves)[0].method.plan(request)
     assert schedule.notes["chosen"] == "moves"
     assert "rests: rests plans only from rest." in str(schedule.notes["compared"])
-    with pytest.raises(PlanningError, match=r"rests plans from rest only\."):
+    with pytest.raises(PlanningError, match=r"rests plans only from rest\."):
         choice_of(rests)[0].method.plan(request)
 
 

@@ -104,7 +104,7 @@ def test_optimal_goes_round_a_contact(arm: SpaceRobot, distance: float) -> None:
 def test_where_no_clear_way_is_fast_enough_the_fastest_is_named(arm: SpaceRobot) -> None:
     few: dict[str, Any] = {**QUICK, "starts": 4, "intervals": 12, "control_period": 0.1}
     turn, start = (0.09, -0.26, -0.21), np.zeros(3)
-    with pytest.raises(PlanningError, match=r"= 4\.5 s: the fastest manoeuvre found takes 5"):
+    with pytest.raises(PlanningError, match=r"= 4\.5 s: the fastest one found takes 5"):
         plan(arm, rotvec=turn, start=start, clearance=0.03, longest=4.5, **few)
 
 

@@ -184,7 +184,7 @@ def test_slots_count_by_their_directions_and_not_by_their_size() -> None:
     require_three_slots(robot, 1e-11 * np.eye(3))
     require_three_slots(robot, np.diag([1.0, 1.0, 1e-8]))
     for thin in (1e-10, 0.0):
-        with pytest.raises(PlanningError, match="of rank 2"):
+        with pytest.raises(PlanningError, match="have rank 2"):
             require_three_slots(robot, 1e3 * np.diag([1.0, 1.0, thin]))
 
 

@@ -173,9 +173,7 @@ def test_a_planar_robot_that_tumbles_is_refused() -> None:
 
 
 def test_methods_that_plan_at_rest_name_the_one_that_does_not() -> None:
-    with pytest.raises(
-        PlanningError, match=r"lie_bracket plans for zero momentum, .* optimal plan"
-    ):
+    with pytest.raises(PlanningError, match=r"lie_bracket plans for zero momentum, .* use optimal"):
         plan(
             "sliding_masses", position=(0.1, 0, 0), method="lie_bracket", linear_momentum=[1, 0, 0]
         )

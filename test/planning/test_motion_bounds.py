@@ -404,7 +404,7 @@ def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
                 "longest": 9.0,
             },
             r"no manoeuvre to this goal takes less than 10 s, as the base rotates by 0\.5 rad at "
-            r"optimal\.max_base_rate at most\. Allow more time\.",
+            r"no more than optimal\.max_base_rate\. Allow more time\.",
         ),
     ],
 )
