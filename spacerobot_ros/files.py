@@ -1,7 +1,8 @@
 """Atomic file replacement, files that no other user can have modified, and the cache.
 
 Files are replaced completely or not at all, because disks may fill up and processes may be killed.
-Files that are executed or resumed are read only if no other user on the machine can have written
+Files
+that are executed or resumed are read only if no other user on the machine can have written
 them. A :class:`Cache` stores files that can be recreated, in a private folder of this user; it
 treats a damaged file as missing, and warns once.
 """
@@ -13,6 +14,7 @@ import logging
 import os
 import secrets
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,10 @@ _CACHE_MAGIC = b"spacerobot_ros cache 2"
 """Prefix of the last line in a cache file, with the file format version."""
 
 _MCAP_MAGIC = b"\x89MCAP"
+_MAX_YAML_CHARACTERS = 1_000_000
+
+_MAX_YAML_VALUES = 100_000
+"""Maximum number of values in a YAML string, including values repeated by aliases."""
 
 _logged_warnings: set[str] = set()
 
@@ -75,8 +81,9 @@ def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
     """Write a report, picture or result and create its folders, completely or not at all.
 
     ``mode`` specifies the permissions of a new file; an existing file keeps its permissions. A bag
-    is not replaced, because it may be the only record of a flight. Devices and pipes are supported.
-    Text is written as UTF-8.
+    is not
+    replaced, because it may be the only record of a flight. Devices and pipes are supported. Text
+    is written as UTF-8.
 
     Raises
     ------
@@ -115,31 +122,85 @@ def _write_output(path: Path, data: bytes, mode: int) -> None:
 
 
 def load_yaml(text: str, loader: Any = None) -> Any:
-    """Return the content of a YAML string; it makes no Python objects.
+    """Return the content of an untrusted YAML string, with limits on its size.
 
     Parameters
     ----------
     text
-        One document.
+        One document of at most a million characters.
     loader
         Class of the loader; None: ``yaml.SafeLoader``.
 
     Raises
     ------
     ValueError
-        The string is not YAML, or is too deeply nested.
+        The string is not YAML, is too long or too deeply nested, or its aliases expand to too many
+        values: a 1 kB file may expand to a billion values.
     """
     import yaml
 
+    if len(text) > _MAX_YAML_CHARACTERS:
+        raise ValueError(f"it has more than {_MAX_YAML_CHARACTERS} characters")
     try:
-        return yaml.load(text, loader or yaml.SafeLoader)
+        reader = (loader or yaml.SafeLoader)(text)
+        try:
+            node = reader.get_single_node()
+            if node is None:
+                return None
+            _limit_values(node)
+            return reader.construct_document(node)
+        finally:
+            reader.dispose()
     except yaml.YAMLError as error:
         raise ValueError(" ".join(str(error).split())) from error
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 
 
+def _limit_values(root: Any) -> None:
+    """Refuse a YAML node with too many values below it; keys count as well."""
+    nodes, count = [root], 0
+    while nodes:
+        count += 1
+        if count > _MAX_YAML_VALUES:
+            raise ValueError(
+                f"it has more than {_MAX_YAML_VALUES} values, including values repeated by aliases"
+            )
+        value = nodes.pop().value
+        for child in () if isinstance(value, str) else value:
+            nodes.extend(child if isinstance(child, tuple) else (child,))
+
+
 # -- files of this user -----------------------------------------------------------------------
+
+
+_FILE_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def irregular_kind(mode: int) -> str:
+    """Return a phrase describing a non-regular file from its mode; empty for a regular file."""
+    if stat.S_ISREG(mode):
+        return ""
+    return next((words for test, words in _FILE_KINDS if test(mode)), "no file")
+
+
+def read_regular(path: str | os.PathLike[str]) -> bytes:
+    """Return the content of a regular file; a pipe would block, and a device may never end.
+
+    Raises
+    ------
+    OSError
+        It cannot be read, or is not a regular file.
+    """
+    if kind := irregular_kind(os.stat(path).st_mode):
+        raise OSError(f"it is {kind}")
+    return Path(path).read_bytes()
 
 
 def read_private(path: Path) -> bytes:
@@ -229,6 +290,24 @@ class Cache:
             f"The cache '{self.folder}' is not used, because its files are executed: "
             f"{error} (Set SPACEROBOT_CACHE_DIR to another folder.)"
         )
+
+
+def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: str) -> None:
+    """Log a warning once per installation; afterwards it is logged as a debug message.
+
+    Parameters
+    ----------
+    folder
+        The cache, which stores under ``name`` that the warning was logged. If this fails, the
+        warning is logged each time.
+    """
+    cache = Cache(folder)
+    # Installations that share a cache have a file each.
+    entry = f"{name}-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:32]}"
+    known = cache.load(entry, entry) is not None
+    logger.log(logging.DEBUG if known else logging.WARNING, message)
+    if not known:
+        cache.store(entry, entry, b"")
 
 
 def _trailer(content: bytes, key: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Files are written as a whole, and trusted where nobody else writes them."""
+"""Files are written as a whole, read within limits, and trusted where nobody else writes them."""
 
 from __future__ import annotations
 
@@ -124,13 +124,27 @@ def test_a_new_file_has_a_mode_and_a_bag_is_not_replaced(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("text", "reason"),
-    [("[" * 10_000, "it is nested too deeply"), ("a: [", "while parsing a flow node")],
+    [
+        ("a" * 1_000_001, "it has more than 1000000 characters"),
+        ("[" * 10_000, "it is nested too deeply"),
+        ("&a [*a]", "it has more than 100000 values"),
+        (f"[&a [{'1, ' * 1000}], {'*a, ' * 100}]", "it has more than 100000 values"),
+        ("a: [", "while parsing a flow node"),
+    ],
 )
-def test_what_is_no_yaml_is_one_sentence(text: str, reason: str) -> None:
+def test_yaml_of_unknown_origin_is_limited(text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=r"\w") as refused:
         load_yaml(text)
     assert str(refused.value).startswith(reason)
     assert "\n" not in str(refused.value)
+
+
+def test_yaml_up_to_its_limits_is_read() -> None:
+    assert load_yaml("a" * 1_000_000) == "a" * 1_000_000
+    assert len(load_yaml(f"[&a [{'1, ' * 1000}], {'*a, ' * 98}]")) == 99
+    assert load_yaml("") is None
+    assert load_yaml("[&a [1, 2], *a]") == [[1, 2], [1, 2]]
+    assert load_yaml("{a: 1, 2: b}") == {"a": 1, 2: "b"}
 
 
 def test_a_private_file_is_of_this_user_alone(
@@ -181,6 +195,24 @@ def test_a_cache_gives_what_was_stored_under_a_key(
     empty = cache.store("z", "key", b"")
     assert empty is not None
     assert cache.load("z", "key") == (empty, b"")
+
+
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        ("plan three_joint_arm --goal-rotvec 0 0 0.01 --set planner.srdf={}", "SRDF"),
+        ("run planar_manipulator --goal-rotvec 0 0 0.1 --set plant.world={}", "URDF"),
+        ("run servicer_thrusters --set plant.thrusters={}", "thruster file"),
+    ],
+)
+def test_a_file_that_would_never_end_is_refused(tmp_path: Path, words: str, kind: str) -> None:
+    """A pipe that nobody writes, and a device without an end."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path, is_what in ((pipe, "a pipe"), (Path("/dev/zero"), "a device")):
+        result = CliRunner().invoke(main, words.format(path).split())
+        assert result.exit_code == 2
+        assert f"{kind} {path} cannot be read: it is {is_what}." in result.stderr
 
 
 def test_an_srdf_in_an_encoding_that_is_none_is_refused(tmp_path: Path) -> None:

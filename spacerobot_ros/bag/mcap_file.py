@@ -23,6 +23,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos, QosTime
 
+from spacerobot_ros.bag.mcap_reading import require_regular
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.times import SECOND
@@ -204,9 +205,9 @@ class BagExistsError(RecordingError):
 
 
 def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
-    """Create an empty, locked file; BagExistsError if the file must not be overwritten."""
-    if path.exists() and not path.is_file():
-        raise RecordingError(f"Cannot create the bag {path}: it is not a file.")
+    """Create an empty, locked, regular file; BagExistsError if the file must not be overwritten."""
+    with suppress(FileNotFoundError):
+        require_regular(os.stat(path).st_mode, path, "create")
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     try:
         descriptor = os.open(path, flags if overwrite else flags | os.O_EXCL, 0o666)

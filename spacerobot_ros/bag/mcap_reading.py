@@ -43,6 +43,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.files import irregular_kind
 
 RecordT = TypeVar("RecordT", bound=McapRecord)
 
@@ -82,6 +83,12 @@ class."""
 # -- files ------------------------------------------------------------------------------------
 
 
+def require_regular(mode: int, path: Path, action: str = "read") -> None:
+    """Raise RecordingError unless a file is regular: pipes block, and devices may be damaged."""
+    if kind := irregular_kind(mode):
+        raise RecordingError(f"Cannot {action} the bag {path}: it is {kind}.")
+
+
 @contextmanager
 def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
     """Open a bag for reading; if the bag is compressed, open the temporary file with its unpacked
@@ -90,11 +97,13 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
     Raises
     ------
     RecordingError
-        There is no such file, or it cannot be read, or a damaged record is found within the
-        context.
+        There is no such file, or it is not regular or cannot be read, or a damaged record is found
+        within the context.
     """
+    content = content or path
     try:
-        with (content or path).open("rb") as file:
+        require_regular(os.stat(content).st_mode, path)
+        with content.open("rb") as file:
             yield file
     except FileNotFoundError as error:
         raise RecordingError(f"There is no bag at {path}.") from error

@@ -23,7 +23,7 @@ from spacerobot_ros.campaign.distributions import (
 from spacerobot_ros.campaign.metrics import OWN_METRICS, metric_of
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, printable, reason
-from spacerobot_ros.files import load_yaml
+from spacerobot_ros.files import load_yaml, read_regular
 from spacerobot_ros.measures import CLEARANCE, METRICS, metric_names
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
@@ -171,7 +171,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
         The file cannot be read, or contains an invalid value; the message states its location.
     """
     try:
-        content = load_yaml(path.read_text("utf-8"), _UniqueKeyLoader)
+        content = load_yaml(read_regular(path).decode("utf-8"), _UniqueKeyLoader)
     except (OSError, ValueError) as error:
         raise ParameterError(
             f"The campaign file {path} cannot be read: {reason(error)}."

@@ -13,6 +13,7 @@ import numpy as np
 
 from spacerobot_ros.campaign.targets import DispersionTarget, DrawnFlight, targets_of
 from spacerobot_ros.errors import ParameterError, reason
+from spacerobot_ros.files import read_regular
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
 from spacerobot_ros.scenario import Scenario, number_in
@@ -178,7 +179,7 @@ def read_table_text(given: Any, folder: Path) -> str:
     if "\n" in given:
         return given
     try:
-        return (folder / given).read_text("utf-8-sig")
+        return read_regular(folder / given).decode("utf-8-sig")
     except (OSError, ValueError) as error:
         raise ParameterError(f"the table '{given}' cannot be read: {reason(error)}.") from error
 

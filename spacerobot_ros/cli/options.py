@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from spacerobot_ros.errors import reason
-from spacerobot_ros.files import write_output
+from spacerobot_ros.files import read_regular, write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal
@@ -282,7 +282,7 @@ def end_effector_goals(
 def _read_path(file: Path) -> list[list[float]]:
     """Return the numbers of a text file, a position or a pose a line; else raise BadParameter."""
     try:
-        lines = [line.partition("#")[0] for line in file.read_text("utf-8").splitlines()]
+        lines = [line.partition("#")[0] for line in read_regular(file).decode("utf-8").splitlines()]
         rows = [list(map(float, line.replace(",", " ").split())) for line in lines]
     except (OSError, ValueError) as error:
         raise click.BadParameter(

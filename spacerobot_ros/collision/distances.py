@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.collision.rounded_box import RoundedBox, separating_planes, separation
-from spacerobot_ros.files import warn_once
+from spacerobot_ros.files import warn_first_time
+from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array, Shape
 
 _LOG = logging.getLogger(__name__)
@@ -57,13 +58,16 @@ class Solid:
 
 @lru_cache(maxsize=1)
 def _coal() -> Any:
-    """Return the module coal; None: it is not installed."""
+    """Return the module coal; None: it is not installed, which is logged once an installation."""
     try:
         import coal
     except ImportError:
-        warn_once(
+        warn_first_time(
+            _LOG,
+            cache_directory(),
+            "warned_of_coal",
             "Distances between links are lower bounds from enclosing spheres, capsules and boxes, "
-            "because the package coal is not installed: `pip install '.[collision]'` in the clone."
+            "because the package coal is not installed: `pip install '.[collision]'` in the clone.",
         )
         return None
     return coal

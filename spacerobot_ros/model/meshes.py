@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import MeshError, reason
+from spacerobot_ros.files import read_regular
 from spacerobot_ros.model.description import Array, Pose, Shape, editable_root
 from spacerobot_ros.model.xacro_files import package_around
 from spacerobot_ros.resources import installed_share_directory, share_directory
@@ -193,7 +194,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
                 f"The mesh {path} has {size / 1e6:.0f} MB; at most "
                 f"{_MAX_MESH_BYTES / 1e6:.0f} MB are read. Make it coarser."
             )
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise MeshError(f"The mesh {path} cannot be read: {reason(error)}.") from error
     try:

@@ -12,6 +12,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, SubElement, fromstring, tostring
 
 from spacerobot_ros.errors import RobotDescriptionError, reason
+from spacerobot_ros.files import read_regular
 from spacerobot_ros.model.description import RobotDescription, editable_root
 from spacerobot_ros.resources import suggestion
 
@@ -29,7 +30,7 @@ def with_srdf(robot: RobotDescription, path: str | Path) -> RobotDescription:
         The file cannot be read, is not an SRDF, or names an unknown link.
     """
     try:
-        root = fromstring(Path(path).read_bytes())
+        root = fromstring(read_regular(path))
     except OSError as error:
         raise RobotDescriptionError(f"The SRDF {path} cannot be read: {reason(error)}.") from error
     except (ParseError, ValueError, LookupError) as error:

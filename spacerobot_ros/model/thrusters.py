@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError, SpaceRobotError, reason
-from spacerobot_ros.files import load_yaml
+from spacerobot_ros.files import load_yaml, read_regular
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.rotations import matrix_from_rpy
 
@@ -188,7 +188,7 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
         The file cannot be read, or a thruster is invalid.
     """
     try:
-        content = load_yaml(Path(path).read_text("utf-8"))
+        content = load_yaml(read_regular(path).decode("utf-8"))
     except (OSError, ValueError) as error:
         raise ParameterError(
             f"The thruster file {path} cannot be read: {reason(error)}."

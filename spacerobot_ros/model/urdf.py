@@ -22,7 +22,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 import numpy as np
 
 from spacerobot_ros.errors import RobotDescriptionError, reason
-from spacerobot_ros.files import warn_once
+from spacerobot_ros.files import read_regular, warn_once
 from spacerobot_ros.model import xacro_files
 from spacerobot_ros.model.description import (
     Array,
@@ -139,7 +139,7 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
 def _read_text(path: Path) -> str:
     """Return the URDF text of a file, expanded and with absolute paths of meshes."""
     try:
-        text = path.read_text("utf-8")
+        text = read_regular(path).decode("utf-8").replace("\r\n", "\n")
     except OSError as error:
         raise RobotDescriptionError(f"The URDF {path} cannot be read: {reason(error)}.") from error
     except UnicodeDecodeError as error:

@@ -6,6 +6,7 @@ reports them.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -21,10 +22,13 @@ from spacerobot_ros.events import (
     KeyValueFormat,
     number_format,
 )
-from spacerobot_ros.files import warn_once
+from spacerobot_ros.files import warn_first_time
+from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import relative_pose
 from spacerobot_ros.simulation.capture import CapturePlant
+
+_LOG = logging.getLogger(__name__)
 
 _OK, _ERROR = 0, 2
 
@@ -140,7 +144,12 @@ class ClearanceMonitor:
         if not len(geometry.pairs):
             return None
         if not geometry.exact:
-            warn_once("The plant cannot measure clearance without the package coal.")
+            warn_first_time(
+                _LOG,
+                cache_directory(),
+                "warned_of_clearance",
+                "The plant cannot measure clearance without the package coal.",
+            )
             return None
         monitor = cls(geometry, links, has_contact_forces=has_contact_forces)
         if before is not None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from spacerobot_ros.bag import (
     read_bag,
 )
 from spacerobot_ros.bag.mcap_reading import INFLATED_SIZE_VARIABLE
-from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.bag.salvage import last_state, salvage_bag
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.reading import open_flight_bag
 from spacerobot_ros.flight.verification import verify_bag
@@ -373,6 +374,59 @@ def test_a_sentence_names_the_place(tmp_path: Path) -> None:
     place = content.index(b"\x06" + (len(message(string("x"))) + 40).to_bytes(8, "little"))
     with pytest.raises(RecordingError, match=f"{path} is damaged: .*chunk at byte {place} "):
         read_bag(path)
+
+
+def make_pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def make_folder(path: Path) -> None:
+    path.mkdir()
+
+
+def make_socket(path: Path) -> None:
+    home = os.getcwd()
+    try:
+        os.chdir(path.parent)  # The names of sockets have at most 107 characters.
+        with socket.socket(socket.AF_UNIX) as opened:
+            opened.bind(path.name)
+    finally:
+        os.chdir(home)
+
+
+def make_device(path: Path) -> None:
+    path.symlink_to("/dev/full")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (make_pipe, "it is a pipe"),
+        (make_socket, "it is a socket"),
+        (make_device, "it is a device"),
+        (make_folder, "it is a folder|contains no bag"),
+    ],
+)
+def test_what_is_no_file_is_neither_read_nor_written(
+    tmp_path: Path, make: Callable[[Path], None], words: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    make(path)
+    acts: list[Callable[[Path], Any]] = [
+        read_bag,
+        lambda path: list(iterate_raw(path)),
+        last_state,
+        lambda path: salvage_bag(path, tmp_path / "out.mcap"),
+        BagWriter,
+        lambda path: BagWriter(path, overwrite=False),
+    ]
+    for act in acts:
+        with pytest.raises(RecordingError, match=words):
+            act(path)
+    for name in ("verify", "report", "salvage"):
+        result = CliRunner().invoke(main, [name, str(path)])
+        assert result.exit_code == 2
+        assert len(result.output.splitlines()) == 1
 
 
 def test_a_message_may_hold_nothing_and_has_a_whole_head(tmp_path: Path) -> None:

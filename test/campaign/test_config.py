@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "loc is the smallest value and scale is the width",
     ),
     ({"table": "none.csv"}, "the table 'none.csv' cannot be read: No such file"),
-    ({"table": "/dev"}, "the table '/dev' cannot be read: Is a directory"),
+    ({"table": "/dev/zero"}, "the table '/dev/zero' cannot be read: it is a device"),
     ({"table": 3}, "'table' must be the name or the content of a CSV file"),
     ({"table": "mass\n"}, "must consist of one line of names and one line per flight"),
     ({"table": "mass\n1,2\n"}, "table row 1 has 2 values for 1 names"),
@@ -194,6 +195,12 @@ def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
     file.write_text(shared + merged)
     made = load_campaign(file)
     assert (made.flights, made.seed) == (5, 4)
+
+
+def test_a_campaign_is_not_read_from_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "campaign.yaml")
+    with pytest.raises(ParameterError, match=r"campaign\.yaml cannot be read: it is a pipe"):
+        load_campaign(tmp_path / "campaign.yaml")
 
 
 def test_a_file_names_its_scenario_beside_it(tmp_path: Path) -> None:

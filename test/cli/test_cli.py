@@ -98,7 +98,7 @@ def test_goal_out_of_reach_is_exit_1(tmp_path: Path) -> None:
         (["sliding_masses", "--set", "tick_rate=1"], "is not node.parameter=value"),
         (["sliding_masses", "--set", "plant.nothing=1"], "no parameter 'nothing'"),
         (["sliding_masses", "--set", "plant.robot=x.urdf"], "no such URDF file"),
-        (["sliding_masses", "--bag", "/dev/full"], "/dev/full: it is not a file"),
+        (["sliding_masses", "--bag", "/dev/full"], "/dev/full: it is a device"),
     ],
 )
 def test_bad_input_is_exit_2_and_one_sentence(
@@ -317,18 +317,34 @@ def test_methods_and_laws_are_offered_by_name() -> None:
 
 ROOT = Path(__file__).resolve().parents[2]
 
+LAUGHS = "a: &a [1, 2]\n" + "".join(
+    f"{chr(98 + n)}: &{chr(98 + n)} [{', '.join(9 * [f'*{chr(97 + n)}'])}]\n" for n in range(20)
+)
+"""Some 1e19 values in 1 kB."""
+
+LADDER = "a0: &a0 {b: 1}\n" + "".join(f"a{n}: &a{n} {{b: *a{n - 1}}}\n" for n in range(1, 2000))
+"""Nested two thousand times, with two levels on a line."""
+
 HARMFUL = {
     "nested": "scenario: " + 10_000 * "[",
+    "alias of itself": "scenario: &a {ros__parameters: *a}",
+    "aliases": LAUGHS,
+    "ladder": LADDER,
     "date": "a: 2024-99-99",
     "number": "a: " + 5000 * "9",
+    "long": "a: " + 1_000_001 * "x",
 }
 READING_COMMANDS = ("plan", "run")
 """They read scenarios as `campaign fly` reads its file, by one function."""
 
 REASONS = {
     "nested": "nested too deeply",
+    "alias of itself": "more than 100000 values",
+    "aliases": "more than 100000 values",
+    "ladder": "more than 100000 values",
     "date": "month must be in",
     "number": "integer string conversion",
+    "long": "more than 1000000 characters",
 }
 
 
@@ -487,6 +503,13 @@ def test_topics_to_replay_are_named_with_or_without_a_slash() -> None:
     result = CliRunner().invoke(main, ["replay", str(BAG), "--topic", "nowhere"])
     assert result.exit_code == 2
     assert "has no topic /nowhere: it has " in result.stderr
+
+
+def test_a_path_that_never_ends_is_no_path() -> None:
+    words = ["plan", "three_joint_arm", "--end-effector-path", "/dev/zero"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 2
+    assert "The path /dev/zero cannot be read: it is a device" in result.output
 
 
 def test_replay_has_the_options_of_its_node() -> None:

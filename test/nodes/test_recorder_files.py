@@ -171,7 +171,7 @@ def test_a_full_disk_ends_the_recording_with_one_sentence_and_not_the_flight(
 def test_a_device_is_refused_in_a_sentence(harness: Harness) -> None:
     stack = Stack(harness, Path("/dev/full"))
     assert stack.recorder.trigger_configure() is not TransitionCallbackReturn.SUCCESS
-    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "it is not a file")
+    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "it is a device")
     stack.probe.watch("/planner/status", message_class("diagnostic_msgs/msg/DiagnosticStatus"))
     harness.connect()
     stack.fly()
