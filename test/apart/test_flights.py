@@ -245,8 +245,8 @@ RATES = [(node, rate) for node in SLIDE_AND_TURN for rate in (5.0, 10.0, 50.0, 2
     ("node", "rate"),
     some_fast(
         RATES,
-        *(("planner", 10.0), ("coordinated_control", 50.0)),
-        slow=[("planner", 200.0), ("coordinated_control", 5.0)],
+        ("planner", 10.0),
+        slow=[("planner", 200.0), ("coordinated_control", 5.0), ("coordinated_control", 50.0)],
     ),
 )
 def test_a_plant_of_any_rate_is_followed(apart: NodesApart, node: str, rate: float) -> None:

@@ -41,9 +41,9 @@ KILLS = [
 ]
 QUICK_KILLS = [
     ("planner", "plant", "executing"),
-    ("coordinated_control", "coordinated_control", "tracking"),
 ]
 SLOW_KILLS = [
+    ("coordinated_control", "coordinated_control", "tracking"),
     ("planner", "planner", "planning"),
     ("planner", "recorder", "executing"),
     ("coordinated_control", "plant", "tracking"),

@@ -414,7 +414,7 @@ def test_what_is_no_file_is_neither_read_nor_written(
     make(path)
     acts: list[Callable[[Path], Any]] = [
         read_bag,
-        lambda path: list(iterate_raw(path)),
+        lambda path: list(read_bag(path).raw_messages(["/a"])),
         last_state,
         lambda path: salvage_bag(path, tmp_path / "out.mcap"),
         BagWriter,

@@ -290,6 +290,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_flights_need_no_ros(tmp_path: Path) -> None:
     """Commands that fly without nodes work; the others say in one sentence what is missing."""
     (tmp_path / "command.py").write_text(WITHOUT_ROS)

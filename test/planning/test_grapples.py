@@ -97,6 +97,7 @@ def satellite(quaternion: list[float], place: list[float], omega: list[float]) -
     return BodyMotion(R, np.array(place), v, R @ np.deg2rad(omega))
 
 
+@pytest.mark.slow
 def test_a_fixture_that_faces_away_is_met_when_it_has_turned() -> None:
     planner, target = servicer(), load_robot(SATELLITE)
     free = satellite([0.254, 0.691, -0.641, -0.216], [-2.38, 1.2, 3.88], [-5.93, 0.91, 0.0])

@@ -206,6 +206,7 @@ def test_a_drag_zooms_all_charts_and_two_clicks_show_all(window: Browser) -> Non
     assert chart(window, 0, "chart.reset.hidden")
 
 
+@pytest.mark.slow
 @with_browser
 def test_dark_and_light(window: Browser) -> None:
     def brightness(of: str) -> float:

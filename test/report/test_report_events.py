@@ -219,8 +219,8 @@ def test_the_text_of_an_estimate_leaves_out_unknown_parameters() -> None:
     # By the parallel-axis theorem: centre (0.1, -0.2, 0.3) m.
     assert payload_text(whole) == (
         "mass 2 ± 0.03 kg; centre of mass (0.10000, -0.20000, 0.30000) m in hand; inertia "
-        "about the centre of mass (0.94, 1.2, 1.2, 0.01, -0.04, 0.08) kg m² (xx, yy, zz, xy, xz, yz); "
-        "corrected to the nearest physical parameters"
+        "about the centre of mass (0.94, 1.2, 1.2, 0.01, -0.04, 0.08) kg m² "
+        "(xx, yy, zz, xy, xz, yz); corrected to the nearest physical parameters"
     )
     some = np.where(np.arange(10) == 2, np.nan, numbers)
     assert payload_text(PayloadEstimate("hand", some, spread, np.zeros((0, 10)), False)) == (
