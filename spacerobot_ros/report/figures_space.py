@@ -311,10 +311,13 @@ def _square_panels(
 _LOOP_JOINTS, _SHOWN_CYCLES = 3, 3
 
 
-def loops_figure(flight: FlightReport) -> ReportFigure | str:
-    """Joint positions plotted against each other, for pairs of the first three joints."""
+def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
+    """Joint positions plotted against each other, for pairs of the first three joints; None without
+    joints, which the figure of joint positions says."""
     columns = flight.shape_columns[:_LOOP_JOINTS]
     names = [flight.joint_names[i] for i in columns]
+    if not names and flight.robot is not None:
+        return None
     if len(names) < 2:
         return "A loop in shape space requires at least two joints."
     if not len(flight.q):

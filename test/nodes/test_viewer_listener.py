@@ -218,6 +218,10 @@ def test_goals_of_anyone_are_shown_until_one_is_refused(viewed: Viewed) -> None:
         "base": 0.5,
         "end_effector": 1.5,
     }
+    path = Path(poses=[PoseStamped(pose=pose_of(x, 2.0, 3.0)) for x in (0.1, 0.7)])
+    path.header.frame_id = "world"
+    viewed.say("goal_path", path)
+    assert viewed.look().goals["base"].position[0] == 0.7
     message.header.frame_id = "elsewhere"
     viewed.say("goal_pose", message)
     assert list(viewed.look().goals) == ["end_effector"]

@@ -164,6 +164,7 @@ class Listener:
         node.create_subscription(Path, "planned_path", self._on_path, LATCHED)
         node.create_subscription(JointTrajectory, "gait_schedule", self._on_schedule, LATCHED)
         node.create_subscription(DiagnosticStatus, "heartbeat", self._on_heartbeat, STREAM)
+        node.create_subscription(Path, "goal_path", self._on_goal_path, STREAM)
         parts: dict[str, Part] = {"goal_pose": "base", "end_effector/goal_pose": "end_effector"}
         for topic, part in parts.items():
             node.create_subscription(
@@ -436,6 +437,12 @@ class Listener:
         except SpaceRobotError:
             # The planner or the controller reports the refusal of an invalid goal.
             self._goals.pop(part, None)
+
+    def _on_goal_path(self, message: Path) -> None:
+        if message.poses:
+            last = message.poses[-1]
+            last.header.frame_id = last.header.frame_id or message.header.frame_id
+            self._on_goal("base", last)
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
         with suppress(ValueError):  # The heartbeat is of another package.
