@@ -37,7 +37,7 @@ from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.node import STREAM
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
-from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, TOPIC, HeartbeatState
+from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, TOPIC, HeartbeatState, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerStatistics
@@ -383,8 +383,10 @@ class MultiProcessStack:
         return {name: end_child(self.processes[name], waits) for name in names}
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
-        # Nodes of this stack send heartbeats once they are active, not before.
-        if message.message != HeartbeatState.INACTIVE.value:
+        # Nodes of this stack send heartbeats once they are active, not before. Viewers and recorders
+        # of the user only listen.
+        acts = message.hardware_id in _ACTING_ROLES
+        if acts and message.message != HeartbeatState.INACTIVE.value:
             self._active_elsewhere = message.name
 
     def _on_clock(self, message: Clock) -> None:
@@ -485,6 +487,9 @@ def _require_flyable(scenario: Scenario) -> None:
             "attitude."
         )
 
+
+_ACTING_ROLES = (Role.PLANT.value, Role.COMMANDER.value, Role.REPLAY.value)
+"""Roles of nodes that must not share a domain with those of another stack."""
 
 _NO_ERROR_TEXT = (
     "it wrote no error. If another stack is running in this ROS domain, the nodes of that stack "

@@ -246,6 +246,19 @@ def test_a_second_stack_in_a_domain_leaves_the_first_one_alone(
         plant.kill()
 
 
+def test_a_viewer_in_the_domain_is_no_other_stack(
+    spacerobot: Command, harness: Harness, ros_domain: int, tmp_path: Path
+) -> None:
+    probe = harness.probe({"heartbeat": DiagnosticStatus})
+    viewer = NodeProcess(tmp_path, ros_domain, "viewer", {"port": "0"})
+    try:
+        harness.spin_until(lambda: probe.count("heartbeat") > 0)
+        run = spacerobot("run", "planar_chain", "--nodes")
+        assert run.returncode == 0, run.stdout + run.stderr
+    finally:
+        viewer.kill()
+
+
 # -- stacks in namespaces ----------------------------------------------------------------------
 
 
