@@ -383,8 +383,8 @@ class MultiProcessStack:
         return {name: end_child(self.processes[name], waits) for name in names}
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
-        # Nodes of this stack send heartbeats once they are active, not before. Viewers and recorders
-        # of the user only listen.
+        # Nodes of this stack send heartbeats once they are active, not before. A user's viewers and
+        # recorders only listen.
         acts = message.hardware_id in _ACTING_ROLES
         if acts and message.message != HeartbeatState.INACTIVE.value:
             self._active_elsewhere = message.name

@@ -234,7 +234,7 @@ def test_a_given_duration_is_long_enough_or_refused(chain: SpaceRobot) -> None:
     assert schedule.duration == pytest.approx(4.0)
     shares = JointEfforts(chain, np.array([3.4, 1.6]), PERIOD).shares(schedule.positions)
     assert np.abs(shares).max() <= 0.85 * (1 + 1e-8)
-    with pytest.raises(PlanningError, match=r"= 1\.5 s: the fastest manoeuvre found takes 3"):
+    with pytest.raises(PlanningError, match=r"= 1\.5 s: the fastest one found takes 3"):
         plan(chain, **asked, **limited, duration=1.5)
     # The limits of the robot are kept where they can be: nobody asked for them.
     weak = SpaceRobot.from_urdf(with_effort_limits(CHAIN, {"pin_1": 3.4, "pin_2": 1.6}))

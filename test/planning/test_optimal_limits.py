@@ -261,7 +261,7 @@ def test_two_links_turn_but_not_in_place() -> None:
 @pytest.mark.slow
 def test_a_goal_that_takes_too_long_is_refused(arm: SpaceRobot) -> None:
     with pytest.raises(
-        PlanningError, match=r"within optimal\.longest = 3 s: the fastest manoeuvre found takes \d"
+        PlanningError, match=r"within optimal\.longest = 3 s: the fastest one found takes \d"
     ):
         of_arm(arm, [0.5, 0.5, 0.5], longest=3.0, starts=2, intervals=20)
 
