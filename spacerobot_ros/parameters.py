@@ -123,6 +123,8 @@ class Parameter:
         if isinstance(default, str):
             if not isinstance(value, str):
                 raise self._refusal(value, "a text")
+            if "\0" in value:
+                raise self._refusal(value.replace("\0", "\\0"), "a string without NUL characters")
             if self.excludes(value):
                 raise self._refusal(value, f"one of {', '.join(self.choices)}")
             return value
@@ -145,6 +147,8 @@ class Parameter:
             raise self._refusal(float(value), "a 64-bit integer")
         if not self.minimum <= value <= self.maximum:
             raise self._refusal(value, f"a number{self._range_text()}")
+        if not whole and not _is_moderate(value):
+            raise self._refusal(value, _MODERATE)
         return int(value) if whole else float(value)
 
     def _check_numbers(self, value: Any) -> tuple[float, ...] | tuple[str, ...]:
@@ -161,6 +165,8 @@ class Parameter:
             raise self._refusal(value, f"a list of {self.length} numbers")
         if not all(math.isfinite(x) and self.minimum <= x <= self.maximum for x in numbers):
             raise self._refusal(value, f"finite numbers{self._range_text()}")
+        if not all(map(_is_moderate, numbers)):
+            raise self._refusal(value, _MODERATE)
         return numbers
 
     def _check_lines(self, value: Any) -> tuple[str, ...]:
@@ -179,6 +185,15 @@ class Parameter:
         unit = f" ({self.unit})" if self.unit else ""
         shown = value if not isinstance(value, str) else f"'{value[:60]}'"
         return ParameterError(f"Parameter '{self.name}' is {shown}; it must be {expected}{unit}.")
+
+
+_SMALLEST, _LARGEST = 1e-100, 1e100
+_MODERATE = f"0 or from {_SMALLEST:g} to {_LARGEST:g} in magnitude"
+
+
+def _is_moderate(number: float) -> bool:
+    """Whether products of a number with others, and its square, are numbers that are not 0."""
+    return number == 0 or _SMALLEST <= abs(number) <= _LARGEST
 
 
 def _named_entries(value: Any) -> dict[str, Any] | None:

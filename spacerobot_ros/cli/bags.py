@@ -11,6 +11,7 @@ import click
 
 from spacerobot_ros.cli.options import (
     PATH,
+    NumberRange,
     bag_argument,
     beside,
     format_option,
@@ -148,7 +149,7 @@ def figures_command(
     is_flag=False,
     flag_value=100.0,
     default=0.0,
-    type=click.FloatRange(min=0.0),
+    type=NumberRange(min=0.0),
     metavar="[HZ]",
     help="Publish bag time on /clock HZ times per second (100 if HZ is omitted) [as recorded].",
 )
@@ -158,7 +159,7 @@ def figures_command(
     "--wait",
     default=3.0,
     show_default=True,
-    type=click.FloatRange(min=0.0),
+    type=NumberRange(min=0.0),
     help="Maximum wait for subscribers (s).",
 )
 def replay_command(
@@ -239,7 +240,7 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     "--tolerance",
     default=1e-9,
     show_default=True,
-    type=click.FloatRange(min=0.0),
+    type=NumberRange(min=0.0),
     help="Largest deviation treated as agreement (SI units; relative for values above 1).",
 )
 @click.option(

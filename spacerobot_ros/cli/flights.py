@@ -16,6 +16,7 @@ from spacerobot_ros.cli.options import (
     METHODS,
     GoalCommand,
     GoalOptions,
+    NumberRange,
     attitude_options,
     bag_option,
     complete_scenario,
@@ -56,14 +57,14 @@ if TYPE_CHECKING:
     "--realtime",
     is_flag=False,
     flag_value=1.0,
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=NumberRange(min=0.0, min_open=True),
     metavar="[FACTOR]",
     help="Fly with the nodes on the wall clock, at FACTOR times real time (1 if FACTOR is "
     "omitted).",
 )
 @click.option(
     "--longest",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=NumberRange(min=0.0, min_open=True),
     default=math.inf,
     metavar="SECONDS",
     help="Simulated time after which the flight is interrupted.",
@@ -295,7 +296,7 @@ def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
     "--rate",
     default=1.0,
     show_default=True,
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=NumberRange(min=0.0, min_open=True),
     help="Speed: ratio of simulated time to wall time.",
 )
 @click.option(
@@ -368,7 +369,7 @@ def up_command(
 @click.option(
     "--timeout",
     default=0.0,
-    type=click.FloatRange(min=0.0),
+    type=NumberRange(min=0.0),
     help="Maximum wait for the result, s of wall time; 0: no limit.",
 )
 def goal_command(

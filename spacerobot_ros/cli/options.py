@@ -29,16 +29,31 @@ else:  # click.Choice is generic only in newer versions of click.
     _Choice = click.Choice
 
 
-class _FilePath(click.Path):
-    """Path option that refuses ``-``, which only ``--json`` supports."""
+class _TextPath(click.Path):
+    """Path option that refuses names that are not UTF-8, which messages and bags cannot hold."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         if str(value) == "-" and not (param and "--json" in param.opts):
             self.fail("'-' is not supported here: name a file.", param, ctx)
+        try:
+            str(value).encode()
+        except UnicodeEncodeError:
+            self.fail(f"the name {str(value)!a} contains bytes that are not UTF-8.", param, ctx)
         return super().convert(value, param, ctx)
 
 
-PATH = _FilePath(path_type=Path)
+PATH = _TextPath(path_type=Path)
+
+
+class NumberRange(click.FloatRange):
+    """Number range that rejects NaN, which otherwise passes every range check."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return a number within the range."""
+        number = super().convert(value, param, ctx)
+        if math.isnan(number):
+            self.fail(f"{value} is not a number.", param, ctx)
+        return number
 
 
 class DefaultGroup(click.Group):

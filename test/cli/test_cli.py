@@ -241,6 +241,15 @@ def test_every_option_says_what_it_does() -> None:
     assert [name for name, option in options.items() if (option.help or "").startswith(".")] == []
 
 
+def test_no_range_of_an_option_has_nan_in_it() -> None:
+    options = [option for each in commands().values() for option in each.params]
+    ranges = [option for option in options if isinstance(option.type, click.FloatRange)]
+    assert {option.opts[0] for option in ranges} >= {"--longest", "--timeout", "--tolerance"}
+    for option in ranges:
+        with pytest.raises(click.BadParameter, match="nan is not a number"):
+            option.type.convert("nan", option, None)
+
+
 @pytest.mark.parametrize("words", [[], ["campaign"]])
 def test_the_list_of_commands_has_whole_sentences(words: list[str]) -> None:
     listed = CliRunner().invoke(main, [*words, "--help"]).output.partition("Commands:\n")[2]
@@ -411,6 +420,14 @@ def test_a_dash_is_no_file_to_write(option: str) -> None:
     assert ended.returncode == 2
     assert f"Invalid value for '{option}': '-' is not supported" in ended.stderr
     assert not Path("-").exists()
+
+
+@pytest.mark.parametrize("option", ["--bag", "--json", "--report"])
+def test_a_path_that_is_no_text_is_refused(option: str) -> None:
+    ended = started("run", "sliding_masses", option, b"out/\xff")
+    assert ended.returncode == 2
+    assert "bytes that are not UTF-8" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 # -- flights --------------------------------------------------------------------------------------

@@ -216,6 +216,15 @@ def test_the_command_starts_and_ends(
     assert capsys.readouterr().err == "Hung up.\n"
 
 
+def test_a_path_of_bytes_that_are_no_text_is_refused() -> None:
+    from spacerobot_ros.cli.options import PATH
+
+    assert PATH.convert("a", None, None) == Path("a")
+    with pytest.raises(click.BadParameter) as refused:
+        PATH.convert("a\udcff", None, None)
+    assert refused.value.message == "the name 'a\\udcff' contains bytes that are not UTF-8."
+
+
 def test_paths_of_end_effectors_are_read_from_files(tmp_path: Path) -> None:
     """After poses and positions; comments, commas and empty lines are left out."""
     places, poses = tmp_path / "places.txt", tmp_path / "poses.csv"
@@ -277,6 +286,21 @@ def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) ->
         refused = CliRunner().invoke(fly, ["sliding_masses", "--goal", *wrong])
         assert refused.exit_code == 2
         assert told in refused.output
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "sliding_masses", "--longest"],
+        ["goal", "1", "2", "3", "--timeout"],
+        ["verify", __file__, "--tolerance"],
+        ["replay", __file__, "--wait"],
+    ],
+)
+def test_a_duration_is_a_number(words: list[str]) -> None:
+    result = CliRunner().invoke(main, [*words, "nan"])
+    assert result.exit_code == 2
+    assert "nan is not a number" in result.output
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")

@@ -191,6 +191,8 @@ def test_gains_are_bounded_so_that_commands_are_numbers(law: str) -> None:
     for name in names:
         with pytest.raises(ParameterError, match=name.replace(".", r"\.")):
             configured(ControllerConfig, {"law": law, name: 1e300})
+    with pytest.raises(ParameterError, match=r"'max_force' is 1e[+]160; .* 1e-100 to 1e[+]100"):
+        configured(ControllerConfig, {"law": law, "max_force": 1e160})
     largest = configured(ControllerConfig, {"law": law, **dict.fromkeys(names, 1e9)})
     controller = build_controller(load("planar_manipulator"), largest)
     state = replace(planar_start(), qdot=np.array([0.5, -0.25]))

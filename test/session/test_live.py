@@ -538,6 +538,10 @@ def test_a_run_takes_the_next_name_if_its_recorder_is_to(tmp_path: Path) -> None
         ("plant", {"robot": "nothing"}, r"Parameter 'robot' is 'nothing'"),
         ("planner", {"method": "magic"}, r"Node 'planner': Parameter 'method' is 'magic'"),
         ("planner", {"spin": 1}, r"Node 'planner' has no parameter 'spin'"),
+        ("plant", {"target.sensors.rate": 1e-322}, "must be 0 or from 1e-100 to 1e[+]100"),
+        ("plant", {"sensors.position_bias": [0, 1e-200, 0]}, "must be 0 or from 1e-100"),
+        ("planner", {"optimal.max_base_rate": 1e-320}, "must be 0 or from 1e-100"),
+        ("plant", {"world": "a\0b"}, "a string without NUL characters"),
     ],
 )
 def test_bad_parameters_are_named(
