@@ -46,6 +46,7 @@ from spacerobot_ros.control.state import (
 from spacerobot_ros.control.wheels import WheelControl
 from spacerobot_ros.errors import (
     ParameterError,
+    PlanningError,
     SpaceRobotError,
     describe_exception,
 )
@@ -60,6 +61,9 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
+
+_LONGEST_MOTION = 1e9
+"""Longest duration of a reference, s, equal to that of the longest flights."""
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion if the base state is unknown, 1/s."""
@@ -230,6 +234,26 @@ class CoordinatedController:
         with self._failures_of_law(time):
             self.law.start(time, profile.start, profile.goal)
 
+    def require_bounded_duration(self, state: ControlState, goals: Reference) -> None:
+        """Reject goals whose reference would take longer than any flight.
+
+        Raises
+        ------
+        PlanningError
+            The reference takes too long; the message states its duration.
+        """
+        here = Reference.present(
+            self.law.robot, state, self.law.outputs.selection.end_effector_link
+        )
+        motion = self._motion_within_limits(state)
+        duration = self._profile_type(here, goals, motion).duration
+        if duration > _LONGEST_MOTION:
+            raise PlanningError(
+                f"The reference to the goal would take {duration:.3g} s, and the longest is "
+                f"{_LONGEST_MOTION:g} s: choose a nearer goal, or raise motion.speed, "
+                "motion.acceleration or the thruster limits."
+            )
+
     def _motion_within_limits(self, state: ControlState) -> MotionLimits:
         motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
         return motion if self.wheels is None else self.wheels.limits_with_wheels(motion, state.q)
@@ -360,16 +384,16 @@ class CoordinatedController:
                 self.gains_checked = True
                 if warning := self.law.sampling_warning():
                     warn_once(warning)
-            if isinstance(self.profile, PlannedReference):
-                planned = self.profile.actuation(
-                    time - self._began, self._control_period, self.law.joint_damping
-                )
-                if self.profile.uses_table:
-                    around_B = planned.wrench_B
-                if not self.law.follows_accelerations:
-                    commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
+            profile, follows = self.profile, self.law.follows_accelerations
             if self.coming_to_rest:
                 commanded = self._to_rest(state)
+            elif isinstance(profile, PlannedReference) and (profile.uses_table or not follows):
+                planned = profile.actuation(
+                    time - self._began, self._control_period, self.law.joint_damping
+                )
+                around_B = planned.wrench_B if profile.uses_table else None
+                if not follows:
+                    commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
         if state is not None:
             periods = self._periods_held(time)
             result = self.apply_limits(state, commanded, periods, around_B)
@@ -405,6 +429,8 @@ class CoordinatedController:
         """Return what wheels, if there are any, and then thrusters and joints give of a command."""
         if around_B is not None:
             correction = self._realised(wanted._replace(wrench_B=wanted.wrench_B - around_B))
+            if self.wheels is not None:
+                self.wheels.thrust = self.wheels.thrust + around_B
             return correction._replace(wrench_B=correction.wrench_B + around_B)
         wheels = self.wheels
         if wheels is None:

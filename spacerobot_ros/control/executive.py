@@ -522,6 +522,7 @@ class ControlExecutive:
             config = config_with(self._config, pending.tolerance)
             try:
                 require_controlled_axes(self.controller.law, state, config, goals)
+                self.controller.require_bounded_duration(state, goals)
             except PlanningError as error:
                 refused = [p for p, g in self._pending.items() if g.goal_id == pending.goal_id]
                 for part in refused:

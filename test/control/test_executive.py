@@ -90,6 +90,24 @@ def test_a_goal_out_of_the_plane_is_refused_and_the_earlier_one_goes_on(
     assert (loop.state, loop.status.goal_id) == ("tracking", "third")
 
 
+@pytest.mark.parametrize(
+    ("way", "force", "refused"), [(1e11, 1e12, True), (1e6, 1e12, False), (1.0, 1e-30, True)]
+)
+def test_a_goal_to_which_no_flight_lasts_long_enough_is_refused(
+    way: float, force: float, refused: bool
+) -> None:
+    """At 0.1 m/s, 1e11 m take more than 30,000 years; so does 1 m by 1e-30 N."""
+    loop = ExecutiveLoop(profile="quintic", max_force=force, max_torque=1e12)
+    loop.answer()
+    loop.aim(base=goal_at(np.array([way, 0.0, 0.0]), "far"))
+    loop.answer()
+    assert loop.state == ("holding" if refused else "tracking")
+    if refused:
+        (status,) = (each for each in loop.statuses if each.state is ControllerState.REFUSED)
+        assert status.goal_id == "far"
+        assert_one_sentence(status.message, " s, and the longest is 1e+09 s", "motion.speed")
+
+
 def test_without_a_goal_the_pose_of_the_first_state_is_held() -> None:
     loop = ExecutiveLoop()
     np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)

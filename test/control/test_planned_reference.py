@@ -7,6 +7,7 @@ from typing import Any
 
 import coal
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from support.sentences import assert_one_sentence
 
@@ -309,6 +310,36 @@ def test_the_cube_rests_at_every_waypoint_of_a_path() -> None:
     assert np.linalg.norm(place - flight.pose[:, :3], axis=1).max() < 5e-3
     force = np.linalg.norm(flight.commands["base_wrench"].values[:, :3], axis=1)
     assert force.max() > 0.5, "so that the test is sharp: max_force is 0.4"
+
+
+def test_a_robot_with_wheels_follows_a_plan_by_its_thrusters() -> None:
+    """The plan's thrust is beyond ``max_force``, and no wheel gives a part of it."""
+    shape = [*[0.0] * 4, 0.0, -1.2, 2.0, 0.0, 0.8, 0.0]
+    plant = {"robot": "servicer_wheels", "initial_joint_positions": shape}
+    limits = {"max_force": 8.0, "max_torque": 4.0, "plan.time_factor": 1.2}
+    scenario = load_scenario("servicer_thrusters").with_overrides("plant", plant)
+    controller = {"robot": "servicer_wheels", **limits}
+    flight = fly_scenario(scenario.with_overrides("coordinated_control", controller))
+    assert flight.outcome is Outcome.REACHED, flight.message
+    ((_, path),) = flight.paths
+    place, _ = path.at(flight.time[: len(flight.pose)])
+    assert np.linalg.norm(place - flight.pose[:, :3], axis=1).max() < 5e-3
+    force = np.linalg.norm(flight.commands["base_wrench"].values[:, :3], axis=1)
+    assert force.max() > 16.0, "so that the test is sharp"
+
+
+def test_a_robot_that_is_brought_to_rest_keeps_to_its_limits_during_a_plan() -> None:
+    rig = Follower(plan=replace(load_scenario("free_flyer").controller.plan, duration=0.0))
+    rig.answer()
+    rig.executive.submit("base", IdentifiedGoal(through_waypoints()))
+    rig.fly(until=1.0)
+    rig.answer()
+    controller = rig.executive.controller
+    moving = replace(rig.state, v_WB_B=np.array([0.3, -0.4, 0.1]))
+    controller.come_to_rest()
+    wrench = controller.command(rig.time, moving, np.zeros(0), np.zeros(0)).realised.wrench_B
+    assert np.linalg.norm(wrench[:3]) == pytest.approx(rig.config.max_force)
+    assert wrench[:3] @ [0.3, -0.4, 0.1] < 0
 
 
 def test_waypoints_that_were_passed_are_not_passed_again() -> None:
