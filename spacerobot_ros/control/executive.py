@@ -282,7 +282,8 @@ class ControlExecutive:
         if left < 2 * PLANNING_TIME:
             self._plan_next(_Next.BEGIN_ANEW)
         elif left < math.inf:
-            self._plan_anew(self._time)
+            # Until the plan takes over, the robot goes on.
+            self._plan_anew(self._time + PLANNING_TIME * self._planning.in_background)
 
     def _plan_anew(self, time: float) -> None:
         """Plan the rest of the motion to the pursued goals again."""

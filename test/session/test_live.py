@@ -10,7 +10,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -227,13 +227,25 @@ def test_bad_words_are_refused(spacerobot: Command, words: tuple[str, ...], ment
     assert "Traceback" not in run.stderr
 
 
+@contextmanager
+def active(
+    harness: Harness, folder: Path, domain: int, node: str, parameters: dict[str, str]
+) -> Iterator[NodeProcess]:
+    """A node that is started by itself, once it sends heartbeats."""
+    probe = harness.probe({"heartbeat": DiagnosticStatus})
+    process = NodeProcess(folder, domain, node, parameters)
+    try:
+        harness.spin_until(lambda: probe.count("heartbeat") > 0)
+        yield process
+    finally:
+        process.kill()
+
+
 def test_a_second_stack_in_a_domain_leaves_the_first_one_alone(
     spacerobot: Command, harness: Harness, ros_domain: int, tmp_path: Path
 ) -> None:
-    probe = harness.probe({"heartbeat": DiagnosticStatus})
-    plant = NodeProcess(tmp_path, ros_domain, "plant", {"robot": "sliding_masses"})
-    try:
-        harness.spin_until(lambda: probe.count("heartbeat") > 0)
+    robot = {"robot": "sliding_masses"}
+    with active(harness, tmp_path, ros_domain, "plant", robot) as plant:
         run = spacerobot("run", "planar_chain", "--nodes")
         assert run.returncode == 2
         assert run.stderr.splitlines()[-1] == (
@@ -242,21 +254,14 @@ def test_a_second_stack_in_a_domain_leaves_the_first_one_alone(
         )
         plant.signal(signal.SIGINT)
         assert plant.end() == 0, plant.said
-    finally:
-        plant.kill()
 
 
 def test_a_viewer_in_the_domain_is_no_other_stack(
     spacerobot: Command, harness: Harness, ros_domain: int, tmp_path: Path
 ) -> None:
-    probe = harness.probe({"heartbeat": DiagnosticStatus})
-    viewer = NodeProcess(tmp_path, ros_domain, "viewer", {"port": "0"})
-    try:
-        harness.spin_until(lambda: probe.count("heartbeat") > 0)
+    with active(harness, tmp_path, ros_domain, "viewer", {"port": "0"}):
         run = spacerobot("run", "planar_chain", "--nodes")
         assert run.returncode == 0, run.stdout + run.stderr
-    finally:
-        viewer.kill()
 
 
 # -- stacks in namespaces ----------------------------------------------------------------------
