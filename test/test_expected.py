@@ -14,7 +14,6 @@ from support.expected import (
     BAGS,
     CAMPAIGN_PAGES,
     COMMAND_TABLE,
-    MADE_REPORTS,
     PARAMETERS,
     PLANS,
     REPORTS,
@@ -25,14 +24,7 @@ from support.expected import (
     parameters,
     plans,
 )
-from support.figure_prints import (
-    MADE_FLIGHTS,
-    PARTS,
-    PICTURES,
-    analysis_prints,
-    made_part,
-    report_part,
-)
+from support.figure_prints import PARTS, analysis_prints, report_part
 from support.page_prints import CAMPAIGNS
 from support.search_prints import SEARCHES
 from support.viewer_prints import SITUATIONS, viewer_prints
@@ -108,21 +100,6 @@ def test_reports_stay_as_they_are(name: str, part: str) -> None:
     kept = json.loads(REPORTS.read_text("utf-8"))[name].get(part)
     problems = differences(report_part(name, part), kept)
     assert not problems, "\n".join([*problems[:40], WRITE])
-
-
-@pytest.mark.parametrize("part", PARTS)
-@pytest.mark.parametrize("name", MADE_FLIGHTS)
-def test_reports_of_made_up_flights_stay_as_they_are(name: str, part: str) -> None:
-    kept = json.loads(MADE_REPORTS.read_text("utf-8"))[name].get(part)
-    problems = differences(made_part(name, part), kept)
-    assert not problems, "\n".join([*problems[:40], WRITE])
-
-
-@pytest.mark.parametrize("name", PICTURES)
-def test_pictures_of_commands_stay_as_they_are(name: str) -> None:
-    kept = json.loads(REPORTS.read_text("utf-8"))[f"picture: {name}"]
-    problems = differences(PICTURES[name](), kept)
-    assert not problems, "\n".join([*problems, WRITE])
 
 
 @pytest.mark.parametrize("name", SITUATIONS)

@@ -14,13 +14,7 @@ from typing import Any
 
 import numpy as np
 from support.command_prints import command_prints, topic_prints
-from support.figure_prints import (
-    MADE_FLIGHTS,
-    PICTURES,
-    analysis_prints,
-    made_prints,
-    report_prints,
-)
+from support.figure_prints import analysis_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
 from support.search_prints import SEARCHES
@@ -49,7 +43,7 @@ from spacerobot_ros.viewer.server import ViewerConfig
 FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
 REPORTS, CAMPAIGN_PAGES = FOLDER / "reports.json", FOLDER / "campaigns.json"
-VIEWER, MADE_REPORTS = FOLDER / "viewer.json", FOLDER / "made_reports.json"
+VIEWER = FOLDER / "viewer.json"
 SEARCH = FOLDER / "search.json"
 COMMAND_TABLE, TOPIC_TABLE = FOLDER / "commands.json", FOLDER / "topics.json"
 BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
@@ -296,7 +290,6 @@ def main() -> None:
     """Write the files."""
     reports = {name: report_prints(name) for name in BAGS}
     reports |= {f"analysis of {name}": analysis_prints(name) for name in ANALYSED}
-    reports |= {f"picture: {name}": print_of() for name, print_of in PICTURES.items()}
     pages = {name: print_of() for name, print_of in CAMPAIGNS.items()}
     for path, content in (
         (COMMAND_TABLE, command_prints()),
@@ -305,7 +298,6 @@ def main() -> None:
         (PLANS, plans()),
         (REPORTS, reports),
         (CAMPAIGN_PAGES, pages),
-        (MADE_REPORTS, {name: made_prints(name) for name in MADE_FLIGHTS}),
         (SEARCH, {name: print_of() for name, print_of in SEARCHES.items()}),
         (VIEWER, {name: viewer_prints(name) for name in SITUATIONS}),
     ):

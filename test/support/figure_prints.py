@@ -13,11 +13,10 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -31,23 +30,13 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Annotation, Text
-from scipy.spatial.transform import Rotation
-from support.made_flights import made_flight
 
-from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.analysis import analyze
-from spacerobot_ros.planning.core.workspaces import Workspaces
-from spacerobot_ros.report import figures_space, planning_figures
-from spacerobot_ros.report.events import _MARKS, draw_events, event_style, event_text
 from spacerobot_ros.report.figures import (
     WIDTH,
-    PictureFormat,
     ReportFigure,
     drawing,
-    new_figure,
-    panel,
 )
 from spacerobot_ros.report.figures_over_time import (
     momentum_figure,
@@ -59,7 +48,6 @@ from spacerobot_ros.report.page import charts_of, page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.planning_figures import _planar_figure, _spatial_figure
 from spacerobot_ros.report.player import view_of_flight
-from spacerobot_ros.report.solids import PlacedSolid, View
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
@@ -127,45 +115,6 @@ PARTS: dict[str, Callable[[FlightReport], Any]] = {
 """The parts of a report by name; None where a bag has nothing for one."""
 
 
-MADE_FLIGHTS = ("cycles", "controlled", "planar", "bare")
-
-
-class _RecordingCanvas:
-    """Takes the faces and edges of a robot instead of drawing them."""
-
-    found: ClassVar[list[str]] = []
-
-    def __init__(self, view: View, low: Any, high: Any, width: int) -> None:
-        self.found.append(f"{_numbers(view.paper_axes)} {_numbers(low)} {_numbers(high)} {width}")
-
-    def draw(self, solids: Sequence[PlacedSolid]) -> None:
-        for solid in solids:
-            parts = (solid.corners, solid.normals, solid.edges, solid.edge_normals, solid.fill)
-            # A sum with weights of their own for all numbers.
-            numbers = np.concatenate([np.ravel(each) for each in parts])
-            weights = 1.0 + np.arange(len(numbers)) % 101
-            self.found.append(f"{len(solid.corners)} {_numbers(numbers @ weights)}")
-
-    def image(self) -> Any:
-        return np.zeros((1, 1, 4))
-
-
-def made_prints(name: str) -> dict[str, Any]:
-    """Return the parts of the report of a made-up flight that has them."""
-    found = {part: made_part(name, part) for part in PARTS}
-    return {part: content for part, content in found.items() if content is not None}
-
-
-def made_part(name: str, part: str) -> Any:
-    """Return a part of the report of a made-up flight, and what was drawn of the robot."""
-    _RecordingCanvas.found.clear()
-    with patch.object(figures_space, "Canvas", _RecordingCanvas):
-        content = json.loads(json.dumps(PARTS[part](made_flight(name))))
-    if _RecordingCanvas.found:
-        content |= {"robots": _digest(_RecordingCanvas.found)}
-    return content
-
-
 def report_part(name: str, part: str) -> Any:
     """Return a part of the report of a reference flight: a table, a figure or the 3D view."""
     return json.loads(json.dumps(PARTS[part](_flight(name))))
@@ -192,88 +141,6 @@ def analysis_prints(name: str) -> dict[str, str]:
     with drawing():
         draw = _planar_figure if found.planar.controllable else _spatial_figure
         return prints_of(draw(found))
-
-
-def _coarse_map(name: str, joints: tuple[int, int, int], shape: list[float]) -> dict[str, str]:
-    """Return the maps of curvature of a robot on a coarse grid, at a shape and of some joints."""
-    robot = SpaceRobot.from_file(robot_file(name))
-    conditions = np.array([3.0, 1.5, np.inf, 40.0, 7.0])
-    nominal = SimpleNamespace(joints=joints)
-    found: Any = SimpleNamespace(
-        robot=robot, nominal=nominal, shape=np.array(shape), conditions=conditions
-    )
-    with drawing(), patch.multiple(planning_figures, _FINE_GRID=5, _COARSE_GRID=4):
-        return prints_of(planning_figures._spatial_figure(found))
-
-
-def _workspaces() -> dict[str, str]:
-    """Return the picture of workspaces in space and, where joints turn freely, in a plane."""
-    found: Any = SimpleNamespace(
-        workspaces=(
-            Workspaces("hand <1>", True, (0.1, 1.9), ((0.1, 0.3), (0.8, 0.8), (1.4, 1.9)), 3, 9),
-            Workspaces("hand <1>", False, (0.0, 2.1), ((0.5, 0.7),), 2, 4),
-        )
-    )
-    drawn: dict[str, str] = {}
-
-    def picture(figure: Figure, format: PictureFormat) -> bytes:
-        drawn.update(prints_of(figure))
-        drawn["format"] = format.value
-        return b""
-
-    with patch.object(planning_figures, "picture_of", picture):
-        planning_figures.draw_workspaces(found, PictureFormat.PDF)
-    return drawn
-
-
-def _plan() -> dict[str, str]:
-    """Return the picture of a plan of three ticks for two sliders and a joint that turns."""
-    positions = np.array([[0.0, 0.1, -0.2], [0.05, 0.1, -0.1], [0.07, 0.0, 0.1], [0.04, -0.1, 0.1]])
-    turns = Rotation.from_rotvec(np.outer([0.0, 0.1, 0.25, 0.4], [0.2, -0.5, 0.8]))
-    path = SimpleNamespace(
-        time=np.array([0.0, 0.125, 0.25, 0.375]),
-        position=np.outer([0.0, 0.01, 0.03, 0.02], [1.0, -2.0, 0.5]),
-        quaternion=turns.as_quat(),
-    )
-    trial: Any = SimpleNamespace(positions=positions, path=path, method="some", duration=0.375)
-    units = [SimpleNamespace(unit=unit) for unit in ("m", "m", "rad")]
-    robot = SimpleNamespace(
-        joint_names=("left", "right", "wrist"), description=SimpleNamespace(movable_joints=units)
-    )
-    goal = Goal(
-        position=np.array([0.03, -0.05, 0.0]),
-        quaternion=Rotation.from_rotvec([0.1, -0.15, 0.3]).as_quat(),
-    )
-    problem: Any = SimpleNamespace(robot=robot, goal=goal, control_period=0.125)
-    with drawing():
-        return prints_of(planning_figures._plan_figure(problem, trial))
-
-
-def _events() -> dict[str, str]:
-    """Return the looks of all kinds of events on a page and in the picture below a time axis."""
-    kinds = list(_MARKS)
-    about = {"fault": "joint_stuck elbow", "method": "some", "node": "/plant", "goal_id": "7.5"}
-    events = [
-        (0.5 * number, Event(kind, "Something.", about=about)) for number, kind in enumerate(kinds)
-    ]
-    found = {kind.value: _command(event_style(kind)) for kind in kinds}
-    found |= {f"text of {each.kind.value}": event_text(each) for _, each in events}
-    with drawing():
-        figure = new_figure(3.0)
-        axes = panel(figure, 0.75, 1.0, 6.0, 1.5)
-        axes.set_xlim(0.25, 5.0)
-        draw_events(axes, events)
-        return found | prints_of(figure)
-
-
-PICTURES: dict[str, Callable[[], dict[str, str]]] = {
-    "marks of events": _events,
-    "maps of an arm": lambda: _coarse_map("three_joint_arm", (0, 1, 2), [0.1, -0.7, 1.5]),
-    "maps of sliders": lambda: _coarse_map("sliding_masses", (0, 2, 1), [0.1, -0.2, 0.3]),
-    "workspaces": _workspaces,
-    "plan": _plan,
-}
-"""Pictures of ``analyze`` and ``plan`` from made-up analyses and plans."""
 
 
 def _command(command: Any) -> str:
