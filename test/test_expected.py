@@ -17,7 +17,6 @@ from support.expected import (
     PARAMETERS,
     PLANS,
     REPORTS,
-    SEARCH,
     TOPIC_TABLE,
     VIEWER,
     differences,
@@ -26,7 +25,6 @@ from support.expected import (
 )
 from support.figure_prints import PARTS, analysis_prints, report_part
 from support.page_prints import CAMPAIGNS
-from support.search_prints import SEARCHES
 from support.viewer_prints import SITUATIONS, viewer_prints
 
 WRITE = "If this is wanted, `make expected` writes the file anew."
@@ -84,13 +82,6 @@ def test_commands_and_topics_stay_as_they_are(
 
 def test_plans_stay_as_they_are() -> None:
     problems = differences(as_kept(plans()), json.loads(PLANS.read_text("utf-8")))
-    assert not problems, "\n".join([*problems[:40], WRITE])
-
-
-@pytest.mark.parametrize("name", SEARCHES)
-def test_the_way_to_a_manoeuvre_stays_as_it_is(name: str) -> None:
-    kept = json.loads(SEARCH.read_text("utf-8"))[name]
-    problems = differences(as_kept(SEARCHES[name]()), kept)
     assert not problems, "\n".join([*problems[:40], WRITE])
 
 

@@ -17,7 +17,6 @@ from support.command_prints import command_prints, topic_prints
 from support.figure_prints import analysis_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
-from support.search_prints import SEARCHES
 from support.viewer_prints import SITUATIONS, viewer_prints
 
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
@@ -44,7 +43,6 @@ FOLDER = Path(__file__).parents[1] / "expected"
 PARAMETERS, PLANS = FOLDER / "parameters.json", FOLDER / "plans.json"
 REPORTS, CAMPAIGN_PAGES = FOLDER / "reports.json", FOLDER / "campaigns.json"
 VIEWER = FOLDER / "viewer.json"
-SEARCH = FOLDER / "search.json"
 COMMAND_TABLE, TOPIC_TABLE = FOLDER / "commands.json", FOLDER / "topics.json"
 BAGS = ("arm_attitude", "planar_chain", "servicer_thrusters", "sliding_masses")
 ANALYSED = ("planar_chain", "three_joint_arm")
@@ -298,7 +296,6 @@ def main() -> None:
         (PLANS, plans()),
         (REPORTS, reports),
         (CAMPAIGN_PAGES, pages),
-        (SEARCH, {name: print_of() for name, print_of in SEARCHES.items()}),
         (VIEWER, {name: viewer_prints(name) for name in SITUATIONS}),
     ):
         path.write_text(json.dumps(content, indent=1) + "\n", "utf-8")
