@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from spacerobot_ros.control import (
     LAWS,
     Actuation,
-    ActuatorLimits,
     ControlLaw,
     ControlState,
     GainPair,
@@ -130,29 +129,11 @@ def law_of(name: str, robot: SpaceRobot, gains: Gains, **options: float) -> Cont
 class Flight:
     """What a closed loop did, sampled at ticks."""
 
-    times: list[float] = field(default_factory=list)
     states: list[ControlState] = field(default_factory=list)
     errors: list[Array] = field(default_factory=list)
     """Of the law's outputs against the reference of the tick."""
     actuations: list[Actuation] = field(default_factory=list)
-    """As realised."""
     statuses: list[LawStatus] = field(default_factory=list)
-    end_effector: list[Array] = field(default_factory=list)
-    """Position of the end-effector, from the plant."""
-    limited: int = 0
-    """Ticks in which something was limited."""
-
-    def at(self, time: float) -> int:
-        """Return the index of a time."""
-        return int(np.argmin(np.abs(np.array(self.times) - time)))
-
-    @property
-    def peak_force(self) -> float:
-        return max(float(np.linalg.norm(a.wrench_B[:3])) for a in self.actuations)
-
-    @property
-    def peak_torque(self) -> float:
-        return max(float(np.linalg.norm(a.wrench_B[3:])) for a in self.actuations)
 
 
 def fly(
@@ -161,25 +142,17 @@ def fly(
     reference: Callable[[float], Reference],
     duration: float,
     rate: float = 100.0,
-    limits: ActuatorLimits | None = None,
     every: int = 1,
 ) -> Flight:
     """Close the loop over a plant: commands are held for a tick; every so many are sampled."""
     flight = Flight()
     for tick in range(round(duration * rate) + 1):
-        time = tick / rate
-        actuation = law.command(plant.state, reference(time))
-        if limits is not None:
-            saturated = limits.apply(actuation)
-            flight.limited += saturated.limited
-            actuation = saturated.realised
+        actuation = law.command(plant.state, reference(tick / rate))
         if tick % every == 0:
-            flight.times.append(time)
             flight.states.append(plant.state)
             flight.errors.append(law.error)
             flight.actuations.append(actuation)
             flight.statuses.append(law.status)
-            flight.end_effector.append(plant.frame(END_EFFECTOR)[0])
         plant.step(actuation, 1 / rate)
     return flight
 

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.executive_loop import (
     AIM,
-    KD,
     KP,
     PERIOD,
     SHAPE,
@@ -31,7 +30,6 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.control import (
     ControlState,
-    Gains,
     JointReference,
     PoseReference,
     Reference,
@@ -106,28 +104,6 @@ def test_a_goal_to_which_no_flight_lasts_long_enough_is_refused(
         (status,) = (each for each in loop.statuses if each.state is ControllerState.REFUSED)
         assert status.goal_id == "far"
         assert_one_sentence(status.message, " s, and the longest is 1e+09 s", "motion.speed")
-
-
-def test_without_a_goal_the_pose_of_the_first_state_is_held() -> None:
-    loop = ExecutiveLoop()
-    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
-    assert loop.state == "holding"
-    loop.place = np.array([0.1, -0.2, 0.0])
-    np.testing.assert_allclose(loop.answer()[0][:3], -2 * KP * loop.place, atol=1e-12)
-    assert loop.status.goal_id == ""
-
-
-def test_both_goals_are_pursued() -> None:
-    loop = ExecutiveLoop()
-    loop.answer()
-    up = np.array([0.0, 1.0, 0.0])
-    loop.aim(base=goal_at(AIM, "1.000000001"), end_effector=goal_at(TIP + up, "1.000000001"))
-    np.testing.assert_allclose(loop.answer()[0][:3], KP * (AIM + up), atol=1e-12)
-    assert loop.state == "tracking"
-    assert loop.status.command is not None
-    assert loop.status.command.errors["base.x"] == pytest.approx(0.5)
-    assert loop.status.command.errors["end_effector.y"] == pytest.approx(1.0)
-    assert loop.status.goal_id == "1.000000001"
 
 
 def test_the_other_goal_stays_when_one_is_replaced_and_the_status_is_about_the_latest() -> None:
@@ -342,15 +318,6 @@ def test_tolerances_that_change_in_flight_take_effect(key: str) -> None:
     assert loop.state == "reached"
 
 
-def test_gains_that_change_in_flight_take_effect() -> None:
-    loop = ExecutiveLoop()
-    loop.aim(base=goal_at([1.0, 0.0, 0.0]))
-    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
-    loop.configure(gains=Gains.uniform(70.0, KD))
-    loop.velocity = np.array([0.0, 0.5, 0.0])
-    np.testing.assert_allclose(loop.answer()[0][:3], [140.0, -2 * KD * 0.5, 0.0], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("key", "settings"),
     [
@@ -381,23 +348,6 @@ def test_a_refusal_is_reported_of_its_goal_and_the_earlier_one_goes_on() -> None
 
 
 # -- abort ------------------------------------------------------------------------------------
-
-
-def test_abort_holds_the_robot_where_it_is() -> None:
-    loop = ExecutiveLoop(settle_time=0.0)
-    loop.aim(base=goal_at([1.0, 0.0, 0.0], "4"))
-    loop.answer()
-    loop.place = np.array([0.25, 0.0, 0.0])
-    loop.executive.abort()
-    np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
-    assert (loop.state, loop.status.state.level, loop.status.goal_id) == ("aborted", 1, "4")
-    loop.answer(3)
-    assert loop.state == "aborted"
-    assert_one_sentence(loop.status.message, "Aborted on request")
-    # A new goal is taken up from there.
-    loop.aim(base=goal_at([1.25, 0.0, 0.0], "5"))
-    np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
-    assert (loop.state, loop.status.goal_id) == ("tracking", "5")
 
 
 @pytest.mark.parametrize("key", ["base", "end_effector"])

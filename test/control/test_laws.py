@@ -14,6 +14,8 @@ from control.flights import (
     INVERTIBLE,
     PLANAR_GAINS,
     PLANAR_GOAL,
+    SERVICER_GAINS,
+    SERVICER_SHAPE,
     Array,
     Flight,
     fly,
@@ -37,6 +39,7 @@ from control.servicer_motion import (
 )
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
+from support.random_robots import random_robot_urdf
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros import fly as fly_robot
@@ -46,16 +49,20 @@ from spacerobot_ros.control import (
     ControlLaw,
     ControlState,
     Gains,
+    JointReference,
     LawOptions,
+    OutputSelection,
     PoseReference,
     Reference,
     TargetNotSetError,
 )
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.control.state import JointReference
+from spacerobot_ros.control.laws.model_based import ModelBasedLaw
+from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.parameters import configured, declared, parameter
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_names
@@ -623,3 +630,119 @@ def _turner(hull: float, wheel: float) -> str:
         '<joint name="turn" type="continuous"><parent link="hull"/><child link="wheel"/>'
         '<axis xyz="0 0 1"/><limit velocity="600" effort="0.2"/></joint></robot>'
     )
+
+
+# -- paper 3's efforts, and outputs fewer than degrees of freedom --------------------------------
+
+ROBOTS = ("planar_chain", "random_0", "random_1", "random_2", "servicer")
+
+
+def robot_of(name: str) -> SpaceRobot:
+    if not name.startswith("random"):
+        return load(name)
+    seed = int(name[-1])
+    return SpaceRobot.from_urdf(random_robot_urdf(np.random.default_rng(seed), 4 + seed))
+
+
+def law_for(robot: SpaceRobot, kp: float, kd: float) -> ControlLaw:
+    law = LAWS["computed_torque"]
+    return law(robot, law.default_outputs(robot, ""), Gains.uniform(kp, kd))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_shape_obeys_the_commanded_acceleration(name: str) -> None:
+    """Eqs (7-9), at any momentum: ``qddot = u`` by Pinocchio."""
+    rng = np.random.default_rng(30)
+    robot = robot_of(name)
+    state = random_state(rng, robot.n)
+    joints = JointReference(*rng.uniform(-1, 1, (3, robot.n)))
+    actuation = law_for(robot, 3.0, 2.0).command(state, Reference(joints=joints))
+    u = joints.qddot + 2.0 * (joints.qdot - state.qdot) + 3.0 * (joints.q - state.q)
+    _, qddot = plant_of(robot, state).acceleration(actuation)
+    np.testing.assert_allclose(qddot, u, atol=1e-10)
+    np.testing.assert_array_equal(actuation.wrench_B, 0.0)
+
+
+def test_shape_settles_like_a_double_integrator() -> None:
+    """Kp = 1, Kd = 2: ``e(t) = e0 (1 + t) exp(-t)``."""
+    robot = load("planar_chain")
+    start = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(2))
+    goal = Reference(joints=JointReference.at_rest(np.array([1.0, -0.5])))
+    law, plant = law_for(robot, 1.0, 2.0), plant_of(robot, start)
+    for tick in range(1, 501):
+        plant.step(law.command(plant.state, goal), 0.002)
+        t = 0.002 * tick
+        expected = np.array([1.0, -0.5]) * (1.0 - (1.0 + t) * np.exp(-t))
+        np.testing.assert_allclose(plant.state.q, expected, atol=2e-3)
+
+
+def test_outputs_are_all_joints_in_the_order_of_the_model() -> None:
+    robot = load("planar_chain")
+    law = LAWS["computed_torque"]
+    gains = Gains.uniform(1.0, 2.0)
+    assert law(robot, OutputSelection(joints=("pin_2", "pin_1")), gains).outputs.labels == (
+        "joint.pin_1",
+        "joint.pin_2",
+    )
+    for refused in (
+        OutputSelection(joints=("pin_1",)),
+        OutputSelection(base=("x",), joints=("pin_1", "pin_2")),
+    ):
+        with pytest.raises(ParameterError, match="the joints pin_1, pin_2"):
+            law(robot, refused, gains)
+
+
+# -- fewer outputs than degrees of freedom: what the other motion does ---------------------------
+
+
+def test_null_space_damping_and_posture() -> None:
+    """Three outputs of twelve: the rest comes to rest, or moves towards the posture."""
+    robot = load("servicer")
+    rng = np.random.default_rng(5)
+    start = ControlState(
+        np.zeros(3),
+        np.array([0.0, 0.0, 0.0, 1.0]),
+        rng.uniform(-0.05, 0.05, 3),
+        rng.uniform(-0.05, 0.05, 3),
+        SERVICER_SHAPE,
+        rng.uniform(-0.1, 0.1, 6),
+    )
+    posture = SERVICER_SHAPE + np.array([0.2, 0.2, -0.3, 0.1, 0.2, 0.4])
+    goal = Reference(end_effector=pose([1.8, 0.2, 0.4]), joints=JointReference.at_rest(posture))
+    selection = OutputSelection(end_effector=("x", "y", "z"), end_effector_link=END_EFFECTOR)
+    away = {}
+    for stiffness in (0.0, 1.0):
+        law = ModelBasedLaw(
+            robot,
+            selection,
+            Gains.uniform(1.0, 2.0),
+            ModelBasedLaw.Options(null_space_damping=2.0, posture_stiffness=stiffness),
+        )
+        flight = fly(plant_of(robot, start), law, lambda _: goal, 12.0, rate=25.0, every=10)
+        last = flight.states[-1]
+        assert np.abs(flight.errors[-1]).max() < 1e-3
+        speed = np.abs(np.concatenate([last.v_WB_B, last.omega_WB_B, last.qdot])).max()
+        assert speed < (5e-3 if stiffness else 1e-4)
+        away[stiffness] = last.q - posture
+    # The pull is weighed by inertia: the heavy inner joints follow it first.
+    assert np.abs(away[1.0][:3]).max() < 0.1
+    assert np.abs(away[0.0][:3]).max() > 0.2
+    assert np.linalg.norm(away[1.0]) < 0.7 * np.linalg.norm(away[0.0])
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.5])
+def test_joint_damping_of_the_transposed_jacobian(damping: float) -> None:
+    """Nine outputs of twelve: the wrist swings on unless it is damped."""
+    robot = load("servicer")
+    still = ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), SERVICER_SHAPE)
+    start = replace(still, qdot=np.array([0.0, 0.0, 0.0, 0.4, -0.3, 0.5]))
+    law = TransposedJacobianLaw(
+        robot,
+        OutputSelection(AXES, ("x", "y", "z"), (), END_EFFECTOR),
+        SERVICER_GAINS["transposed_jacobian"],
+        TransposedJacobianLaw.Options(joint_damping=damping),
+    )
+    goal = Reference.present(robot, still, END_EFFECTOR)
+    flight = fly(plant_of(robot, start), law, lambda _: goal, 12.0, rate=50.0, every=10)
+    moving = np.abs(flight.states[-1].qdot).max()
+    assert moving < 0.01 if damping else moving > 0.1

@@ -14,7 +14,6 @@ from control.flights import (
     SERVICER_GAINS,
     SERVICER_GOAL,
     SERVICER_PACE,
-    Flight,
     fly,
     law_of,
     load,
@@ -34,13 +33,10 @@ from support.slow import some_fast
 from spacerobot_ros.control import (
     PROFILES,
     Actuation,
-    ActuatorLimits,
     ControlState,
     DeadReckoning,
-    MotionLimits,
     PoseReference,
     Reference,
-    ReferenceProfile,
 )
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
@@ -49,11 +45,6 @@ from spacerobot_ros.model.inverse_kinematics import FixedBaseArm, is_reached
 
 MILLIMETRE = 1e-3
 TENTH_OF_A_DEGREE = np.radians(0.1)
-
-
-def profile_of(name: str, pace: MotionLimits = SERVICER_PACE) -> ReferenceProfile:
-    present = Reference.present(load("servicer"), servicer_start(), END_EFFECTOR)
-    return PROFILES[name](present, SERVICER_GOAL, pace)
 
 
 def assert_arrived(plant: PinocchioPlant) -> None:
@@ -67,25 +58,6 @@ def assert_arrived(plant: PinocchioPlant) -> None:
         turn = Rotation.from_quat(goal.quaternion) * Rotation.from_matrix(attitude).inv()
         assert np.linalg.norm(position - goal.position) < MILLIMETRE, link
         assert turn.magnitude() < TENTH_OF_A_DEGREE, link
-
-
-def flown(
-    name: str,
-    profile: ReferenceProfile,
-    settling: float,
-    *,
-    believed: SpaceRobot | None = None,
-    limits: ActuatorLimits | None = None,
-    rate: float = 100.0,
-) -> Flight:
-    """Fly the profile and some time longer; both poses must have been reached by then."""
-    robot = load("servicer")
-    law = law_of(name, believed or robot, SERVICER_GAINS[name])
-    plant = plant_of(robot, servicer_start())
-    duration = profile.duration + settling
-    flight = fly(plant, law, profile.at, duration, rate, limits=limits, every=5)
-    assert_arrived(plant)
-    return flight
 
 
 def ten_percent_heavier() -> Callable[[], float]:
@@ -106,8 +78,13 @@ def test_both_poses_are_reached_with_wrong_masses(
 ) -> None:
     """Law (27) believes other masses and inertias; law (29) knows none."""
     believed = scaled_robot(load("servicer"), error())
+    law = law_of("model_based", believed, SERVICER_GAINS["model_based"])
+    present = Reference.present(load("servicer"), servicer_start(), END_EFFECTOR)
+    reference = PROFILES[profile](present, SERVICER_GOAL, SERVICER_PACE)
     settling = 12.0 if profile == "step" else 5.0
-    flown("model_based", profile_of(profile), settling, believed=believed, rate=50.0)
+    plant = plant_of(load("servicer"), servicer_start())
+    fly(plant, law, reference.at, reference.duration + settling, rate=50.0)
+    assert_arrived(plant)
 
 
 # -- dead reckoning against the plant: paper 4, end of section IV --------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -162,28 +161,6 @@ def test_a_law_that_fails_is_the_reason_for_the_end_of_its_goal(
     assert "deactivated" not in message
     assert loop.status["goal_id"] == goal_id
     loop.harness.spin_until(lambda: not loop.node.is_active, "the node is inactive")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("group", "settings"),
-    [
-        ("base", {"law": "computed_torque"}),
-        ("end_effector", {"law": "computed_torque"}),
-        ("end_effector", {"base_outputs": "x y rz", "joint_outputs": "shoulder elbow"}),
-    ],
-)
-def test_a_goal_for_what_is_not_controlled_is_refused(
-    harness: Harness, group: str, settings: dict[str, Any]
-) -> None:
-    loop = Loop(harness, **settings)
-    loop.answer()
-    loop.goals[group].publish(pose([1.0, 0.0, 0.0]))
-    law = settings.get("law", "transposed_jacobian")
-    refusal = loop.wait_for("refused").message
-    assert_one_sentence(refusal, law, group.replace("_", "-"), "joint.shoulder")
-    wrench, effort = loop.answer()
-    np.testing.assert_allclose([*wrench, *effort], 0.0, atol=1e-12)
 
 
 # -- abort, life ------------------------------------------------------------------------------
