@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.planning.core.schedule import held_velocities
 
 _MAX_EXCESS = 1e-6
 """Fraction of a limit by which an effort may exceed it through rounding errors."""
@@ -110,10 +111,8 @@ class JointEfforts:
         self, positions: Array, velocity: Array | float, after: Array | float
     ) -> tuple[Array, Array]:
         """Return the joint rates and their changes a second (N + 1, n) at the ticks."""
-        rates = np.diff(positions, axis=0) / self._period
-        first, last = (np.broadcast_to(x, (1, positions.shape[1])) for x in (velocity, after))
-        held, next_held = np.vstack([first, rates]), np.vstack([rates, last])
-        return (held + next_held) / 2, (next_held - held) / self._period
+        held = held_velocities(positions, self._period, velocity, after)
+        return (held[:-1] + held[1:]) / 2, np.diff(held, axis=0) / self._period
 
     def _effort_shares(
         self,

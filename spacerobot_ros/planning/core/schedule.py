@@ -125,6 +125,19 @@ class GaitSchedule:
         return np.diff(self.positions, axis=0) / self.control_period
 
 
+def held_velocities(
+    positions: Array, period: float, before: Array | float = 0.0, after: Array | float = 0.0
+) -> Array:
+    """Return the joint velocities (N + 2, n) held before, between and after ticks.
+
+    ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds; ``before`` and ``after``
+    (n,) are the velocities before the first tick and after the last.
+    """
+    ends = np.zeros((2, positions.shape[1]))
+    ends[0], ends[1] = before, after
+    return np.vstack([ends[:1], np.diff(positions, axis=0) / period, ends[1:]])
+
+
 _MIN_JOINT_MOTION = 1e-9  # m or rad
 
 

@@ -316,8 +316,7 @@ class TwistFollower:
         self._clearance = clearance
         self._required: Array | None = None
         """Distances (P,), m, that pairs of bodies must keep, determined at the first shape."""
-        turning = BaseRotations.of(robot)
-        axes = turning.axes if turning.loops_turn_base else np.zeros((0, 3))
+        axes = BaseRotations.of(robot).loop_axes
         (directions,) = EndEffectorRows(robot, [(link, True)], axes).directions
         self._displacements, self._rotations = directions.displacements, directions.rotations
         kept = len(axes) if self._keeps_attitude else 0

@@ -717,12 +717,11 @@ class ResolvedRateGait(GaitMethod):
         the goal lies off these directions, or has more of them than the joints can follow.
         """
         robot = self.robot
-        turning = BaseRotations.of(robot)
-        axes = turning.axes if turning.loops_turn_base else np.zeros((0, 3))
         goals = list(goal.end_effectors)
         if self.options.keep_attitude:
             goals.append(EndEffectorGoal(robot.base_link, state.position, state.quaternion))
-        rows = EndEffectorRows(robot, [(x.link, x.quaternion is not None) for x in goals], axes)
+        links = [(x.link, x.quaternion is not None) for x in goals]
+        rows = EndEffectorRows(robot, links, BaseRotations.of(robot).loop_axes)
         tolerances = tolerance.position, tolerance.attitude
         rows.require_directions(state, goals, tolerances)
         for point in waypoints:

@@ -331,8 +331,7 @@ class EndEffectorSpecification:
         links = [(each.link, each.quaternion is not None) for each in goal.end_effectors]
         if position:
             links.append((robot.base_link, False))
-        axes = base.base_rotations.axes if base.base_rotations.loops_turn_base else np.zeros((0, 3))
-        rows = EndEffectorRows(robot, links, axes)
+        rows = EndEffectorRows(robot, links, base.base_rotations.loop_axes)
         rank, count = rows.rank(attitude)
         shape = goal.joint_positions is not None
         return cls(rows, base, attitude, position, shape, rank < count)
@@ -477,7 +476,6 @@ class EndEffectorSpecification:
         """Return ends of guesses, those that the joints reach soonest first, or NotFoundError."""
         rng = np.random.default_rng(0)
         middle, half = limits.joint_ranges(start)
-        speed = np.where(np.isfinite(limits.velocity), limits.velocity, half)
         nearest = np.inf
         for count, follows in ((_STARTS, True), (_STARTS, False), (_ADDITIONAL_STARTS, False)):
             # From here, from nearby, and from anywhere.
@@ -491,7 +489,8 @@ class EndEffectorSpecification:
                 shapes, start, limits, parameters, turns, fixed=self.attitude
             )
             nearest = min(nearest, float(miss.min()))
-            times = np.abs((shapes - start) / np.maximum(speed, 1e-9)).max(axis=1)
+            speeds = np.maximum(limits.speeds(start), 1e-9)
+            times = np.abs((shapes - start) / speeds).max(axis=1)
             ends: list[PossibleEnd] = []
             for k in np.argsort(times, kind="stable"):
                 scaled = [np.abs((shapes[k] - end.shape) / np.maximum(half, 1e-9)) for end in ends]

@@ -288,6 +288,11 @@ class BaseRotations:
     turns_base: bool
     loops_turn_base: bool
 
+    @property
+    def loop_axes(self) -> Array:
+        """Axes (m, 3) about which closed shape loops rotate the base; none if they do not."""
+        return self.axes if self.loops_turn_base else np.zeros((0, 3))
+
     @classmethod
     def of(cls, robot: SpaceRobot) -> BaseRotations:
         """Test a robot at a few shapes in general position."""

@@ -41,6 +41,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.core.schedule import held_velocities
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_shape_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
@@ -285,9 +286,8 @@ class ManoeuvreModel:
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:
-            speed, _ = _speeds_and_half_ranges(positions[0], limits)
             # The others make up for joints at the end of their range.
-            speed = speed * self._fading(positions[-1:], limits)[0]
+            speed = limits.speeds(positions[0]) * self._fading(positions[-1:], limits)[0]
             ramps = (s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self.robot.n) * speed
             waves = np.hstack([waves, ramps])
         for _ in range(_MAX_NEWTON_STEPS):
@@ -312,9 +312,8 @@ class ManoeuvreModel:
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         order = np.arange(1, _WAVES_PER_JOINT + 1)
         shape = np.sin(math.pi * s) * np.sin(math.pi * s * order) / order
-        speed, _ = _speeds_and_half_ranges(positions[0], limits)
         fading = self._fading(positions, limits)
-        joints = np.eye(self.robot.n) * speed
+        joints = np.eye(self.robot.n) * limits.speeds(positions[0])
         waves = (
             shape[:, :, np.newaxis, np.newaxis] * (fading[:, np.newaxis] * joints)[:, np.newaxis]
         )
@@ -381,12 +380,6 @@ class ManoeuvreModel:
     @cached_property
     def _drift(self) -> DriftVariation:
         return DriftVariation(self.robot)
-
-
-def _speeds_and_half_ranges(q: Array, limits: MotionLimits) -> tuple[Array, Array]:
-    """Return a speed (n,) of every joint, and half of its range round q (n,)."""
-    half = limits.joint_ranges(q)[1]
-    return np.where(np.isfinite(limits.velocity), limits.velocity, half), half
 
 
 class DriftVariation:
@@ -493,7 +486,7 @@ def least_change(
     if count < 1:
         return None
     # Unknowns are shares of a tick at full speed.
-    scale = _speeds_and_half_ranges(positions[0], limits)[0] * period
+    scale = limits.speeds(positions[0]) * period
     scaled = (rows[:, moving] * scale).reshape(len(rows), -1)
     weight = 1.0 / np.maximum(np.linalg.norm(scaled, axis=1), 1e-12)
 
@@ -507,12 +500,10 @@ def least_change(
         ca.kron(first, ca.diag(speed_share)),
         ca.kron(second, ca.diag(change_share)),
     )
-    rates = np.diff(positions, axis=0) / period
-    ends = np.zeros((2, n))
-    ends[0], ends[1] = before, after
-    changes = np.diff(np.vstack([ends[:1], rates, ends[1:]]), axis=0) / period
+    rates = held_velocities(positions, period, before, after)
+    changes = np.diff(rates, axis=0) / period
     shares = np.concatenate(
-        [(rates / limits.velocity).ravel(), (changes / limits.acceleration).ravel()]
+        [(rates[1:-1] / limits.velocity).ravel(), (changes / limits.acceleration).ravel()]
     )
     most = 1.0 - _LIMIT_RESERVE
     wanted = weight * error

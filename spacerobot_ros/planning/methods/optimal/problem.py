@@ -16,6 +16,7 @@ from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_fro
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.goal import RobotState
+from spacerobot_ros.planning.core.schedule import held_velocities
 from spacerobot_ros.resources import suggestion
 
 
@@ -331,6 +332,11 @@ class MotionLimits:
         middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
         return middle, np.minimum((upper - lower) / 2, _UNLIMITED_HALF_RANGE)
 
+    def speeds(self, q: Array) -> Array:
+        """Return a finite speed (n,) of every joint: half of its range round ``q`` (n,) in a
+        second if its velocity is not limited."""
+        return np.where(np.isfinite(self.velocity), self.velocity, self.joint_ranges(q)[1])
+
     def excess(
         self,
         positions: Array,
@@ -361,9 +367,7 @@ class MotionLimits:
 
         Arguments are as in :meth:`excess`.
         """
-        ends = np.zeros((2, positions.shape[1]))
-        ends[0], ends[1] = velocity, after
-        rates = np.vstack([ends[:1], np.diff(positions, axis=0) / period, ends[1:]])
+        rates = held_velocities(positions, period, velocity, after)
         change = np.abs(np.diff(rates, axis=0)) / period
         return np.abs(rates) / self.velocity, change / self.acceleration
 
