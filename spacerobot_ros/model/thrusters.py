@@ -173,7 +173,7 @@ def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:
             "add them, or give a YAML file of thrusters."
         )
     try:
-        return thruster_table(entries, robot)
+        return _thruster_table(entries, robot)
     except ParameterError as error:
         raise RobotDescriptionError(f"The URDF of robot '{robot.name}': {error}") from error
 
@@ -202,23 +202,17 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
     try:
         if not all(isinstance(entry, dict) for entry in entries):
             raise ParameterError("An entry of 'thrusters' is not a mapping.")
-        return thruster_table([{**defaults, **entry} for entry in entries], robot)
+        return _thruster_table([{**defaults, **entry} for entry in entries], robot)
     except SpaceRobotError as error:
         raise ParameterError(f"{path}: {error}") from error
 
 
-def thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription) -> ThrusterTable:
+def _thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription) -> ThrusterTable:
     """Check thrusters and express their data in the base link frame.
 
     Each thruster has ``name``, ``position`` (m) in the frame of ``link`` (default: the base link),
     force ``direction`` (default: x, as for joint axes) in that frame rotated by ``rpy`` (rad),
     ``force`` (N), ``isp`` (s) and ``min_on_time`` (s, default: 0).
-
-    Raises
-    ------
-    ParameterError
-        An entry is missing, unknown, not finite or not positive, or a link moves relative to the
-        base.
     """
     names: list[str] = []
     rows: list[Array] = []

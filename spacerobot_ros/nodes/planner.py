@@ -68,7 +68,7 @@ class PlannerNode(CommanderNode):
     default_name: ClassVar = "planner"
     config: PlannerConfig
     commander: PlannerCommander
-    _trajectories: TrajectoryClients | None = None
+    _trajectories: _TrajectoryClients | None = None
     """FollowJointTrajectory clients, for ``output: trajectory``."""
     _announcement: Thread | None = None
     """Publishes the latest schedule."""
@@ -132,7 +132,7 @@ class PlannerNode(CommanderNode):
 
     def _follow_trajectories(self) -> None:
         if self._trajectories is None:
-            self._trajectories = TrajectoryClients(self)
+            self._trajectories = _TrajectoryClients(self)
         self.commander.trajectories = self._trajectories.connect(
             self.config.trajectory_action, self.commander.end_schedule
         )
@@ -228,16 +228,9 @@ _OUTCOMES = {
 }
 
 
-class TrajectoryClients:
-    """The FollowJointTrajectory clients of a planner node, which exist as long as the node.
-
-    If a node cleanup destroyed the clients, an executor might still hold a response for one of
-    them.
-
-    Raises
-    ------
-    ParameterError
-        The action package is not installed.
+class _TrajectoryClients:
+    """The FollowJointTrajectory clients of a planner node, which exist as long as the node: after a
+    cleanup, an executor might still hold a response for one of them.
     """
 
     def __init__(self, node: Any) -> None:

@@ -420,7 +420,7 @@ class MultiProcessStack:
         answers = self._call_services(self._change_state, dict.fromkeys(names, request))
         for name, answer in answers.items():
             if not answer.success:
-                error = last_error(self._read_log(name)) or _NO_ERROR_TEXT
+                error = _last_error(self._read_log(name)) or _NO_ERROR_TEXT
                 raise SpaceRobotError(f"The {name} refuses: {error}")
 
     def _ask_statistics(self, patience: float) -> None:
@@ -504,11 +504,8 @@ _CRASH = re.compile(r"^Fatal Python error: .*$", re.MULTILINE)
 _CRASHED_AT = re.compile(r"^Current thread .*\n  File (.*)$", re.MULTILINE)
 
 
-def last_error(log: str) -> str:
-    """Return the last error in a node's log; empty if there is none.
-
-    This is an error that the node logged, or the last line of a traceback.
-    """
+def _last_error(log: str) -> str:
+    """Return the last error that a node logged, or the last line of a traceback; else nothing."""
     found = ""
     for line in log.splitlines():
         prefix = _LOG_PREFIX.match(line)
@@ -530,7 +527,7 @@ def end_message(name: str, code: int, log: str) -> str:
         if crash is None:
             return f"{how}."
         return f"{how}: {crash[0]} at {at[1]}." if at else f"{how}: {crash[0]}."
-    return f"Node '{name}' has ended with exit code {code}: {last_error(log) or _NO_ERROR_TEXT}"
+    return f"Node '{name}' has ended with exit code {code}: {_last_error(log) or _NO_ERROR_TEXT}"
 
 
 class RestartLimit:

@@ -256,7 +256,7 @@ class CommanderNode(FlightNode):
         self.commander.answer_latest()
 
     def _on_goal(self, key: str, message: PoseStamped) -> None:
-        self.receive(key, message, lambda: self.read_goal(key, message))
+        self.receive(key, message, lambda: self._read_goal(key, message))
 
     def receive(self, key: str, message: PoseStamped | Path, read: Callable[[], Goal]) -> None:
         """Pass the goal returned by ``read`` to the commander; log the goal if it is accepted."""
@@ -266,16 +266,9 @@ class CommanderNode(FlightNode):
             line = goal_description(part, accepted.goal_id, message, accepted.goal)
             self.get_logger().info(line)
 
-    def read_goal(self, key: str, message: PoseStamped) -> Goal:
-        """Return the goal from a message for the base or an end-effector.
-
-        If the orientation of an end-effector is all zeros, any attitude is accepted.
-
-        Raises
-        ------
-        PlanningError
-            The goal is invalid.
-        """
+    def _read_goal(self, key: str, message: PoseStamped) -> Goal:
+        """Return the goal from a message for the base or an end-effector; an orientation of zeros
+        accepts any attitude of an end-effector."""
         frame = self.config.world_frame
         if key == BASE_GOAL_KEY:
             return goal_of(message, frame, "The goal of the base", self.goal_shape, self.pose_of)

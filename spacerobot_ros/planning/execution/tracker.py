@@ -75,7 +75,7 @@ class ScheduleFollower:
     deadband
         Shape errors up to this value are treated as noise and not fed back, m or rad.
     brakes
-        Whether the schedule is a :func:`braking_schedule`, whose end does not wait for the joints.
+        Whether the schedule brakes along another one; its end does not wait for the joints.
     """
 
     def __init__(
@@ -124,9 +124,8 @@ class ScheduleFollower:
         return self.start_ns <= stamp_ns <= self._end_ns + self._settling_ns
 
     def braking(self, stamp_ns: int, duration: float) -> ScheduleFollower:
-        """Return the follower that brakes along the schedule from a time on; see
-        :func:`braking_schedule`."""
-        braking = braking_schedule(self.schedule, (stamp_ns - self.start_ns) / SECOND, duration)
+        """Return the follower that brakes along the schedule from a time on."""
+        braking = _braking_schedule(self.schedule, (stamp_ns - self.start_ns) / SECOND, duration)
         return ScheduleFollower(braking, stamp_ns, self.gain, brakes=True)
 
     def shapes_from(self, stamp_ns: int) -> Array:
@@ -164,22 +163,14 @@ class ScheduleFollower:
             velocity += self.gain * (late / SECOND) * self._after
 
 
-def braking_schedule(schedule: GaitSchedule, begins: float, duration: float) -> GaitSchedule:
-    """Return a schedule that slows down along another one and comes to rest on its path.
+def _braking_schedule(schedule: GaitSchedule, begins: float, duration: float) -> GaitSchedule:
+    """Return a schedule that slows down along another one, from ``begins`` s after its start, and
+    comes to rest on its path after ``duration`` T, s.
 
     Gait time runs at the rate ``1 - t/T``: the shape stays on the path of the gait. At zero
     momentum, the base path does not depend on speed, so the base also stays on its path. Wheels
     that keep spinning after the end of the schedule are brought to their final rates, at which the
     base comes to rest at its goal.
-
-    Parameters
-    ----------
-    schedule
-        The schedule until then.
-    begins
-        Time since its start, s.
-    duration
-        T, s; the gait continues for half this time. It ends with the tick at which T is over.
     """
     period, positions, last = schedule.control_period, schedule.positions, schedule.ticks
     since: Array = period * np.arange(max(1, math.ceil(duration / period - 1e-9)) + 1, dtype=float)

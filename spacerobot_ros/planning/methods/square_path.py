@@ -92,23 +92,10 @@ class SquarePathOptions:
 
 
 @dataclass(frozen=True)
-class SquareLoop:
-    """A square in shape space that rotates the base by the desired angle.
-
-    Attributes
-    ----------
-    pair
-        Indices (i, j) of the moving joints.
-    centre
-        (2,) ``psi*``, rad.
-    side
-        ``z*``, rad.
-    loops
-        Number of loops.
-    clockwise
-        Direction of travel in the plane (psi_i, psi_j).
-    corners
-        (4, n) shapes in the order of travel; the first is the corner nearest to ``psi_e``.
+class _SquareLoop:
+    """A square in the plane (psi_i, psi_j) of a ``pair`` of joints that rotates the base by the
+    desired angle: ``centre`` (2,) ``psi*`` and ``side`` ``z*`` in rad, and ``corners`` (4, n) in
+    the order of travel, beginning with the one nearest to ``psi_e``.
     """
 
     pair: tuple[int, int]
@@ -219,7 +206,7 @@ class SquarePathGait(GaitMethod):
         twist = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         return math.remainder(twist, 2 * math.pi)
 
-    def _straight_legs(self, psi_e: Array, loop: SquareLoop | None) -> list[tuple[Array, float]]:
+    def _straight_legs(self, psi_e: Array, loop: _SquareLoop | None) -> list[tuple[Array, float]]:
         """Return the ends (n,) of the straight legs, and the duration of each, s."""
         step_1, step_2, step_3, step_4 = self._durations
         legs = [(psi_e, step_1)]
@@ -230,7 +217,7 @@ class SquarePathGait(GaitMethod):
             legs.append((psi_e, step_4))
         return legs
 
-    def _loop_notes(self, loop: SquareLoop | None) -> Notes:
+    def _loop_notes(self, loop: _SquareLoop | None) -> Notes:
         if loop is None:
             return {"loops": 0.0}
         return {
@@ -242,7 +229,7 @@ class SquarePathGait(GaitMethod):
             "corner": loop.corners[0].tolist(),
         }
 
-    def _find_loop(self, psi_e: Array, wanted: float) -> SquareLoop:
+    def _find_loop(self, psi_e: Array, wanted: float) -> _SquareLoop:
         """Return the loop for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,).
 
         Of all pairs of joints it is the one that takes the fewest loops, and of those the one
@@ -277,7 +264,7 @@ class SquarePathGait(GaitMethod):
         found: list[_SquareFamily],
         largest: _SquareFamily,
         loops: int,
-    ) -> Iterator[SquareLoop]:
+    ) -> Iterator[_SquareLoop]:
         """Yield the squares that turn the base by ``wanted`` (rad) in a number of loops, the
         smallest first.
         """
@@ -294,7 +281,7 @@ class SquarePathGait(GaitMethod):
             corners[:, candidates.pair] = squares[0]
             corners = corners[::-1] if clockwise else corners
             nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
-            yield SquareLoop(
+            yield _SquareLoop(
                 candidates.pair,
                 candidates.centres[row],
                 side,

@@ -87,7 +87,7 @@ class GoalSpecification:
         """Return a robot's goal specification according to the options."""
         position = options.base_position == 1
         if options.base_position == 0:
-            position = slides_anywhere(robot)
+            position = _slides_anywhere(robot)
         return cls(
             position,
             bool(options.base_attitude),
@@ -192,7 +192,7 @@ class GoalSpecification:
                     Proof.MOMENTUM,
                 )
             return BoundaryConditions(state.q, turn, shape, shape)
-        likely = shape_for_center(
+        likely = _shape_for_center(
             robot, limits, state.q, center, POSITION_SLACK * tolerance.position
         )
         center = robot.center_of_mass(likely)
@@ -346,9 +346,8 @@ def _require_within_one_joint(
         )
 
 
-def slides_anywhere(robot: SpaceRobot) -> bool:
-    """Whether sliders can move the base to any position, because their slots span three
-    directions."""
+def _slides_anywhere(robot: SpaceRobot) -> bool:
+    """Whether the slots of sliders span three directions, so that the base moves anywhere."""
     try:
         require_three_slots(
             robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders_of(robot))
@@ -358,25 +357,17 @@ def slides_anywhere(robot: SpaceRobot) -> bool:
     return True
 
 
-def center_rate(robot: SpaceRobot, q: Array) -> Array:
+def _center_rate(robot: SpaceRobot, q: Array) -> Array:
     """Return ``dc/dq`` (3, n) of the centre of mass in base components: ``-A_v + c x A_omega``."""
     A = robot.connection(q)
     return np.asarray(A[:3] - np.cross(robot.center_of_mass(q), A[3:], axisb=0, axisc=0))
 
 
-def shape_for_center(
+def _shape_for_center(
     robot: SpaceRobot, limits: MotionLimits, start: Array, wanted: Array, enough: float
 ) -> Array:
-    """Return the shape (n,) near ``start`` whose centre of mass is at ``wanted`` (3,), m, in B.
-
-    If there is no such shape, the centre of mass may be off by up to ``enough``, m.
-
-    Raises
-    ------
-    UnreachableError
-        There is no such shape within the limits: the base cannot reach the goal position.
-    NotFoundError
-        None was found.
+    """Return the shape (n,) near ``start`` whose centre of mass is at ``wanted`` (3,), m, in B, or
+    at most ``enough``, m, away from there if there is no such shape.
     """
     lower, upper = limits.lower, limits.upper
     # The solver needs lower bounds below upper bounds.
@@ -391,7 +382,7 @@ def shape_for_center(
         found = least_squares(
             lambda q: robot.center_of_mass(q) - wanted,
             np.clip(guess, lower, upper),
-            lambda q: center_rate(robot, q),
+            lambda q: _center_rate(robot, q),
             bounds=(lower - room, upper + room),
             xtol=1e-15,
             ftol=1e-15,
@@ -420,7 +411,7 @@ def nearest_shape_for_center(
         miss = wanted - robot.center_of_mass(q)
         if np.linalg.norm(miss) <= 1e-14:
             break
-        q = q + np.linalg.lstsq(center_rate(robot, q), miss, rcond=1e-9)[0]
+        q = q + np.linalg.lstsq(_center_rate(robot, q), miss, rcond=1e-9)[0]
     if np.maximum(limits.lower - q, q - limits.upper).max() > _JOINT_LIMIT_ROUNDING:
         q = near
     q = np.clip(q, limits.lower, limits.upper)

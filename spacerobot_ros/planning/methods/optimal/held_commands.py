@@ -215,7 +215,7 @@ class ManoeuvreModel:
             quaternions = self._attitudes(positions, boundary)
             error, *by_end = self._end_error(positions, quaternions, boundary)
             rows = self._end_rows(positions, quaternions, boundary, *by_end)
-            change = least_change(
+            change = _least_change(
                 positions,
                 rows,
                 error,
@@ -444,7 +444,7 @@ _OPTIONS = {
 }
 
 
-def least_change(
+def _least_change(
     positions: Array,
     rows: Array,
     error: Array,
@@ -455,30 +455,10 @@ def least_change(
     *,
     moves_end: bool,
 ) -> Array | None:
-    """Return the smallest change (N + 1, n) in the shapes at ticks such that all limits are
-    satisfied.
+    """Return the smallest change (N + 1, n) in the shapes at ticks that satisfies all limits and
+    changes m end values, with derivatives ``rows`` (m, N + 1, n), by ``error`` (m,); None: none.
 
-    Parameters
-    ----------
-    positions
-        (N + 1, n) shapes at the ticks, m or rad; the first shape is fixed.
-    rows, error
-        (m, N + 1, n) derivatives of m end values with respect to the shapes, and their required
-        change (m,).
-    limits
-        Limits of the joints.
-    period
-        Between ticks, s.
-    before, after
-        (n,) velocities held until the start, and after the end.
-    moves_end
-        Whether the last shape may change.
-
-    Returns
-    -------
-    :
-        The change with the smallest sum of squares, where each joint's change is divided by its
-        speed; None: none.
+    Smallest is the sum of squares of changes divided by joint speeds; the first shape is fixed.
     """
     N, n = len(positions) - 1, positions.shape[1]
     moving = slice(1, N + 1 if moves_end else N)
