@@ -335,18 +335,6 @@ def test_a_goal_for_what_is_not_controlled_is_refused(key: str, settings: dict[s
     np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
 
 
-def test_a_refusal_is_reported_of_its_goal_and_the_earlier_one_goes_on() -> None:
-    loop = ExecutiveLoop()
-    loop.aim(base=goal_at(AIM, "flown"))
-    before = loop.answer()[0]
-    loop.executive.refuse("It is in frame 'moon'.", "refused")
-    assert loop.status == ControllerStatus(
-        ControllerState.REFUSED, "It is in frame 'moon'.", "refused", loop.statuses[-2].command
-    )
-    np.testing.assert_array_equal(loop.answer()[0], before)
-    assert (loop.state, loop.status.goal_id) == ("tracking", "flown")
-
-
 # -- abort ------------------------------------------------------------------------------------
 
 
@@ -884,24 +872,6 @@ def test_a_goal_that_is_decided_is_not_kept(file: Path, end: str) -> None:
     assert loop.state == end
     assert not file.exists()
     assert loop.file.load() == {}
-
-
-@pytest.mark.parametrize(
-    ("key", "shape", "settings", "mentions"),
-    [
-        ("end_effector", None, {"law": "computed_torque"}, ("computed_torque", "end-effector")),
-        ("base", np.zeros(3), {}, ("3 joints", "planar_manipulator", "2")),
-    ],
-)
-def test_goals_of_another_robot_or_law_are_refused(
-    key: str, shape: np.ndarray | None, settings: dict[str, Any], mentions: tuple[str, ...]
-) -> None:
-    loop = ExecutiveLoop(**settings)
-    with pytest.raises(ParameterError) as refusal:
-        loop.executive.resume({key: goal_at(AIM, shape=shape)})
-    assert_one_sentence(str(refusal.value), "resume_file", *mentions)
-    loop.answer()
-    assert loop.state == "holding"
 
 
 def test_where_nothing_can_be_written_the_goal_is_flown(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.resources import robot_file, share_directory
@@ -126,13 +126,6 @@ def test_a_bag_holds_published_figures_of_the_method_that_is_flown_only() -> Non
     assert json.loads(other.records(["plant"])["scenario"]["published"]) == []
 
 
-def test_real_time_plans_beside_the_flight_and_says_how_the_recorder_does() -> None:
-    scenario = load_scenario("sliding_masses").in_real_time(2.5)
-    assert (scenario.plant.time_mode, scenario.plant.real_time_factor) == ("realtime", 2.5)
-    assert scenario.planner.plan_in_background is True
-    assert scenario.config("recorder").diagnostics_period == 1.0
-
-
 def test_another_pose_keeps_the_shape_that_is_wanted() -> None:
     scenario = load_scenario("planar_chain")
     shape = scenario.goal.joint_positions
@@ -236,11 +229,6 @@ def test_degrees_are_roll_pitch_and_yaw_about_fixed_axes() -> None:
     goal = load_scenario("arm_attitude").with_goal(rpy_deg=angles).goal
     expected = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     assert np.allclose(Rotation.from_quat(goal.quaternion).as_matrix(), expected, atol=1e-14)
-
-
-def test_an_attitude_given_twice_is_refused() -> None:
-    with pytest.raises(GoalError, match="given twice"):
-        load_scenario("arm_attitude").with_goal(rotvec=(0, 0, 1), rpy_deg=(0, 0, 1))
 
 
 @pytest.mark.parametrize(

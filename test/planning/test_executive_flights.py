@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from support.planner_loop import HERE, NEAR, TURNED, Loop, Place, StubMethod, goal_at
+from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod, goal_at
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.planning import GaitSchedule
@@ -24,7 +24,6 @@ from spacerobot_ros.simulation import InitialState
 
 Array = npt.NDArray[np.float64]
 
-BEYOND_STROKE: Place = ([-0.4, 0.0, 0.0], [0.0, 0.0, 0.0])
 # Wide tolerances and one large cycle: a first order that is some way off.
 COARSE = {
     "position_tolerance": 0.1,
@@ -63,20 +62,6 @@ def test_the_measured_error_is_reported() -> None:
     assert status.position_error_m == pytest.approx(distance, rel=1e-3, abs=1e-9)
     assert status.attitude_error_rad == pytest.approx(angle, rel=1e-3, abs=1e-9)
     assert loop.states == ["executing", "reached"]
-
-
-def test_a_goal_that_is_refused_in_flight_does_not_disturb_the_earlier_one() -> None:
-    loop = Loop()
-    loop.propose_goal(NEAR)
-    loop.tick(10)
-    loop.propose_goal(BEYOND_STROKE)
-    loop.until(PlannerState.REACHED)
-    assert loop.states == ["executing", "refused", "reached"]
-    (refused,) = [s for s in loop.statuses if s.state is PlannerState.REFUSED]
-    assert "beyond the stroke" in refused.message
-    assert refused.message.endswith(" The earlier goal is still pursued.")
-    assert max(loop.error_to(NEAR)) <= 1e-3
-    assert len(loop.starts) == 1
 
 
 @pytest.mark.parametrize(
@@ -235,18 +220,6 @@ def wait_for_plan(loop: Loop) -> None:
             return
         loop.tick()
     raise AssertionError("nothing is planned")
-
-
-def test_states_are_answered_at_rest_until_the_plan_is_there() -> None:
-    loop = held()
-    loop.propose_goal(NEAR)
-    loop.tick(40)
-    assert not loop.states
-    assert not any(loop.speeds)
-    loop.held.release()
-    loop.until(PlannerState.REACHED)
-    assert loop.error_to(NEAR)[0] < 1e-3
-    assert any(loop.speeds)
 
 
 def test_a_new_goal_in_flight_is_planned_from_rest() -> None:
