@@ -49,7 +49,7 @@ from support.planner_phases import (
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.planning import GaitSchedule, RobotState
+from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
@@ -61,33 +61,19 @@ from spacerobot_ros.planning.execution.status import (
     Transition,
 )
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand
-from spacerobot_ros.planning.execution.worker import PlanJob, PlanningWorker
+from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 
 # -- why plans are requested ------------------------------------------------------------------
 
 
-def reasons(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> list[PlanReason]:
-    """Record why the executive of a loop requests plans from now on."""
-    requested: list[PlanReason] = []
-    request = loop.executive._request_plan
-
-    def recorded(job: PlanJob, state: RobotState) -> None:
-        requested.append(job.reason)
-        request(job, state)
-
-    monkeypatch.setattr(loop.executive, "_request_plan", recorded)
-    return requested
-
-
-def test_a_goal_is_planned_from_rest_or_blended_into(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_goal_is_planned_from_rest_or_blended_into() -> None:
     loop = resting(ticks=40)
-    requested = reasons(loop, monkeypatch)
     loop.propose_goal(NEAR)
     loop.tick(10)
     loop.propose_goal(OTHER)
     loop.tick()
-    assert requested == [PlanReason.NEW_GOAL, PlanReason.BLEND]
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.BLEND]
     first, second = stub_of(loop).requests
     assert first.previous is None
     assert second.previous is None
@@ -97,45 +83,41 @@ def test_a_goal_is_planned_from_rest_or_blended_into(monkeypatch: pytest.MonkeyP
     assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
 
 
-def test_what_is_missed_is_corrected_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missed_is_corrected_and_counts() -> None:
     loop = resting()
-    requested = reasons(loop, monkeypatch)
     stub_of(loop).overshoot = 0.1
     status = loop.decide(NEAR)
     # 0.062 m, a tenth of it is missed by every plan: 6.2 mm, 0.62 mm.
     assert status.state is PlannerState.REACHED
     assert status.corrections == 1
-    assert requested == [PlanReason.NEW_GOAL, PlanReason.CORRECTION]
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.CORRECTION]
     first, second = stub_of(loop).requests
     assert (first.correction, second.correction) == (False, True)
     assert second.previous is loop.starts[0].schedule
 
 
-def test_partial_schedules_are_continued_and_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partial_schedules_are_continued_and_do_not_count() -> None:
     loop = resting(max_corrections=0)
-    requested = reasons(loop, monkeypatch)
     stub_of(loop).partial = True
     status = loop.decide(NEAR)
     assert status.state is PlannerState.REACHED
     assert status.corrections == 0
     # Half of 0.062 m at a time until 1 mm is left.
-    assert requested == [PlanReason.NEW_GOAL, *[PlanReason.CONTINUATION] * 5]
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, *[PlanReason.CONTINUATION] * 5]
     assert all(request.correction for request in stub_of(loop).requests[1:])
 
 
 @pytest.mark.parametrize("held", [False, True])
-def test_a_tracking_error_is_planned_for_at_once_or_from_rest(
-    monkeypatch: pytest.MonkeyPatch, held: bool
-) -> None:
+def test_a_tracking_error_is_planned_for_at_once_or_from_rest(held: bool) -> None:
     loop = executing(held=held, ticks=60, wrong_path=0.1, drift_position=0.02)
-    requested = reasons(loop, monkeypatch)
     stub_of(loop).wrong_path = 0.0
     for _ in range(400):
         loop.tick()
         loop.held.release()
         if loop.statuses[-1].state.decided:
             break
-    assert requested == [PlanReason.REPLAN if held else PlanReason.TRACKING_ERROR]
+    again = PlanReason.REPLAN if held else PlanReason.TRACKING_ERROR
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, again]
     status = loop.statuses[-1]
     assert (status.state, status.corrections) == (PlannerState.REACHED, 1)
     assert any("Deviates from the path by" in notice for notice in loop.notices)
@@ -159,16 +141,13 @@ def test_tracking_errors_are_corrected_as_often_as_allowed() -> None:
     assert loop.statuses[-1].corrections == 2
 
 
-def test_a_goal_is_planned_for_without_the_joints_that_are_stuck(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_goal_is_planned_for_without_the_joints_that_are_stuck() -> None:
     loop = executing(held=True, ticks=400, stuck_ticks=5)
     quick_without_joints(loop)
-    requested = reasons(loop, monkeypatch)
     stuck(loop)
     q = loop.plant.q.copy()
     until(loop, Phase.PLANNING)
-    assert requested == [PlanReason.STUCK_JOINTS]
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.STUCK_JOINTS]
     task = loop.held.tasks[-1]
     assert dict(task.stuck_joint_positions) == {"slider_1": q[0]}
     assert task.required == {"position"}
@@ -286,36 +265,31 @@ def test_a_time_without_a_plan_is_no_end_of_a_schedule(seconds: float) -> None:
     assert len(loop.starts) == 2
 
 
-def test_a_gap_within_the_schedule_is_flown_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gap_within_the_schedule_is_flown_on() -> None:
     loop = executing(ticks=80)
-    requested = reasons(loop, monkeypatch)
     loop.tick(20)
     jump(2.0)(loop)
     assert loop.executive.phase is Phase.EXECUTING
     loop.until(PlannerState.REACHED)
-    assert requested == []
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL]
 
 
-def test_a_reset_is_planned_for_from_where_the_robot_is_then(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_reset_is_planned_for_from_where_the_robot_is_then() -> None:
     loop = executing(ticks=40, max_corrections=0)
-    requested = reasons(loop, monkeypatch)
     loop.tick(20)
     reset_plant(loop)
     status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
     assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
-    assert requested == [PlanReason.REPLAN]
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.REPLAN]
     np.testing.assert_array_equal(stub_of(loop).requests[-1].state.q, np.zeros(3))
 
 
-def test_a_reset_at_the_end_of_a_schedule_is_no_miss(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reset_at_the_end_of_a_schedule_is_no_miss() -> None:
     loop = evaluating(max_corrections=0)
-    requested = reasons(loop, monkeypatch)
     reset_plant(loop)
     status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
     assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
-    assert requested == [PlanReason.REPLAN]
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.REPLAN]
 
 
 def test_momenta_of_before_a_reset_are_not_planned_for() -> None:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal
@@ -32,6 +33,7 @@ from spacerobot_ros.planning.execution.status import (
     Output,
     PlannerState,
     PlannerStatus,
+    PlanReason,
     ScheduleStart,
     Transition,
 )
@@ -333,6 +335,13 @@ class Loop:
     @property
     def starts(self) -> list[ScheduleStart]:
         return [output for output in self.outputs if isinstance(output, ScheduleStart)]
+
+    @property
+    def plan_reasons(self) -> list[PlanReason]:
+        """Why plans were requested."""
+        events = [output for output in self.outputs if isinstance(output, Event)]
+        started = [each for each in events if each.kind is EventKind.PLAN_STARTED]
+        return [PlanReason(each.about["reason"]) for each in started]
 
     @property
     def notices(self) -> list[str]:
