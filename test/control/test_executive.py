@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import re
@@ -37,7 +36,6 @@ from spacerobot_ros.control import (
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
-from spacerobot_ros.control.reference import HeldVelocityReference
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
 from spacerobot_ros.events import EventKind
@@ -432,22 +430,6 @@ def test_a_reference_of_the_end_effector_from_outside_is_followed() -> None:
     # The base's own goal goes on beside it.
     loop.aim(base=goal_at(AIM))
     np.testing.assert_allclose(loop.answer(reference=reference)[0][:3], KP * (AIM + up), atol=1e-12)
-
-
-@given(st.lists(st.floats(-2.0, 2.0), min_size=2, max_size=6))
-def test_a_reference_of_held_velocities_leads_from_one_to_the_next(speeds: list[float]) -> None:
-    held = HeldVelocityReference(PERIOD)
-    position = np.zeros(1)
-    first = held.at_command(position, np.array(speeds[:1]))
-    assert (first.qdot[0], first.qddot[0]) == (speeds[0], 0.0)
-    for before, after in itertools.pairwise(speeds):
-        position = position + PERIOD * before
-        reference = held.at_command(position, np.array([after]))
-        assert reference.q == pytest.approx(position)
-        # Half a period on either side of the command is flown at its own velocity.
-        early, late = (reference.qdot + x * PERIOD / 2 * reference.qddot for x in (-1, 1))
-        assert early == pytest.approx(before, abs=1e-12)
-        assert late == pytest.approx(after, abs=1e-12)
 
 
 def test_a_body_twist_is_turned_into_the_world() -> None:

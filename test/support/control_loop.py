@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -72,7 +73,7 @@ class Loop:
         self.velocity = np.zeros(3)
         self.rates = np.zeros(2)
 
-    def show(self, *, odom: bool = True) -> None:
+    def show(self, *, odom: bool = True, joints: Sequence[str] = JOINTS) -> None:
         """Publish the state of the next tick."""
         self.tick += 1
         state = Odometry(child_frame_id="base_link")
@@ -81,18 +82,18 @@ class Loop:
         p.x, p.y, p.z = self.place.tolist()
         v.x, v.y, v.z = self.velocity.tolist()
         state.pose.pose.orientation.w = 1.0
-        joints = JointState(
-            name=JOINTS,
+        shape = JointState(
+            name=joints,
             position=SHAPE.tolist(),
             velocity=self.rates.tolist(),
             effort=[0.0, 0.0],
         )
-        for message in (state, joints):
+        for message in (state, shape):
             stamp = divmod(self.tick * TICK_NS, 1_000_000_000)
             message.header.stamp.sec, message.header.stamp.nanosec = stamp
         if odom:
             self.odom.publish(state)
-        self.joints.publish(joints)
+        self.joints.publish(shape)
 
     def answer(self, *, odom: bool = True) -> tuple[Array, Array]:
         """Show a state; return the wrench and the efforts that come for it, or one before."""

@@ -77,6 +77,9 @@ _ITERATIONS = 40
 _DAMPING = 1e-4
 """Least-squares damping in a step, relative to the largest matrix entry."""
 
+_DAMPING_OF_EXACT_ENDS = 1e-9
+"""The same if end shapes must meet the goal exactly."""
+
 _END_ERROR = 2e-3
 """Largest error, m or rad, of a shape at which an initial guess ends; the solver removes the
 error."""
@@ -90,9 +93,6 @@ _POSSIBLE_ENDS = 6
 
 _MIN_END_DIFFERENCE = 0.05
 """End shapes closer than this, as a fraction of the joint ranges, are considered equal."""
-
-_DAMPING_OF_EXACT_ENDS = 1e-9
-"""The same threshold if end shapes must meet the goal exactly."""
 
 _GIVEN_SHAPE_ERROR = 1e-9
 """Smallest error at which given joint positions contradict an end-effector goal, m or rad."""
