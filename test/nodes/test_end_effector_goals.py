@@ -28,9 +28,6 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes.common.messages import path_poses
-from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
 from spacerobot_ros.report import write_report
 from spacerobot_ros.topics import goal_topic
 
@@ -137,17 +134,6 @@ def test_goals_of_one_stamp_are_one_goal(harness: Harness) -> None:
     await_reached(flight, "9.000000000")
     for each, aim in aims.items():
         np.testing.assert_allclose(flown_to(flight, each), aim, atol=1e-6)
-
-
-def test_a_goal_of_a_link_goes_on_after_a_restart(harness: Harness, tmp_path: Path) -> None:
-    path, aim = tmp_path / "goal.json", reachable("link_3")
-    goal = Goal.of_end_effectors([EndEffectorGoal("link_3", aim)])
-    GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(goal, "7.000000000")})
-    flight = flight_of(harness, resume_file=str(path))
-    flight.start()
-    assert values_of(flight.wait("reached"))["goal_id"] == "7.000000000"
-    np.testing.assert_allclose(flown_to(flight, "link_3"), aim, atol=1e-6)
-    assert not path.exists()
 
 
 def test_a_planner_for_a_controller_leaves_the_end_effector_to_it(harness: Harness) -> None:

@@ -217,25 +217,6 @@ def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:
     ]
 
 
-@pytest.mark.slow
-def test_a_planner_that_starts_again_resumes_its_goal_by_its_id(
-    harness: Harness, tmp_path: Path
-) -> None:
-    flight = Flight(harness, {"resume_file": str(tmp_path / "goal.json")})
-    flight.send(stamped(TURNED, 7, 0))
-    flight.start()
-    flight.wait("executing")
-    flight.ticks(15)
-    for step in ("deactivate", "cleanup", "configure"):
-        assert getattr(flight.planner, f"trigger_{step}")() is TransitionCallbackReturn.SUCCESS
-    harness.connect()
-    flight.planner.trigger_activate()
-    flight.wait("reached")
-    assert max(flight.error_to(TURNED)) <= 1e-3
-    assert ids_of(flight)[2:] == [("executing", "7.000000000"), ("reached", "7.000000000")]
-    assert not (tmp_path / "goal.json").exists()
-
-
 # -- without a stop ---------------------------------------------------------------------------
 
 

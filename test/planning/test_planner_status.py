@@ -158,14 +158,33 @@ def test_a_goal_file_without_ids_is_read(tmp_path: Path) -> None:
     assert loaded.goal.joint_positions is None
 
 
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"arm": {}}', '{"base": 3}', '{"base": {"position": [1]}}']
-)
-def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, text: str) -> None:
+def goal_text(position: str = "[0, 0, 0]", quaternion: str = "[0, 0, 0, 1]") -> bytes:
+    entry = f'"position": {position}, "quaternion": {quaternion}, "joint_positions": null'
+    return f'{{"base": {{{entry}}}}}'.encode()
+
+
+NO_GOALS = {
+    "empty": b"",
+    "cut": goal_text()[:-5],
+    "no text": b"\xff\xfe\x00",
+    "no object": b"[]",
+    "no goal": b"{}",
+    "another name": goal_text().replace(b"base", b"arm"),
+    "a number": b'{"base": 3}',
+    "no attitude": b'{"base": {"position": [1]}}',
+    "not finite": goal_text(position="[0, NaN, 0]"),
+    "no rotation": goal_text(quaternion="[0, 0, 0, 0]"),
+    "deep": b"[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("content", NO_GOALS.values(), ids=NO_GOALS)
+def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "goal.json"
-    path.write_text(text)
+    path.write_bytes(content)
     with pytest.raises(ParameterError, match="contains no valid goals"):
         GoalFile(str(path)).load()
+    assert path.read_bytes() == content
 
 
 def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
