@@ -1,4 +1,4 @@
-"""The modules that all others use: errors, events, times, topics, parameters, scenarios."""
+"""The modules that all others use: errors, events, times, topics and measures."""
 
 from __future__ import annotations
 
@@ -14,14 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from builtin_interfaces.msg import Time
 
 from spacerobot_ros import errors, measures, resources, times
 from spacerobot_ros.bag import message_definition
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import (
-    GoalError,
     NotFoundError,
     ParameterError,
     PlanningError,
@@ -33,22 +31,6 @@ from spacerobot_ros.errors import (
     sentence_case,
 )
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.trials import PlanningProblem
-from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.scenario import (
-    Kill,
-    Scenario,
-    load_scenario,
-    number_in,
-    parse_kills,
-    parse_setting,
-    read_sections,
-    scenario_of,
-    scenario_or_robot,
-    scenario_text,
-)
 from spacerobot_ros.topics import TOPICS, Topic, goal_topic, pose_topic, state_topics, topic_named
 
 # -- errors ------------------------------------------------------------------------------------
@@ -248,261 +230,6 @@ def test_momenta_of_a_flight() -> None:
     np.testing.assert_array_equal(measures.peak(np.empty((0, 2))), [0.0, 0.0])
     wrenches = np.array([[3.0, 0, 4, 0, 0, 1], [0, 0, 0, 0, -5, 12]])
     np.testing.assert_allclose(measures.peak_wrench(wrenches), [5.0, 13.0])
-
-
-# -- scenarios ---------------------------------------------------------------------------------
-
-
-def text_of(*goal: str, **nodes: Any) -> str:
-    """Return a scenario file of lines of its goal and parameters by node."""
-    plant = {"robot": "sliding_masses", **nodes.pop("plant", {})}
-    content = {"plant": {"ros__parameters": plant}, **nodes}
-    lines = "".join(f"    {line}\n" for line in goal or ("goal_position: [1, 2, 3]",))
-    return f"scenario:\n  ros__parameters:\n{lines}{yaml.safe_dump(content)}"
-
-
-def written(folder: Path, text: str) -> Scenario:
-    path = folder / "own.yaml"
-    path.write_text(text)
-    return load_scenario(str(path))
-
-
-@pytest.mark.parametrize(
-    ("line", "kills"),
-    [
-        ("planner at 1", (Kill("planner", 1.0, math.inf),)),
-        ("plant  at 0 until 2.5", (Kill("plant", 0.0, 2.5),)),
-    ],
-)
-def test_kills_of_nodes(line: str, kills: tuple[Kill, ...]) -> None:
-    assert parse_kills([line], "here") == kills
-
-
-@pytest.mark.parametrize(
-    ("lines", "sentence"),
-    [
-        ("planner at 1", "'kills' in here is 'planner at 1', not a list of lines NODE at SECONDS."),
-        *(
-            ([line], f"The kill in here '{line}' is refused: {reason}.")
-            for line, reason in {
-                "planner": "it must be NODE at SECONDS [until SECONDS]",
-                "planner until 5": "it must be NODE at SECONDS [until SECONDS]",
-                "recorder at 5": "its node is one of plant, planner, coordinated_control",
-                "viewer at 1": "its node is one of plant, planner, coordinated_control",
-                "plant at x": "'x' is not a finite number",
-                "plant at inf": "'inf' is not a finite number",
-                "plant at nan": "'nan' is not a finite number",
-                "plant at -1": "it is at -1 s, before the start of the flight",
-                "plant at 2 until 2": "it ends at 2 s but begins at 2 s",
-                "plant at 2 until 1": "it ends at 1 s but begins at 2 s",
-            }.items()
-        ),
-    ],
-)
-def test_kills_that_are_refused(lines: Any, sentence: str) -> None:
-    with pytest.raises(ParameterError) as refused:
-        parse_kills(lines, "here")
-    assert str(refused.value) == sentence
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("plant.tick_rate=1e-3", ("plant", "tick_rate", 1e-3)),
-        (" planner.method =optimal", ("planner", "method ", "optimal")),
-        ("plant.a.b=[1, 2]", ("plant", "a.b", [1, 2])),
-        ("plant.a=b=c", ("plant", "a", "b=c")),
-    ],
-)
-def test_settings(text: str, found: tuple[str, str, Any]) -> None:
-    node, name, value = parse_setting(text)
-    assert (node, name.strip(), value) == (found[0], found[1].strip(), found[2])
-
-
-@pytest.mark.parametrize("text", ["plant.a", "plant=1", "nobody.a=1", "plant.=1", "=1"])
-def test_settings_that_are_none(text: str) -> None:
-    with pytest.raises(ParameterError) as refused:
-        parse_setting(text)
-    assert str(refused.value) == (
-        f"'{text}' is not node.parameter=value with one of the nodes plant, planner, "
-        "coordinated_control, recorder, viewer."
-    )
-    with pytest.raises(ParameterError) as refused:
-        parse_setting("plant.a=[")
-    assert str(refused.value) == "The value in 'plant.a=[' cannot be read."
-    assert (number_in("1e3"), number_in("a")) == (1000.0, "a")
-
-
-def test_sections_of_files(tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_text(
-        "/**:\n  ros__parameters: {tick_rate: 5.0, method: optimal}\n"
-        "/**/plant:\n  ros__parameters: {sensors: {seed: 3}, tick_rate: 7.0}\n"
-        "/robot_1/plant:\n  ros__parameters: {actuation: effort}\n"
-        "planner:\n"
-        "else:\n  ros__parameters: {a: 1}\n"
-    )
-    assert read_sections(path) == {
-        "plant": {"tick_rate": 7.0, "sensors.seed": 3, "actuation": "effort"},
-        "planner": {"tick_rate": 5.0, "method": "optimal"},
-    }
-    for content in ("plant: [1]", "plant: {ros__parameters: 3}"):
-        path.write_text(content)
-        with pytest.raises(ParameterError) as refused:
-            read_sections(path)
-        assert str(refused.value) == (
-            f"The section 'plant' of the scenario file {path} is not 'ros__parameters:' with "
-            "parameters under it."
-        )
-    path.write_text("[1]")
-    assert read_sections(path) == {}
-    with pytest.raises(ParameterError, match="cannot be read"):
-        read_sections(tmp_path / "none.yaml")
-
-
-@pytest.mark.parametrize(
-    ("goal", "sentence"),
-    [
-        (("goal_positon: [1, 2, 3]",), "has an unknown key 'goal_positon' in its scenario section"),
-        (("goal_position: [1, 2]",), "The goal in the scenario file"),
-        (("goal_rotvec: [1, 2]",), "The goal in the scenario file"),
-        (
-            ("published: {a: 3}",),
-            "The section 'published' in the scenario file FILE is not quantity: {printed: "
-            "[numbers], note: text}: ",
-        ),
-        (("kills: 3",), "'kills' in the file FILE is 3, not a list of lines NODE at SECONDS."),
-        (("world: none.urdf",), "The world in the scenario file FILE is invalid: "),
-        (("end_effector_goals: 3",), "The goal in the scenario file FILE is invalid: "),
-    ],
-)
-def test_scenarios_that_are_refused(goal: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError) as refused:
-        written(tmp_path, text_of(*goal))
-    assert sentence.replace("FILE", str(tmp_path / "own.yaml")) in str(refused.value)
-
-
-def test_a_scenario_without_a_section_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError) as refused:
-        written(tmp_path, "plant: {ros__parameters: {}}")
-    assert str(refused.value) == (
-        f"The scenario file {tmp_path / 'own.yaml'} has no 'scenario: ros__parameters:' section "
-        "with a goal."
-    )
-
-
-def test_a_scenario_is_read_and_written(tmp_path: Path) -> None:
-    found = written(
-        tmp_path,
-        text_of(
-            *("description: It is", "goal_position: [1, 2, 3]", "goal_rotvec: [0, 0, 0.5]"),
-            *("goal_joint_positions: [0.1, 0.2, 0.3]", "published_method: optimal"),
-            *("published: {a: {printed: [1, 2.5], note: so}, b: {printed: [3]}}",),
-            planner={"ros__parameters": {"method": "lie_bracket"}},
-        ),
-    )
-    assert (found.name, found.description, found.commanders) == ("own", "It is", ("planner",))
-    assert found.path == (tmp_path / "own.yaml").resolve()
-    assert found.goal.position.tolist() == [1.0, 2.0, 3.0]
-    assert found.goal.quaternion == pytest.approx([0, 0, math.sin(0.25), math.cos(0.25)])
-    assert found.goal.joint_positions is not None
-    first, second = found.published
-    assert (first.quantity, first.printed, first.note) == ("a", [1.0, 2.5], "so")
-    assert (second.quantity, second.printed, second.note) == ("b", [3.0], "")
-    assert found.comparable == ()
-    assert found.with_method("optimal").comparable == found.published
-    assert replace(found, published_method="").comparable == found.published
-    assert (found.end_effector_goal, found.kills, found.has_goal) == (None, (), True)
-    text = scenario_text(found.with_overrides("planner", {"averaging": 3}))
-    content = yaml.safe_load(text)
-    assert list(content) == ["scenario", "/**/plant", "/**/planner"]
-    about = content["scenario"]["ros__parameters"]
-    assert about["description"] == "It is"
-    assert about["goal_position"] == [1.0, 2.0, 3.0]
-    assert about["goal_joint_positions"] == [0.1, 0.2, 0.3]
-    planner = content["/**/planner"]["ros__parameters"]
-    assert planner == {"method": "lie_bracket", "averaging": 3}
-    recorded = scenario_text(found.with_overrides("recorder", {"tf_period": 0.5}))
-    assert list(yaml.safe_load(recorded)) == [
-        *("scenario", "/**/plant", "/**/planner", "/**/recorder"),
-    ]
-    again = written(tmp_path, text)
-    assert again.goal.joint_positions is not None
-    assert again.planner.averaging == 3
-
-
-def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
-    found = written(tmp_path, text_of(planner={"ros__parameters": {}}))
-    with pytest.raises(ParameterError) as refused:
-        found.with_method("transposed_jacobian")
-    assert str(refused.value) == (
-        "'transposed_jacobian' is a control law, and the scenario 'own' has no section "
-        "'coordinated_control' that could use it: this scenario flies with planner."
-    )
-    with pytest.raises(ParameterError) as unused:
-        found.with_settings(["coordinated_control.law=model_based"])
-    assert str(unused.value) == (
-        "'coordinated_control.law=model_based' is for the node 'coordinated_control', which is "
-        "not running: the scenario 'own' flies with planner."
-    )
-    with pytest.raises(GoalError) as twice:
-        found.with_goal(None, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
-    assert str(twice.value) == "The goal attitude is given twice, in radians and in degrees."
-    assert found.with_goal() is found
-    bare = written(tmp_path, text_of(plant={"robot": ""}, planner={"ros__parameters": {}}))
-    with pytest.raises(ParameterError) as refused:
-        PlanningProblem.of(bare)
-    assert str(refused.value) == "The scenario 'own' has no robot; see plant.robot."
-    with pytest.raises(ParameterError) as refused:
-        found.with_overrides("plant", {"tick_rat": 1}).config("plant")
-    misspelt = "Node 'plant' has no parameter 'tick_rat'. Did you mean 'tick_rate'?"
-    assert str(refused.value) == misspelt
-    with pytest.raises(ParameterError) as refused:
-        found.with_overrides("plant", {"tick_rate": -1}).config("plant")
-    assert str(refused.value).startswith("Node 'plant': Parameter 'tick_rate' is -1")
-    robot = scenario_or_robot("planar_manipulator")
-    if not robot.has_goal:
-        with pytest.raises(ParameterError) as refused:
-            robot.require_goal()
-        assert str(refused.value) == (
-            "'planar_manipulator' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
-            "write a scenario with a goal (`spacerobot new` writes one for a robot)."
-        )
-
-
-def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
-    description = SpaceRobot.from_file(resources.robot_file("sliding_masses")).description
-    found = scenario_of(description)
-    assert (found.name, found.has_goal, found.path) == (description.name, False, Path())
-    assert found.plant.robot_description == found.planner.robot_description == description.urdf
-    shape = Goal.checked([0, 0, 0], [0, 0, 0, 1], [0.0])
-    with pytest.raises(GoalError) as refused:
-        replace(found, goal=shape).require_shape_of(SpaceRobot(description))
-    assert str(refused.value) == (
-        f"The goal has 1 joint position(s); robot '{description.name}' has 3 joints."
-    )
-
-
-def test_parameters_of_a_scenario_have_their_types(tmp_path: Path) -> None:
-    found = written(
-        tmp_path,
-        text_of(
-            planner={"ros__parameters": {"averaging": "3", "use_sim_time": 1, "method": "auto"}}
-        ),
-    )
-    assert found.parameters("planner") == {"averaging": 3, "method": "auto", "use_sim_time": True}
-    assert found.planner.averaging == 3
-    assert found.lockstep
-    fast = found.in_real_time(0.25)
-    assert (fast.plant.time_mode, fast.plant.real_time_factor) == ("realtime", 0.25)
-    assert fast.planner.plan_in_background
-    recorder = fast.config("recorder")
-    assert recorder.diagnostics_period == 1.0
-    assert recorder.tf_period == pytest.approx(min(found.config("recorder").tf_period, 0.025))
-    silent = found.with_overrides("recorder", {"tf_period": 0.0}).in_real_time(2.0)
-    assert silent.config("recorder").tf_period == 0.0
-    assert not fast.lockstep
-    assert isinstance(fast.planner, PlannerConfig)
 
 
 @pytest.mark.parametrize(

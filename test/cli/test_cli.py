@@ -20,10 +20,9 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.campaign import campaign_command
 from spacerobot_ros.cli.main import COMMANDS, CommandGroup, main
-from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.scenario import load_scenario, parse_setting, scenario_names
+from spacerobot_ros.scenario import load_scenario, scenario_names
 
 QUICK = [
     "--method",
@@ -118,39 +117,12 @@ def test_broken_scenario_file_is_named(tmp_path: Path) -> None:
     result = spacerobot("run", str(path))
     assert result.exit_code == 2
     assert "mine.yaml cannot be read" in result.output
-    path.write_text("plant: {ros__parameters: {}}")
-    assert "has no 'scenario" in spacerobot("run", str(path)).output
-    path.write_text("scenario: {ros__parameters: {goal_positon: [0, 0, 0]}}")
-    assert "unknown key 'goal_positon'" in spacerobot("run", str(path)).output
-    path.write_text("scenario: {ros__parameters: {goal_position: [0, 0]}}")
-    assert "is invalid" in spacerobot("run", str(path)).output
 
 
 def test_scenarios_are_listed() -> None:
     output = spacerobot("scenarios").output
     assert all(name in output for name in scenario_names())
     assert "sliding_masses" in output
-
-
-@pytest.mark.parametrize(
-    ("text", "value"),
-    [
-        ("plant.tick_rate=20", 20),
-        ("plant.tick_rate=1e-3", 0.001),
-        ("plant.initial_position=[1, 2.5, 0]", [1, 2.5, 0]),
-        ("planner.method=lie_bracket", "lie_bracket"),
-        ("plant.autostart=false", False),
-    ],
-)
-def test_settings(text: str, value: object) -> None:
-    node, _, rest = text.partition(".")
-    assert parse_setting(text) == (node, rest.partition("=")[0], value)
-
-
-@pytest.mark.parametrize("text", ["", "plant", "plant.=1", "moon.x=1", "plant.x", "plant.x=["])
-def test_bad_settings(text: str) -> None:
-    with pytest.raises(ParameterError):
-        parse_setting(text)
 
 
 # -- `run` and `plan` end with the same code for the same goal: 1 out of reach, 2 bad input ------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,28 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import GoalError, ParameterError
 from spacerobot_ros.flight.trials import PlanningProblem
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes import NODE_TYPES
+from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import (
     CONFIGS,
     NODES,
     Kill,
+    Scenario,
     different_parameters,
     load_scenario,
+    number_in,
     parse_kills,
+    parse_setting,
+    read_sections,
     scenario_names,
+    scenario_of,
     scenario_or_robot,
+    scenario_text,
 )
 
 
@@ -140,11 +150,11 @@ def test_another_pose_keeps_the_shape_that_is_wanted() -> None:
 
 
 def test_kills_are_read_in_order_of_time() -> None:
-    lines = ["plant at 20", "planner at 5.5 until 7", "coordinated_control at 6"]
+    lines = ["plant  at 20", "planner at 0 until 7", "coordinated_control at 6"]
     assert parse_kills(lines, "a test") == (
-        Kill("planner", 5.5, 7.0),
-        Kill("coordinated_control", 6.0, float("inf")),
-        Kill("plant", 20.0, float("inf")),
+        Kill("planner", 0.0, 7.0),
+        Kill("coordinated_control", 6.0, math.inf),
+        Kill("plant", 20.0, math.inf),
     )
 
 
@@ -214,8 +224,12 @@ def test_files_beside_a_scenario_come_before_those_of_the_present_folder(
 
 def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
     alone = scenario_or_robot("three_joint_arm")
-    with pytest.raises(ParameterError, match="'three_joint_arm' has no goal"):
+    with pytest.raises(ParameterError) as refused:
         alone.require_goal()
+    assert str(refused.value) == (
+        "'three_joint_arm' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
+        "write a scenario with a goal (`spacerobot new` writes one for a robot)."
+    )
     there = alone.with_goal(rpy_deg=(0.0, 0.0, 90.0))
     there.require_goal()
     half = np.sqrt(0.5)
@@ -260,3 +274,228 @@ def test_parameters_that_differ_between_scenarios() -> None:
     # What one alone gives, as its default, is no difference.
     usual = first.with_overrides("plant", {"orbit.altitude": 0, "sensors.position_bias": [0, 0, 0]})
     assert different_parameters([first, usual]) == []
+
+
+# -- files, settings and what is refused ---------------------------------------------------------
+
+
+def text_of(*goal: str, **nodes: Any) -> str:
+    """Return a scenario file of lines of its goal and parameters by node."""
+    plant = {"robot": "sliding_masses", **nodes.pop("plant", {})}
+    content = {"plant": {"ros__parameters": plant}, **nodes}
+    lines = "".join(f"    {line}\n" for line in goal or ("goal_position: [1, 2, 3]",))
+    return f"scenario:\n  ros__parameters:\n{lines}{yaml.safe_dump(content)}"
+
+
+def written(folder: Path, text: str) -> Scenario:
+    path = folder / "own.yaml"
+    path.write_text(text)
+    return load_scenario(str(path))
+
+
+@pytest.mark.parametrize(
+    ("lines", "sentence"),
+    [
+        ("planner at 1", "'kills' in here is 'planner at 1', not a list of lines NODE at SECONDS."),
+        *(
+            ([line], f"The kill in here '{line}' is refused: {reason}.")
+            for line, reason in {
+                "planner": "it must be NODE at SECONDS [until SECONDS]",
+                "planner until 5": "it must be NODE at SECONDS [until SECONDS]",
+                "recorder at 5": "its node is one of plant, planner, coordinated_control",
+                "viewer at 1": "its node is one of plant, planner, coordinated_control",
+                "plant at x": "'x' is not a finite number",
+                "plant at inf": "'inf' is not a finite number",
+                "plant at nan": "'nan' is not a finite number",
+                "plant at -1": "it is at -1 s, before the start of the flight",
+                "plant at 2 until 2": "it ends at 2 s but begins at 2 s",
+                "plant at 2 until 1": "it ends at 1 s but begins at 2 s",
+            }.items()
+        ),
+    ],
+)
+def test_kills_that_are_refused(lines: Any, sentence: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        parse_kills(lines, "here")
+    assert str(refused.value) == sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("plant.tick_rate=1e-3", ("plant", "tick_rate", 1e-3)),
+        (" planner.method =optimal", ("planner", "method", "optimal")),
+        ("plant.a.b=[1, 2]", ("plant", "a.b", [1, 2])),
+        ("plant.a=b=c", ("plant", "a", "b=c")),
+        ("plant.autostart=false", ("plant", "autostart", False)),
+    ],
+)
+def test_settings(text: str, found: tuple[str, str, Any]) -> None:
+    assert parse_setting(text) == found
+
+
+@pytest.mark.parametrize("text", ["plant.a", "plant=1", "nobody.a=1", "plant.=1", "=1"])
+def test_settings_that_are_none(text: str) -> None:
+    with pytest.raises(ParameterError) as refused:
+        parse_setting(text)
+    assert str(refused.value) == (
+        f"'{text}' is not node.parameter=value with one of the nodes plant, planner, "
+        "coordinated_control, recorder, viewer."
+    )
+    with pytest.raises(ParameterError) as refused:
+        parse_setting("plant.a=[")
+    assert str(refused.value) == "The value in 'plant.a=[' cannot be read."
+    assert (number_in("1e3"), number_in("a")) == (1000.0, "a")
+
+
+def test_files_without_sections(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    for content in ("plant: [1]", "plant: {ros__parameters: 3}"):
+        path.write_text(content)
+        with pytest.raises(ParameterError) as refused:
+            read_sections(path)
+        assert str(refused.value) == (
+            f"The section 'plant' of the scenario file {path} is not 'ros__parameters:' with "
+            "parameters under it."
+        )
+    path.write_text("[1]")
+    assert read_sections(path) == {}
+    with pytest.raises(ParameterError, match="cannot be read"):
+        read_sections(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("goal", "sentence"),
+    [
+        (("goal_positon: [1, 2, 3]",), "has an unknown key 'goal_positon' in its scenario section"),
+        (("goal_position: [1, 2]",), "The goal in the scenario file"),
+        (("goal_rotvec: [1, 2]",), "The goal in the scenario file"),
+        (
+            ("published: {a: 3}",),
+            "The section 'published' in the scenario file FILE is not quantity: {printed: "
+            "[numbers], note: text}: ",
+        ),
+        (("kills: 3",), "'kills' in the file FILE is 3, not a list of lines NODE at SECONDS."),
+        (("world: none.urdf",), "The world in the scenario file FILE is invalid: "),
+        (("end_effector_goals: 3",), "The goal in the scenario file FILE is invalid: "),
+    ],
+)
+def test_scenarios_that_are_refused(goal: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError) as refused:
+        written(tmp_path, text_of(*goal))
+    assert sentence.replace("FILE", str(tmp_path / "own.yaml")) in str(refused.value)
+
+
+def test_a_scenario_without_a_section_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError) as refused:
+        written(tmp_path, "plant: {ros__parameters: {}}")
+    assert str(refused.value) == (
+        f"The scenario file {tmp_path / 'own.yaml'} has no 'scenario: ros__parameters:' section "
+        "with a goal."
+    )
+
+
+def test_a_scenario_is_read_and_written(tmp_path: Path) -> None:
+    found = written(
+        tmp_path,
+        text_of(
+            *("description: It is", "goal_position: [1, 2, 3]", "goal_rotvec: [0, 0, 0.5]"),
+            *("goal_joint_positions: [0.1, 0.2, 0.3]", "published_method: optimal"),
+            *("published: {a: {printed: [1, 2.5], note: so}, b: {printed: [3]}}",),
+            planner={"ros__parameters": {"method": "lie_bracket"}},
+        ),
+    )
+    assert (found.name, found.description, found.commanders) == ("own", "It is", ("planner",))
+    assert found.path == (tmp_path / "own.yaml").resolve()
+    assert found.goal.position.tolist() == [1.0, 2.0, 3.0]
+    assert found.goal.quaternion == pytest.approx([0, 0, math.sin(0.25), math.cos(0.25)])
+    assert found.goal.joint_positions is not None
+    first, second = found.published
+    assert (first.quantity, first.printed, first.note) == ("a", [1.0, 2.5], "so")
+    assert (second.quantity, second.printed, second.note) == ("b", [3.0], "")
+    assert found.comparable == ()
+    assert found.with_method("optimal").comparable == found.published
+    assert replace(found, published_method="").comparable == found.published
+    assert (found.end_effector_goal, found.kills, found.has_goal) == (None, (), True)
+    text = scenario_text(found.with_overrides("planner", {"averaging": 3}))
+    content = yaml.safe_load(text)
+    assert list(content) == ["scenario", "/**/plant", "/**/planner"]
+    about = content["scenario"]["ros__parameters"]
+    assert about["description"] == "It is"
+    assert about["goal_position"] == [1.0, 2.0, 3.0]
+    assert about["goal_joint_positions"] == [0.1, 0.2, 0.3]
+    planner = content["/**/planner"]["ros__parameters"]
+    assert planner == {"method": "lie_bracket", "averaging": 3}
+    recorded = scenario_text(found.with_overrides("recorder", {"tf_period": 0.5}))
+    assert list(yaml.safe_load(recorded)) == [
+        *("scenario", "/**/plant", "/**/planner", "/**/recorder"),
+    ]
+    again = written(tmp_path, text)
+    assert again.goal.joint_positions is not None
+    assert again.planner.averaging == 3
+
+
+def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
+    found = written(tmp_path, text_of(planner={"ros__parameters": {}}))
+    with pytest.raises(ParameterError) as refused:
+        found.with_method("transposed_jacobian")
+    assert str(refused.value) == (
+        "'transposed_jacobian' is a control law, and the scenario 'own' has no section "
+        "'coordinated_control' that could use it: this scenario flies with planner."
+    )
+    with pytest.raises(ParameterError) as unused:
+        found.with_settings(["coordinated_control.law=model_based"])
+    assert str(unused.value) == (
+        "'coordinated_control.law=model_based' is for the node 'coordinated_control', which is "
+        "not running: the scenario 'own' flies with planner."
+    )
+    with pytest.raises(GoalError) as twice:
+        found.with_goal(None, (0.0, 0.0, 1.0), (0.0, 0.0, 1.0))
+    assert str(twice.value) == "The goal attitude is given twice, in radians and in degrees."
+    assert found.with_goal() is found
+    bare = written(tmp_path, text_of(plant={"robot": ""}, planner={"ros__parameters": {}}))
+    with pytest.raises(ParameterError) as refused:
+        PlanningProblem.of(bare)
+    assert str(refused.value) == "The scenario 'own' has no robot; see plant.robot."
+    with pytest.raises(ParameterError) as refused:
+        found.with_overrides("plant", {"tick_rat": 1}).config("plant")
+    misspelt = "Node 'plant' has no parameter 'tick_rat'. Did you mean 'tick_rate'?"
+    assert str(refused.value) == misspelt
+    with pytest.raises(ParameterError) as refused:
+        found.with_overrides("plant", {"tick_rate": -1}).config("plant")
+    assert str(refused.value).startswith("Node 'plant': Parameter 'tick_rate' is -1")
+
+
+def test_a_scenario_of_a_robot_flies_that_robot() -> None:
+    description = SpaceRobot.from_file(robot_file("sliding_masses")).description
+    found = scenario_of(description)
+    assert (found.name, found.has_goal, found.path) == (description.name, False, Path())
+    assert found.plant.robot_description == found.planner.robot_description == description.urdf
+    shape = Goal.checked([0, 0, 0], [0, 0, 0, 1], [0.0])
+    with pytest.raises(GoalError) as refused:
+        replace(found, goal=shape).require_shape_of(SpaceRobot(description))
+    assert str(refused.value) == (
+        f"The goal has 1 joint position(s); robot '{description.name}' has 3 joints."
+    )
+
+
+def test_parameters_of_a_scenario_have_their_types(tmp_path: Path) -> None:
+    found = written(
+        tmp_path,
+        text_of(
+            planner={"ros__parameters": {"averaging": "3", "use_sim_time": 1, "method": "auto"}}
+        ),
+    )
+    assert found.parameters("planner") == {"averaging": 3, "method": "auto", "use_sim_time": True}
+    assert found.planner.averaging == 3
+    assert found.lockstep
+    fast = found.in_real_time(0.25)
+    assert (fast.plant.time_mode, fast.plant.real_time_factor) == ("realtime", 0.25)
+    assert fast.planner.plan_in_background
+    recorder = fast.config("recorder")
+    assert recorder.diagnostics_period == 1.0
+    assert recorder.tf_period == pytest.approx(min(found.config("recorder").tf_period, 0.025))
+    silent = found.with_overrides("recorder", {"tf_period": 0.0}).in_real_time(2.0)
+    assert silent.config("recorder").tf_period == 0.0
+    assert not fast.lockstep
+    assert isinstance(fast.planner, PlannerConfig)
