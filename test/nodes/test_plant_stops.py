@@ -169,8 +169,11 @@ def forged(harness: Harness, name: str) -> tuple[Probe, Publisher]:
     return forger, topic
 
 
-def latched_message() -> bytes:
-    return StatusRecord("/plant", 2, "Nothing moves.", LATCHED_PLANT.to_values()).encoded()
+LATCHED_PLANT = PlantStatus(PlantState.LATCHED, "Nothing moves: a fuse.", "abort", "a fuse")
+
+
+def message_of(status: PlantStatus) -> bytes:
+    return StatusRecord("/plant", status.level, status.message, status.to_values()).encoded()
 
 
 def test_a_status_of_another_node_stops_nothing_and_is_reported(harness: Harness) -> None:
@@ -182,7 +185,7 @@ def test_a_status_of_another_node_stops_nothing_and_is_reported(harness: Harness
     flight.ticks(5)
     pause(flight, True)  # In lockstep the goal may be reached before the forger is connected.
     forger, topic = forged(harness, "forger")
-    topic.publish(latched_message())
+    topic.publish(message_of(LATCHED_PLANT))
     harness.spin_until(
         lambda: any(
             "more publishers than odom" in line.msg for line in flight.probe.messages["/rosout"]
@@ -211,7 +214,7 @@ def test_a_status_of_a_node_that_has_left_locks_nothing(harness: Harness) -> Non
     flight.ticks(5)
     harness.executor.remove_node(flight.planner)
     forger, topic = forged(harness, "forger")
-    topic.publish(latched_message())
+    topic.publish(message_of(LATCHED_PLANT))
     harness.remove(forger)
     own = flight.planner.resolve_topic_name("plant/status")
     harness.spin_until(lambda: len(flight.planner.get_publishers_info_by_topic(own)) == 1)
@@ -225,83 +228,33 @@ def test_a_status_of_a_node_that_has_left_locks_nothing(harness: Harness) -> Non
 # -- the controller ---------------------------------------------------------------------------
 
 
-def plant_status(loop: Loop, status: PlantStatus) -> None:
-    """Publish a status of the plant, and let it arrive."""
-    if not hasattr(loop, "plant_topic"):
-        loop.plant_topic = loop.probe.create_publisher(  # type: ignore[attr-defined]
-            DiagnosticStatus, "plant/status", LATCHED
-        )
-        loop.harness.matched(loop.plant_topic)  # type: ignore[attr-defined]
-    loop.plant_topic.publish(  # type: ignore[attr-defined]
-        StatusRecord("/plant", status.level, status.message, status.to_values()).encoded()
-    )
-    loop.harness.settle(loop.probe)
+HOSTILE = "A fuse: \x1b[2J\x1b]0;title\x07 it is\rblown.\n"
+"""Clears the terminal of whoever reads the controller's log."""
 
 
-RUNNING = PlantStatus(PlantState.RUNNING, "A command is active.")
-LATCHED_PLANT = PlantStatus(PlantState.LATCHED, "Nothing moves: a fuse.", "abort", "a fuse")
-
-
-def test_a_latched_plant_ends_the_goals_of_the_controller(harness: Harness, tmp_path: Path) -> None:
-    file = tmp_path / "goals.json"
-    loop = Loop(harness, resume_file=str(file))
-    plant_status(loop, RUNNING)
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    loop.answer()
-    loop.wait_for("tracking")
-    assert file.exists()
-    plant_status(loop, LATCHED_PLANT)
-    status = loop.wait_for("aborted")
-    assert_one_sentence(status.message, "Aborted by the plant: a fuse.")
-    assert not file.exists()
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    assert_one_sentence(loop.wait_for("refused").message, "'/plant' is latched", "rearm it")
-    # The robot drifts meanwhile; it is held where it is when commands pass again.
-    loop.place = np.array([0.3, 0.0, 0.0])
-    loop.answer()
-    plant_status(loop, PlantStatus(PlantState.RUNNING, "Again.", rearms=1))
-    loop.place = np.array([0.5, 0.0, 0.0])
-    wrench, effort = loop.answer()
-    np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
-    np.testing.assert_allclose(effort, 0.0, atol=1e-12)
-    assert loop.status["state"] in ("aborted", "refused")
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    loop.answer()
-    loop.wait_for("tracking")
-
-
-def test_control_characters_of_a_status_reach_no_status_and_no_log(harness: Harness) -> None:
-    """A status that clears the terminal of whoever reads the controller's log."""
-    hostile = "Nothing moves: \x1b[2J\x1b]0;title\x07 a\rfuse.\n"
+@pytest.mark.parametrize(
+    "stopped",
+    [
+        PlantStatus(PlantState.FAILED, HOSTILE, "model"),
+        PlantStatus(PlantState.LATCHED, "Nothing moves.", "abort", HOSTILE),
+    ],
+)
+def test_control_characters_of_a_status_reach_no_status_and_no_log(
+    harness: Harness, stopped: PlantStatus
+) -> None:
     loop = Loop(harness)
     logs = harness.probe({"/rosout": Log}, name="reader")
-    plant_status(loop, RUNNING)
+    topic = loop.probe.create_publisher(DiagnosticStatus, "plant/status", LATCHED)
+    harness.matched(topic)
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     loop.answer()
     loop.wait_for("tracking")
-    plant_status(loop, PlantStatus(PlantState.LATCHED, hostile, "abort", hostile))
+    topic.publish(message_of(stopped))
     status = loop.wait_for("aborted")
+    assert_one_sentence(status.message, "Aborted by the plant: A fuse")
     harness.spin_until(
-        lambda: any("fuse" in line.msg for line in logs.messages["/rosout"]), "the log of the end"
+        lambda: any("blown" in line.msg for line in logs.messages["/rosout"]), "the log of the end"
     )
     texts = [status.message, *(line.msg for line in logs.messages["/rosout"])]
     texts += [text for pair in status.values for text in (pair.key, pair.value)]
     assert all(text.isprintable() for text in texts)
-
-
-def test_a_restarted_plant_does_not_end_the_goal_of_the_controller(harness: Harness) -> None:
-    """Its time begins again; the time limit of the goal is not over for that."""
-    loop = Loop(harness, time_limit=0.1)
-    loop.tick = 10**6
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    loop.answer()
-    loop.tick = 0
-    loop.answer()
-    loop.answer()
-    loop.tick = 10**7
-    loop.answer()
-    loop.answer()
-    assert loop.status["state"] == "tracking"
-    for _ in range(12):
-        loop.answer()
-    loop.wait_for("failed")
