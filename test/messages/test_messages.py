@@ -146,8 +146,13 @@ def test_a_quantity_that_is_no_longer_given_is_zero() -> None:
 
 def test_a_refused_message_leaves_nothing_behind() -> None:
     reader = JointReader(JOINTS, ["velocity"])
-    with pytest.raises(CommandError):
-        reader.accept(serialize_message(message([*JOINTS, "rudder"], velocity=[math.nan] * 4)))
+    before = serialize_message(message(list(JOINTS), velocity=[1.0, 2.0, 3.0]))
+    refused = serialize_message(message([*JOINTS, "rudder"], velocity=[math.nan] * 4))
+    reader.accept(before)
+    for act in (reader.require, reader.accept):
+        with pytest.raises(CommandError, match="'rudder' is unknown"):
+            act(refused)
+        np.testing.assert_array_equal(reader.values["velocity"], [1.0, 2.0, 3.0])
     reader.accept(serialize_message(message(list(JOINTS[::-1]), velocity=[4.0, 5.0, 6.0])))
     np.testing.assert_array_equal(reader.values["velocity"], [6.0, 5.0, 4.0])
 
@@ -493,6 +498,7 @@ def test_a_list_of_texts_has_ten_thousand_at_most(count: int) -> None:
         reader.accept(raw)
     long = f"it has a list of {count} entries, more than 10000"
     assert (str(caught.value) == long) is (count > 10_000)
+    assert not isinstance(caught.value, UnreadableError), "the stamp is read"
     assert reader.stamp_ns == 3 * S
 
 
