@@ -1,8 +1,7 @@
 """Atomic file replacement, files that no other user can have modified, and the cache.
 
 Files are replaced completely or not at all, because disks may fill up and processes may be killed.
-Files
-that are executed or resumed are read only if no other user on the machine can have written
+Files that are executed or resumed are read only if no other user on the machine can have written
 them. A :class:`Cache` stores files that can be recreated, in a private folder of this user; it
 treats a damaged file as missing, and warns once.
 """
@@ -81,9 +80,8 @@ def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
     """Write a report, picture or result and create its folders, completely or not at all.
 
     ``mode`` specifies the permissions of a new file; an existing file keeps its permissions. A bag
-    is not
-    replaced, because it may be the only record of a flight. Devices and pipes are supported. Text
-    is written as UTF-8.
+    is not replaced, because it may be the only record of a flight. Devices and pipes are supported.
+    Text is written as UTF-8.
 
     Raises
     ------

@@ -129,9 +129,9 @@ class TopicSeries:
         Returns
         -------
         An array of shape (N,) for a number, or (N, k) for k numbers per message; integers are
-        64-bit, other numbers float64. A list of N values for everything
-        else: strings, lists, messages, arrays of varying length. Joint state
-        arrays and names are in :attr:`joint_names` order; joints missing from a message are nan.
+        64-bit, other numbers float64. A list of N values for everything else: strings, lists,
+        messages, arrays of varying length. Joint state arrays and names are in :attr:`joint_names`
+        order; joints missing from a message are nan.
 
         Raises
         ------

@@ -50,8 +50,8 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         ``NAME-2.mcap``, ...
     max_size
         File size, in bytes, at which a new file is started; 0: unlimited. If the bag may be split,
-        its files are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with
-        all attachments and metadata.
+        its files are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with all attachments and
+        metadata.
     max_duration_ns
         Log time per file, in nanoseconds, after which a new file is started; 0: unlimited. Both
         limits are checked after every chunk.

@@ -228,7 +228,8 @@ class CollisionGeometry:
         ----------
         shapes
             (..., n), m or rad; with a base (N, n).
-        base Base poses; None: obstacles are ignored.
+        base
+            Base poses; None: obstacles are ignored.
         """
         return self.with_world(self._kinematics.link_poses(shapes), base)
 

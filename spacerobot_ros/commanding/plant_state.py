@@ -212,12 +212,11 @@ class StateSynchroniser:
     only to plan):
 
     * *Pose required:* a state is ready when its odom message has arrived. If odom fails, this is
-      detected
-      when the next joint states arrive: the previous state is then overdue (:meth:`take_overdue`).
-      From then on states are ready without their pose, until odom arrives again.
+      detected when the next joint states arrive: the previous state is then overdue
+      (:meth:`take_overdue`). From then on states are ready without their pose, until odom arrives
+      again.
     * *Pose optional:* a state is ready when its joint states have arrived; odom that arrives later
-      is returned as
-      a :attr:`Pairing.LATE_POSE`.
+      is returned as a :attr:`Pairing.LATE_POSE`.
 
     Further topics can be required (:meth:`require`): a state then waits for a message with its
     stamp on each of these topics.

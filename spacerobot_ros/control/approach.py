@@ -411,7 +411,8 @@ class TargetClearance:
             (K, n) joint positions, m or rad.
         grapple
             Motion of the grapple frame at the same times.
-        closes First sample of closing in.
+        closes
+            First sample of closing in.
         """
         geometry = self._geometry
         if not len(geometry.pairs):

@@ -1,9 +1,9 @@
 """Actuator, joint rate and reference limits.
 
 A control law commands forces without regard to the resulting speeds. If a goal is far away, a
-measurement
-is late or a thruster is stuck open, joints would exceed the rates of their motors, and the rates
-that held commands can control. In such cases, :class:`JointRateLimits` lowers the joint efforts.
+measurement is late or a thruster is stuck open, joints would exceed the rates of their motors, and
+the rates that held commands can control. In such cases, :class:`JointRateLimits` lowers the joint
+efforts.
 """
 
 from __future__ import annotations

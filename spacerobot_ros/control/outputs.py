@@ -193,7 +193,8 @@ class OutputVector:
     ``m`` outputs, ``N = 6 + n`` degrees of freedom. The expressions are functions of the symbols
     ``state`` and ``reference`` (see :meth:`pack_state` and :meth:`pack_reference`):
 
-    ``model`` Calls robot model functions by name.
+    ``model``
+        Calls robot model functions by name.
     ``q``, ``omega``, ``v_cm``, ``qdot``
         The state, with velocities z0dot in base components.
     ``J_z``

@@ -373,8 +373,7 @@ class FlightData:
     @property
     def manoeuvre_time(self) -> float:
         """Flight time for the goal, s, see :func:`~spacerobot_ros.measures.flown_time`; if no
-        status
-        reports it, the duration of the flight.
+        status reports it, the duration of the flight.
         """
         reports = [(stamp_ns / SECOND, status) for stamp_ns, status in self.statuses]
         last = self.status.manoeuvre_time_s if isinstance(self.status, PlannerStatus) else 0.0

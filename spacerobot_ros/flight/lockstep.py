@@ -1,8 +1,8 @@
 """A lockstep flight without ROS: the plant and its commanders, called in the same order as the
 nodes.
 
-Nodes in lockstep exchange messages in publication order. The
-loop makes the same calls in the same order:
+Nodes in lockstep exchange messages in publication order. The loop makes the same calls in the same
+order:
 
 1. The plant reports the state of tick k.
 2. The planner responds as soon as the joint state arrives, the controller once the pose and the

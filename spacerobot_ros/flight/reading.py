@@ -536,8 +536,7 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
 
 
 def recorded_actuation(robot: FlightBag) -> str:
-    """Return the commanded quantity for a robot in a bag: ``velocity``, ``effort``, or
-    nothing.
+    """Return the commanded quantity for a robot in a bag: ``velocity``, ``effort``, or nothing.
 
     The quantity is read from the plant's status. In bags without a plant status, efforts are
     assumed if there are wrench commands.

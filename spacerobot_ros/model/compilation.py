@@ -2,10 +2,9 @@
 
 Without a compiler, or with ``SPACEROBOT_COMPILE=0``, the same functions run in CasADi's virtual
 machine, which is slower but uses the same formulas. Compiled objects are stored in
-``SPACEROBOT_CACHE_DIR``, by
-default ``$XDG_CACHE_HOME/spacerobot_ros`` (``~/.cache/spacerobot_ros``), under a hash of the
-source, flags, compiler and C library. Only complete objects owned by this user are loaded
-(:class:`.Cache`).
+``SPACEROBOT_CACHE_DIR``, by default ``$XDG_CACHE_HOME/spacerobot_ros``
+(``~/.cache/spacerobot_ros``), under a hash of the source, flags, compiler and C library. Only
+complete objects owned by this user are loaded (:class:`.Cache`).
 """
 
 from __future__ import annotations

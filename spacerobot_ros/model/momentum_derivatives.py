@@ -9,8 +9,7 @@ motion of body k at ``omega`` and ``qdot``. Spatial vectors and inertias are as 
 
 Joint i moves all bodies that it carries. Seen from those bodies, the rest of the system moves in
 the opposite direction: V1 changes by ``a_i = V1 x S_i``, and the motion V2 of the carrier of joint
-i by
-``b_i = V2 x S_i``. Let ``h1_i = I^c_i V1`` and ``h2_i = sum_k I_k V2_k`` be the momenta of the
+i by ``b_i = V2 x S_i``. Let ``h1_i = I^c_i V1`` and ``h2_i = sum_k I_k V2_k`` be the momenta of the
 bodies that joint i carries, ``S x*`` the cross product of motion and force, and P_j the momentum
 due to a unit rate of joint j. Then the momenta change by
 

@@ -72,7 +72,7 @@ class PayloadEstimate:
     link
         Name of the link.
     parameters
-        (10,) of :data:`PAYLOAD_PARAMETERS`; A parameter that the motion does not determine is NaN.
+        (10,) of :data:`PAYLOAD_PARAMETERS`; a parameter that the motion does not determine is NaN.
     deviations
         (10,) standard deviations, estimated from the scatter of the momenta.
     directions

@@ -391,11 +391,10 @@ class ThrusterModulator:
     """Converts a desired wrench into thruster on-times, one control period at a time.
 
     Sigma-delta modulation with minimum pulse lengths is used. ``pending_impulse`` grows by the
-    desired
-    wrench times the period and shrinks by the impulse of each fired pulse. The pending impulse is
-    reallocated every period, so that opposite contributions cancel. The pending impulse is
-    therefore at most one shortest pulse of each thruster: with the shortest on-time ``t`` and the
-    period ``h``, ``allocation <= t + h - (remaining part of a shortest pulse)`` holds in every
+    desired wrench times the period and shrinks by the impulse of each fired pulse. The pending
+    impulse is reallocated every period, so that opposite contributions cancel. The pending impulse
+    is therefore at most one shortest pulse of each thruster: with the shortest on-time ``t`` and
+    the period ``h``, ``allocation <= t + h - (remaining part of a shortest pulse)`` holds in every
     period if the desired wrench is achievable. A wrench beyond the available thrust is dropped and
     not compensated for later.
 

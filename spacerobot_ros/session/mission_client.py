@@ -138,8 +138,7 @@ class MissionClient:
         matched.
 
         A commander may be known but not matched yet, while a viewer or a recorder is already
-        matched. Third-party
-        planners need not accept joint positions.
+        matched. Third-party planners need not accept joint positions.
         """
         return all(
             publisher.get_subscription_count()

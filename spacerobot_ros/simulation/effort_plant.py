@@ -13,11 +13,10 @@ inertia matrix in the configuration. Stops have two effects:
   limit. The joint does not rebound; the energy ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` is lost
   (Carnot). The time of arrival is exact up to rounding.
 * Holding: a joint that is on its stop stays there during an integration step if it is pushed
-  outwards.
-  This is the case if its rate is zero in the admissible rates nearest to ``qdot + h K^-1 Q``
-  (Gauss's principle of least constraint over a step, Moreau's time stepping). The joint leaves its
-  stop with a delay of at most one step. This delay ends the sequence of ever shorter rebounds
-  between joints that push each other off their stops.
+  outwards. This is the case if its rate is zero in the admissible rates nearest to
+  ``qdot + h K^-1 Q`` (Gauss's principle of least constraint over a step, Moreau's time stepping).
+  The joint leaves its stop with a delay of at most one step. This delay ends the sequence of ever
+  shorter rebounds between joints that push each other off their stops.
 
 A locked joint (by a brake or a jam) is brought to rest by the same kind of impulse and held.
 """
@@ -346,10 +345,9 @@ class EffortPlant:
         wrench.
 
         ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, in base components;
-        it rotates with the base during the tick. A joint that reaches its limit stops
-        there without rebound and is held while something pushes it outwards. Returns whether any
-        joint was limited; ``effort_limited`` and ``stroke_limited`` count these ticks for each
-        joint.
+        it rotates with the base during the tick. A joint that reaches its limit stops there without
+        rebound and is held while something pushes it outwards. Returns whether any joint was
+        limited; ``effort_limited`` and ``stroke_limited`` count these ticks for each joint.
 
         Raises
         ------

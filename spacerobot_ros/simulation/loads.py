@@ -114,9 +114,10 @@ class Surroundings:
 
         Parameters
         ----------
-        name Name of the body. motion Its motion.
-        inertia
-            Its mass properties, in its frame.
+        name
+            Name of the body.
+        motion, inertia
+            Its motion, and its mass properties in its frame.
 
         Raises
         ------
@@ -206,8 +207,7 @@ class LoadedTick:
     plain
         The tick without loads, whose inputs and outputs are read and written.
     loaded
-        The tick with loads: its last input is the load vector; it may have additional
-        outputs.
+        The tick with loads: its last input is the load vector; it may have additional outputs.
     loads
         The loads.
     further

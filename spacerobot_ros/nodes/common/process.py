@@ -107,8 +107,9 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
     """Run one node in its own process until SIGINT, SIGTERM or SIGHUP arrives, or the parent
     process ends.
 
-    The end of the parent is ignored unless the parent requested otherwise; a shell and ``ros2
-    run`` make no such request.
+    The end of the parent is ignored unless the parent requested otherwise; a shell and ``ros2 run``
+    make no such request.
+
     Returns the exit code: 0 after a signal, 2 if the node cannot start (the reason is written to
     standard error), or the node's own code if the node ends by itself.
 

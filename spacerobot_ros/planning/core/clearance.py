@@ -129,9 +129,8 @@ class Clearance:
         """Return the required distances (P,), m, of all pairs for a motion from a start (n,).
 
         If a pair is closer than the clearance at the start, its distance there is required instead.
-        Links
-        in contact at the start are ignored (minus infinity), with a warning. ``base`` is the base
-        pose at the start; None: obstacles are ignored.
+        Links in contact at the start are ignored (minus infinity), with a warning. ``base`` is the
+        base pose at the start; None: obstacles are ignored.
 
         Raises
         ------

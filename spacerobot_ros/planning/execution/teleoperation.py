@@ -344,8 +344,13 @@ class TwistFollower:
         Parameters
         ----------
         twist
-            The wanted twist; None: no twist, so the joints come to rest. pose (7,) of the base:
-            position, m, and quaternion. q (n,) shape, m or rad. before (n,) last commanded rates.
+            The wanted twist; None: no twist, so the joints come to rest.
+        pose
+            (7,) of the base: position, m, and quaternion.
+        q
+            (n,) shape, m or rad.
+        before
+            (n,) last commanded rates.
         """
         wanted, reason = np.zeros(len(q)), ""
         if twist is not None:

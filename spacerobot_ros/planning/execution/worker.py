@@ -1,5 +1,4 @@
-"""Plans on request: synchronously, with time stopped, or in a thread while states are
-processed."""
+"""Plans on request: synchronously, with time stopped, or in a thread while states are processed."""
 
 from __future__ import annotations
 
@@ -84,8 +83,7 @@ class PlanningTask:
         (K + 1, n) shapes at the ticks before the gait, m or rad: the joints brake, or they rest
         while the base drifts; None: the gait begins immediately.
     rates_after_braking
-        (n,) velocities held after braking, m/s or rad/s, for reaction wheels; None:
-        zero.
+        (n,) velocities held after braking, m/s or rad/s, for reaction wheels; None: zero.
     take_over
         Tick at which the plan takes over from the schedule that is tracked before it; None: the
         plan begins at rest, or with braking. The request's state is the current state.

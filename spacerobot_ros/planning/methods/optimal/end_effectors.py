@@ -305,9 +305,8 @@ class EndEffectorSpecification:
         Whether base attitude, base position and joint positions are part of the goal.
     overdetermined
         Whether the goal has more coordinates than the joints can move independently. Hardly any
-        such
-        goal can be reached, and only in isolated shapes, which inverse kinematics finds before the
-        motion is planned.
+        such goal can be reached, and only in isolated shapes, which inverse kinematics finds before
+        the motion is planned.
     """
 
     rows: EndEffectorRows

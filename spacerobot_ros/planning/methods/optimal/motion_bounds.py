@@ -10,13 +10,12 @@ such sliders, it is the set of all centres of mass.
 
 :class:`ConnectionBounds` bounds the base motion caused by each joint. While one joint moves and the
 others are at rest, the robot consists of two rigid bodies with masses ``m_P`` and ``m_D``, inboard
-and outboard of
-the joint. With the locked inertia ``H`` about the centre of mass, and the angular momentum ``h_i``
-about it due to the joint at unit rate with the base at rest, the base rotates at ``-H^-1 h_i``.
-The distances of the centres of mass from the joint bound ``|h_i|`` for all shapes, and the smallest
-principal moments of all bodies bound ``H`` from below. Energy yields another bound: the energy of
-the base motion is not available outboard of the joint, ``omega . (H + I_base) omega <= M_ii``. The
-smaller bound counts.
+and outboard of the joint. With the locked inertia ``H`` about the centre of mass, and the angular
+momentum ``h_i`` about it due to the joint at unit rate with the base at rest, the base rotates at
+``-H^-1 h_i``. The distances of the centres of mass from the joint bound ``|h_i|`` for all shapes,
+and the smallest principal moments of all bodies bound ``H`` from below. Energy yields another
+bound: the energy of the base motion is not available outboard of the joint,
+``omega . (H + I_base) omega <= M_ii``. The smaller bound counts.
 
 :class:`DurationBound` follows from both bounds, and from the largest joint travel in a given time.
 No shape is sampled.
@@ -422,13 +421,17 @@ class DurationBound:
         Parameters
         ----------
         boundary, limits
-            Ends of the manoeuvre, and joint limits. axes (m, 3) base axes along which the final
-            attitude is given. connection Bounds on the base motion.
+            Ends of the manoeuvre, and joint limits.
+        axes
+            (m, 3) base axes along which the final attitude is given.
+        connection
+            Bounds on the base motion.
         final_is_given
             Whether the last shape in the boundary conditions is the only one at the goal.
         base_rate_limit
             Largest rate of the base, rad/s; 0: any.
-        demands Further demands.
+        demands
+            Further demands.
         """
         demands = list(demands)
         angle = _least_turn(boundary.goal_rotation, axes)

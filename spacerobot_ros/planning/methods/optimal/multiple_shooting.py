@@ -198,7 +198,8 @@ class MultipleShooting:
             The problem, and the start of the solver.
         stop
             Conditions on which the solver stops early.
-        duration Bounds on the duration.
+        duration
+            Bounds on the duration.
         near
             Neighbourhood of the guess for the solution; None: anywhere.
         refining
