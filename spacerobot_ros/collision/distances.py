@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -101,14 +102,25 @@ class ExactDistances:
                 made = coal.Capsule(*shape.size)
             case _:
                 assert solid.vertices is not None
-                points = coal.StdVec_Vec3s()
-                points.extend(list(solid.vertices))
-                if np.linalg.matrix_rank(solid.vertices - solid.vertices[0], tol=1e-9) == 3:
-                    return coal.Convex.convexHull(points, True, "Qt"), np.eye(3), np.zeros(3)
+                if (hull := self._hull(solid.vertices)) is not None:
+                    return hull, np.eye(3), np.zeros(3)
                 box = solid.enclosure
                 sides = 2 * (box.half + box.radius)
                 return coal.Box(*sides.tolist()), box.pose.R, box.pose.r
         return made, shape.pose.R, shape.pose.r
+
+    def _hull(self, vertices: Array) -> Any:
+        """Return the convex hull of vertices (V, 3); None if coal has none for them."""
+        if np.linalg.matrix_rank(vertices - vertices[0], tol=1e-9) < 3:
+            return None
+        points = self._coal.StdVec_Vec3s()
+        points.extend(list(vertices))
+        # A vertex may have at most 254 neighbours. A disc that is cut into triangles can exceed
+        # this; left whole, only the tip of a cone can.
+        for triangles, options in ((True, "Qt"), (False, "")):
+            with suppress(RuntimeError):
+                return self._coal.Convex.convexHull(points, triangles, options)
+        return None
 
     def __call__(
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array

@@ -201,6 +201,24 @@ def test_a_tilted_flat_mesh_lies_where_its_corners_are(tmp_path: Path) -> None:
         assert geometry.distances(pair, poses)[0] == pytest.approx(expected, abs=1e-5)
 
 
+def test_round_meshes_of_many_facets_have_distances(tmp_path: Path) -> None:
+    """More facets than coal allows neighbours of a vertex; a cone counts as the box around it."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
+    rim = np.stack((0.5 * np.cos(turn), 0.5 * np.sin(turn), np.zeros_like(turn)), axis=1)
+    disc = np.concatenate((rim - [0, 0, 0.05], rim + [0, 0, 0.05]))
+    bounds = {}
+    for name, corners in (("disc", disc), ("cone", np.concatenate((rim, [[0, 0, 0.4]])))):
+        lines = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in corners.tolist())
+        (tmp_path / f"{name}.obj").write_text(f"{lines}f 1 2 {len(corners)}\n")
+        mesh = f'<collision><geometry><mesh filename="{tmp_path}/{name}.obj"/></geometry>'
+        text = chain((f"{mesh}</collision>",), (), (BALL.replace("0.2 0.1 0", "0 0 0"),))
+        geometry = CollisionGeometry(parse_robot(text.replace("0.1 0 0.2", "0 0 0")))
+        bounds[name], _ = geometry.nearest(np.zeros(2)) or (np.nan, 0)
+    # The ball of 0.1 m is at (2, 0, 0.2).
+    assert bounds["disc"] == pytest.approx(np.hypot(1.5, 0.15) - 0.1, abs=1e-4)
+    assert 1.5 - 0.1 - 1e-6 <= bounds["cone"] <= np.hypot(1.5, 0.2) - 0.1
+
+
 @pytest.mark.parametrize("name", ["dual_arm", "servicer"])
 def test_distances_are_those_of_pinocchio(name: str) -> None:
     pinocchio = pytest.importorskip("pinocchio")
