@@ -205,7 +205,8 @@ def test_round_meshes_of_many_facets_have_distances(tmp_path: Path) -> None:
     """More facets than coal allows neighbours of a vertex; a cone counts as the box around it."""
     turn = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
     rim = np.stack((0.5 * np.cos(turn), 0.5 * np.sin(turn), np.zeros_like(turn)), axis=1)
-    disc = np.concatenate((rim - [0, 0, 0.05], rim + [0, 0, 0.05]))
+    half = np.array([0.0, 0.0, 0.05])
+    disc = np.concatenate((rim - half, rim + half))
     bounds = {}
     for name, corners in (("disc", disc), ("cone", np.concatenate((rim, [[0, 0, 0.4]])))):
         lines = "".join(f"v {x!r} {y!r} {z!r}\n" for x, y, z in corners.tolist())
