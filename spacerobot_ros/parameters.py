@@ -8,7 +8,9 @@ checks on the command line and in :func:`spacerobot_ros.plan`, and the tables in
 from __future__ import annotations
 
 import math
+import reprlib
 import sys
+from array import array
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -183,7 +185,8 @@ class Parameter:
 
     def _refusal(self, value: Any, expected: str) -> ParameterError:
         unit = f" ({self.unit})" if self.unit else ""
-        shown = value if not isinstance(value, str) else f"'{value[:60]}'"
+        plain = value.tolist() if isinstance(value, array) else value
+        shown = f"'{value[:60]}'" if isinstance(value, str) else reprlib.repr(plain)
         return ParameterError(f"Parameter '{self.name}' is {shown}; it must be {expected}{unit}.")
 
 

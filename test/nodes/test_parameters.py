@@ -233,6 +233,13 @@ def test_nodes_whose_watchdog_is_off_listen_to_no_heartbeats(harness: Harness) -
     assert "/heartbeat" not in {each.topic_name for each in node.subscriptions}
 
 
+def test_a_refused_list_is_shown_as_a_list_and_not_to_its_end(harness: Harness) -> None:
+    planner = harness.make(KINDS["planner"], {"robot": "planar_manipulator"})
+    (result,) = planner.set_parameters([Parameter("max_corrections", value=[2.5] * 50)])
+    assert not result.successful
+    assert "is [2.5, 2.5, 2.5, 2.5, 2.5, 2.5, ...]; it must be a whole number" in result.reason
+
+
 def test_given_values_and_defaults_are_declared(harness: Harness) -> None:
     given = {"rate": 20, "names": ["a", "b"]}
     node = harness.add(Node("any", **construction(harness.context, given)))
