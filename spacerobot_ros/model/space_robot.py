@@ -407,11 +407,14 @@ class SpaceRobot:
                 f"it can rotate without moving any mass. Give '{self.description.base_link}' {box}."
             )
         else:
-            joint = self.description.movable_joints[int(moved.argmax())]
+            i = int(moved.argmax())
+            joint = self.description.movable_joints[i]
+            outer = np.array(H(shapes[1], *p))[6 + i, 6 + i]
+            link = joint.child if outer <= 1e-12 * self.total_mass else joint.parent
             mend = (
                 f"its joint '{joint.name}' can move without moving any mass, because the bodies on "
-                f"one side of it have no inertia about its axis. Give '{joint.child}' and "
-                f"'{joint.parent}' {box}, or make the joint fixed."
+                f"the side of '{link}' have no inertia about its axis. Give '{link}' {box}, or "
+                "make the joint fixed."
             )
         raise RobotDescriptionError(
             f"The inertia matrix of robot '{self.description.name}' is not positive definite: "
