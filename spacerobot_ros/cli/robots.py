@@ -80,7 +80,7 @@ def analyze_command(
     target = picture or Path("out") / f"{name}_curvature.png"
     drawn = draw_analysis(found, PictureFormat.of(target))
     if drawn is None:
-        click.echo(f"{'picture':<13}none: no joint loops rotate the base")
+        click.echo(f"{'picture':<13}none: no loops of joints that can move rotate the base")
     else:
         write_output(target, drawn)
         click.echo(f"{'picture':<13}{target}")

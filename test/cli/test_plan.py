@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -238,6 +239,17 @@ def test_the_robots_of_the_papers(
     content = picture.read_bytes()
     assert content.startswith(b"\x89PNG")
     assert len(content) > 20_000
+
+
+def test_no_picture_is_drawn_of_joints_that_cannot_move(tmp_path: Path) -> None:
+    """Exporters of URDFs write limits of 0 where none were given."""
+    text = robot_file("three_joint_arm").read_text("utf-8")
+    stiff = tmp_path / "stiff.urdf"
+    stiff.write_text(re.sub(r'velocity="[^"]*"', 'velocity="0"', text))
+    _, lines, picture = analyzed(tmp_path, str(stiff))
+    assert not picture.exists()
+    assert "picture      none: no loops of joints that can move rotate the base" in lines
+    assert any("has a velocity limit of 0, so it cannot move" in line for line in lines)
 
 
 @pytest.mark.slow

@@ -293,6 +293,9 @@ def test_joints_without_a_velocity_limit_are_refused_with_the_remedies() -> None
         '<limit velocity="..." effort="..."/> in the URDF, or optimal.max_velocity.'
     )
     assert plan(free, rotvec=[0, 0, 0.2], max_velocity=[0.5, 0.5], **QUICK).ticks > 0
+    stiff = SpaceRobot.from_urdf(re.sub(r'(<limit[^>]* velocity=)"[^"]*"', r'\1"0"', text, count=1))
+    with pytest.raises(ParameterError, match=r"'pin_1' has a velocity limit of 0, .*make it fixed"):
+        plan(stiff, rotvec=[0, 0, 0.2], **QUICK)
 
 
 def test_a_start_that_breaks_a_constraint_is_refused(arm: SpaceRobot) -> None:

@@ -284,6 +284,12 @@ class MotionLimits:
             acceleration limit.
         """
         velocity = robot.velocity_limit.copy()
+        for i in np.flatnonzero(velocity == 0)[:1]:
+            raise ParameterError(
+                f"Joint '{robot.joint_names[i]}' has a velocity limit of 0, but {method} requires "
+                'that all joints can move: give it <limit velocity="..."/> in the URDF, or make it '
+                "fixed."
+            )
         if options.max_velocity:
             fastest = per_joint(robot, "max_velocity", options.max_velocity, velocity, method)
             velocity = np.minimum(velocity, fastest)
