@@ -110,6 +110,8 @@ class Commander(ABC):
         self._decoder: StateDecoder | None = None
         self._described: SpaceRobot | None = None
         """The robot as described, without a held body."""
+        self._robot_refusal = ""
+        """Why the described robot cannot be commanded; empty: it can, or none is described."""
         self._payload = ""
         self._held: Payload | None = None
         """The body that the robot holds, if its description is valid."""
@@ -183,6 +185,17 @@ class Commander(ABC):
             self.give_up_goals(PlantStopped(why))
             self._reset_executive()
         self.robot = self.executive = self._decoder = self._described = None
+        self._robot_refusal = ""
+
+    def refuse_robot(self, reason: str) -> None:
+        """Report that the described robot cannot be commanded; goals are refused for this reason
+        until another robot is described.
+        """
+        self._robot_refusal = f"The robot on 'robot_description' is refused: {reason}"
+        waiting, self._waiting_goals = self._waiting_goals, {}
+        for goal in waiting.values():
+            self._refuse_goal(self._robot_refusal, goal.goal_id)
+        self._report_missing()
 
     def activate(self) -> None:
         """Start handling states; resume unfinished goals from an earlier process.
@@ -289,10 +302,9 @@ class Commander(ABC):
     def _require_free(self) -> None:
         if not self.active:
             raise PlanningError(f"The goal is refused: this node is {self.activity.value}.")
-        if self._actuation_refusal:
-            raise PlanningError(self._actuation_refusal)
-        if self.plant.refusal_of_goals:
-            raise PlanningError(self.plant.refusal_of_goals)
+        plant = self._actuation_refusal or self.plant.refusal_of_goals
+        if refusal := self._robot_refusal or plant:
+            raise PlanningError(refusal)
 
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
         self._fly_to.accepted(goal.goal_id)
@@ -461,6 +473,8 @@ class Commander(ABC):
     def missing(self) -> str:
         """Clause naming the messages for which states wait; empty: none."""
         if self.robot is None:
+            if self._robot_refusal:
+                return f"another robot. {self._robot_refusal.rstrip('.')}"
             return "a robot on 'robot_description'"
         return self.inputs.missing(self.config.control_period)
 

@@ -138,6 +138,25 @@ def test_ignored_states_are_reported_once_a_second(planner: Rig) -> None:
 # -- the references of a controller -----------------------------------------------------------
 
 
+def test_goals_for_a_robot_that_is_refused_are_refused_for_the_same_reason(arm: SpaceRobot) -> None:
+    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
+    rig.commander.activate()
+    rig.goal(sec=1)
+    rig.commander.refuse_robot("The thruster force limit is inf: set max_force.")
+    rig.goal(sec=2)
+    why = "The robot on 'robot_description' is refused: The thruster force limit is inf: set max_f"
+    refused = [each for each in rig.host.statuses if each.state.value == "refused"]
+    assert [each.goal_id for each in refused] == ["1.000000000", "2.000000000"]
+    assert all(each.message.startswith(why) for each in refused)
+    rig.wall += 2.0
+    rig.commander.take_accepted_jump()
+    waiting = [each.message for each in rig.host.statuses if each.state.value == "waiting"]
+    assert waiting[-1].startswith(f"Waiting for another robot. {why}")
+    rig.commander.drop_robot("robot_description now describes another robot.")
+    rig.use(arm)
+    assert rig.goal(sec=3) is not None
+
+
 def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
 

@@ -252,6 +252,7 @@ class CommanderNode(FlightNode):
                 self.use(robot_from_text(message.data, self.config))
         except SpaceRobotError as error:
             self.get_logger().error(f"robot_description: {error}")
+            self.commander.refuse_robot(str(error))
             return
         self.commander.answer_latest()
 
