@@ -329,7 +329,7 @@ class ReplayNode(FlightNode):
 
     def _step(self) -> str:
         if not (self._paused and self._begun):
-            raise CommandError("Only a paused replay can be stepped; call ~/pause first.")
+            raise CommandError("Only a paused replay can be stepped: pause it first.")
         try:
             message = self._playback.step(self._now())
         except RecordingError as error:

@@ -64,7 +64,7 @@ class Reason(str, Enum):
     SECOND_COMMANDER = "second_commander"
     """Another node has already sent a command for the same state."""
     LATCHED = "latched"
-    """A fault is latched: nothing moves until the plant is rearmed."""
+    """A fault is latched: joints brake and thrusters are off until the plant is rearmed."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,8 @@ class Refusal:
     clause
         The reason as a clause, with numbers and names; it completes "the command was refused:".
     latches
-        Whether the refusal latched a fault: nothing moves until the plant is rearmed.
+        Whether the refusal latched a fault: joints brake and thrusters are off until the plant is
+        rearmed.
     """
 
     reason: Reason
@@ -300,7 +301,8 @@ class CommandValidator:
             source.arrived = False
 
     def latch(self, reason: str, clause: str, now_ns: int) -> None:
-        """Bring everything to rest until :meth:`rearm`; the first of several faults is reported.
+        """Brake the joints and turn off the thrusters until :meth:`rearm`; the first of several
+        faults is reported.
 
         Commands for states before the fault are refused even after :meth:`rearm`.
 

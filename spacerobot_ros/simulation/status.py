@@ -251,7 +251,7 @@ class PlantMonitor:
                 reason, message = self.failure
                 return PlantStatus(activity, message, reason, fault)
             case PlantState.PAUSED:
-                message = "Time is stopped; '~/pause' resumes it"
+                message = "Time is stopped until it is resumed"
                 if fault:
                     message += f", and a fault is latched: {fault}"
             case _ if fault:

@@ -173,7 +173,7 @@ class Request(Enum):
     ABORT = "abort"
     """The planner and the controller drop their goals; the joints brake."""
     STOP = "stop"
-    """The plant brings everything to rest and rejects commands until ``REARM``."""
+    """The joints brake, the thrusters are off, and commands are rejected until ``REARM``."""
     REARM = "rearm"
     PAUSE = "pause"
     RESUME = "resume"

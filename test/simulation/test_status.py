@@ -108,6 +108,8 @@ def test_a_fault_that_latches_while_time_stands_still_is_reported_at_once() -> N
     rig.commands.latch("abort", "aborted on request", rig.now)
     assert rig.events(PlantState.PAUSED) == [EventKind.LATCHED]
     assert rig.state == (PlantState.PAUSED, "abort")
+    message = "Time is stopped until it is resumed, and a fault is latched: aborted on request."
+    assert rig.monitor.status.message == message, "names no service, for the page has a button"
     assert rig.events() == [EventKind.RESUMED]
     assert rig.state == (PlantState.LATCHED, "abort")
 
