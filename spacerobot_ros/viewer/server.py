@@ -13,6 +13,7 @@ import gzip
 import importlib.util
 import io
 import ipaddress
+import logging
 import secrets
 import socket
 import threading
@@ -146,6 +147,10 @@ def _with_script(page: bytes, *, packed: bool) -> bytes:
     return gzip.compress(html) if packed else html
 
 
+def _is_no_failed_handshake(record: logging.LogRecord) -> bool:
+    return record.getMessage() != "opening handshake failed"
+
+
 @contextmanager
 def _guarded_websockets(served: str) -> Iterator[None]:
     """Make websocket servers that start in this block refuse other origins and frames."""
@@ -179,6 +184,8 @@ def _guarded_websockets(served: str) -> Iterator[None]:
 
         return serve(*given, process_request=process, **options)
 
+    # Whatever is no GET request, such as HEAD, ends there with a traceback.
+    logging.getLogger("websockets.server").addFilter(_is_no_failed_handshake)
     module.serve = guarded_serve  # type: ignore[assignment, misc]
     try:
         yield

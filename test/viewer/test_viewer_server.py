@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import gzip
 import importlib.util
+import logging
 import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from http.client import HTTPConnection
+from http.client import HTTPConnection, RemoteDisconnected
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,21 @@ def test_the_page_has_its_own_script_before_that_of_viser(server: Any, encoding:
     page = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_bytes()
     assert html.index(own) < html.index(b"<script data-")
     assert html.replace(b"<script>" + own + b"</script>", b"") == page
+
+
+def test_a_head_request_leaves_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    # viser filters the log too, but only from its first page on.
+    monkeypatch.setattr(logging.getLogger("websockets.server"), "filters", [])
+    server = start_server("127.0.0.1", 0)
+    connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
+    connection.request("HEAD", "/")
+    with pytest.raises(RemoteDisconnected):
+        connection.getresponse()
+    connection.close()
+    stop_server(server)
+    assert not [each for each in caplog.records if each.exc_info]
 
 
 def test_pages_learn_whether_their_viewer_still_runs(server: Any) -> None:
