@@ -73,6 +73,21 @@
     }
   }
 
+  // Pages report their cameras late: if the viewer moved them, they would fall behind the robot.
+  let followed = null;
+
+  function follow(viewer) {
+    const robot = viewer.nodeRefFromName["/robot"];
+    const here = robot?.visible ? robot.getWorldPosition(robot.position.clone()) : null;
+    if (here && followed && !here.equals(followed) && viewer.cameraControl) {
+      const labels = [...document.querySelectorAll("label[for]")];
+      const box = labels.find((label) => label.textContent.trim() === "Follow the robot");
+      const { x, y, z } = viewer.cameraControl.getTarget(here.clone()).add(here).sub(followed);
+      if (box?.control?.checked) viewer.cameraControl.moveTo(x, y, z, false);
+    }
+    followed = here;
+  }
+
   function dress(nodes) {
     for (const [name, node] of Object.entries(nodes)) {
       if (!node) continue;
@@ -197,6 +212,7 @@
     dressed.onBeforeRender = () => {
       dress(viewer.nodeRefFromName);
       liftShadows(viewer.scene);
+      follow(viewer);
     };
   }, 200);
 })();

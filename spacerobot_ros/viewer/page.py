@@ -826,8 +826,6 @@ class Page:
         assert around is not None
         if measured is self._drawn:
             return
-        if self._drawn is not None and self._follow.value:
-            self._move_cameras(measured.pose[:3] - self._drawn.pose[:3])
         self._drawn = measured
         drawing.base.visible = True
         drawing.place(measured.pose)
@@ -902,12 +900,6 @@ class Page:
     def _aim_cameras(self) -> None:
         for client in self._server.get_clients().values():
             self._aim_camera(client.camera)
-
-    def _move_cameras(self, way: Array) -> None:
-        """Move the cameras of all browsers by ``way`` (3,), m."""
-        for client in self._server.get_clients().values():
-            position, look_at = np.array(client.camera.position), np.array(client.camera.look_at)
-            client.camera.position, client.camera.look_at = position + way, look_at + way
 
     # -- actions of users -----------------------------------------------------------------------
 

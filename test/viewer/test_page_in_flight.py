@@ -88,12 +88,25 @@ def test_paths_are_in_front_and_the_sun_casts_shadows(up: Up, tmp_path: Path) ->
         assert window.complaints == []
 
 
+_FROM_ROBOT = """
+(() => {
+  const viewer = window.__viserMutable, robot = viewer.nodeRefFromName["/robot"];
+  const here = robot.getWorldPosition(robot.position.clone());
+  const target = viewer.cameraControl.getTarget(here.clone());
+  return [here.toArray(), target.sub(here).toArray()];
+})()
+"""
+"""Where the robot is, and where the camera looks beside it."""
+
+
 def test_the_goal_of_the_scenario_is_flown_by_a_press(ros_domain: int, tmp_path: Path) -> None:
     up = Up(tmp_path, ros_domain, "coordinated_control", "--rate", "4")
     try:
         with browser(tmp_path / "profile") as window:
             page = Page(window, up.url)
             page.wait_for_text("coordinated_control, 4 times real time", "Drag", "holding")
+            page.tick("Follow the robot")
+            start, aside = window.evaluate(_FROM_ROBOT)
             page.press("Fly the scenario's goal")
             page.wait_for_text("The goal is accepted.", "tracking")
             arrow = "!!window.__viserMutable.nodeRefFromName['/end_effector_goal']?.visible"
@@ -102,6 +115,10 @@ def test_the_goal_of_the_scenario_is_flown_by_a_press(ros_domain: int, tmp_path:
             scenario = load_scenario("coordinated_control")
             np.testing.assert_allclose(page.numbers(POSITION), scenario.goal.position, atol=1e-4)
             window.wait_for(arrow)
+            # The camera has followed the robot, and no step of it was lost.
+            end, still = window.evaluate(_FROM_ROBOT)
+            assert np.linalg.norm(np.subtract(end, start)) > 0.1
+            np.testing.assert_allclose(still, aside, atol=1e-3)
             assert window.complaints == []
     finally:
         up.close()
