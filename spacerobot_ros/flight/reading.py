@@ -227,7 +227,7 @@ class FlightBag(RecordedRobot):
             yield time_ns, replace(event, node=message.name.strip("/"))
 
     def goals(self, topic: str) -> tuple[SentGoal, ...]:
-        """Return the valid goal poses, and the last pose of each path, in the odometry frame."""
+        """Return the valid goal poses, or the last pose of each path, in the odometry frame."""
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals, ids = [], GoalIds()
@@ -236,23 +236,22 @@ class FlightBag(RecordedRobot):
             shape = next((each for since, each in reversed(shapes) if since <= time_ns), None)
             stamp = message.header.stamp
             goal_id = ids.of(stamp.sec, stamp.nanosec)
-            aim, frame = message, message.header.frame_id
+            poses, frame = [message], message.header.frame_id
             if topic.endswith("path"):
                 if not message.poses:
                     continue
-                aim = message.poses[-1]
-                frame = aim.header.frame_id or frame
-            p, o = aim.pose.position, aim.pose.orientation
-            attitude = [o.x, o.y, o.z, o.w]
+                poses = message.poses
+                frame = poses[-1].header.frame_id or frame
+            *through, (position, attitude) = map(_pose_of, poses)
             if topic != "goal_pose" and not any(attitude):
                 # Zeros ask for the position of an end-effector alone.
                 attitude = _NO_GOAL.quaternion.tolist()
             try:
-                goal = Goal.received([p.x, p.y, p.z], attitude, shape)
+                goal = Goal.received(position, attitude, shape)
                 if odom is not None:
-                    at = odom[1].pose.pose
-                    r, o = at.position, at.orientation
-                    goal = goal.kept_at(np.array([r.x, r.y, r.z]), np.array([o.x, o.y, o.z, o.w]))
+                    goal = goal.kept_at(*map(np.array, _pose_of(odom[1].pose)))
+                if topic == "goal_path" and through:
+                    goal = replace(goal, waypoints=np.array([x + q for x, q in through]))
             except PlanningError:
                 continue
             if not world or frame in ("", world):
@@ -332,6 +331,12 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
                 f"The bag {bag.path} has no robot in the namespace '{namespace}': it has {known}."
             )
     return FlightBag(bag, chosen)
+
+
+def _pose_of(stamped: Any) -> tuple[list[float], list[float]]:
+    """Return the position and quaternion of a message with a pose."""
+    p, o = stamped.pose.position, stamped.pose.orientation
+    return [p.x, p.y, p.z], [o.x, o.y, o.z, o.w]
 
 
 def namespaces(bag: Bag) -> list[str]:

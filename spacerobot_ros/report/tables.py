@@ -17,13 +17,14 @@ from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
-from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatus, time_to_end
 from spacerobot_ros.report.flight import FlightReport, joint_unit
 from spacerobot_ros.scenario import Published
 
 _NO_VALUE = "–"
 _LEAST_ANGLE_IN_DEGREES = 1e-4  # rad
+_SHOWN_DIGIT = 1e-6
+"""Share of a number that six significant digits do not show."""
 _EQUAL_TIME_TICKS = 1.5
 """Largest difference between times that are considered equal, in control periods."""
 
@@ -138,7 +139,7 @@ def result_table(flight: FlightReport) -> Table:
         rows.append(("End-effector goal", _position_text(goal.position)))
         rows.append(("End-effector, final", _position_text(flight.tool.values[-1, :3])))
     for link, aim in flight.link_goals.items():
-        rows.append((f"Goal of {link}", _link_goal_text(aim)))
+        rows.append((f"Goal of {link}", _pose_text(aim.position, aim.quaternion)))
         if (error := flight.end_effector_errors.get(link)) is not None:
             at = aim.position - error.position
             rows.append((f"Final position of {link}", _position_text(at)))
@@ -161,21 +162,25 @@ def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
     if not flight.controls("base") and flight.outputs:
         return {}
     attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
-    return {"position": _position_text(goal.position), "attitude": attitude}
+    through = {
+        f"waypoint {number}": _pose_text(pose[:3], pose[3:])
+        for number, pose in enumerate(goal.path_values[:-1], start=1)
+    }
+    return through | {"position": _position_text(goal.position), "attitude": attitude}
 
 
-def _link_goal_text(goal: EndEffectorGoal) -> str:
+def _pose_text(position: Array, quaternion: Array | None) -> str:
     attitude = "any attitude"
-    if goal.quaternion is not None:
-        attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
-    return f"{_position_text(goal.position)}, {attitude}"
+    if quaternion is not None:
+        attitude = _format_attitude(rotvec_from_quaternion(quaternion))
+    return f"{_position_text(position)}, {attitude}"
 
 
 def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
     """Return a row for each goal component that differs between flights: name and values."""
     goals = [
         _base_goal_texts(flight)
-        | {f"of {link}": _link_goal_text(goal) for link, goal in flight.link_goals.items()}
+        | {f"of {x.link}": _pose_text(x.position, x.quaternion) for x in flight.link_goals.values()}
         for flight in flights
     ]
     parts = dict.fromkeys(part for each in goals for part in each)
@@ -196,7 +201,9 @@ def payload_text(estimate: PayloadEstimate) -> str:
     parts = []
     mass, spread = estimate.parameters[0], estimate.deviations[0]
     if not math.isnan(mass):
-        parts.append(f"mass {mass:.6g} ± {spread:.1g} kg")
+        # The digits shown are certain if the deviation is smaller.
+        about = f" ± {spread:.1g}" if spread > _SHOWN_DIGIT * mass else ""
+        parts.append(f"mass {mass:.6g}{about} kg")
     if not np.isnan(estimate.parameters[:4]).any():
         center = numbers(estimate.parameters[1:4] / mass)
         parts.append(f"centre of mass ({center}) m in {estimate.link}")
