@@ -30,20 +30,26 @@ def sentence_case(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+AT_JOINTS = "m or rad at the joints"
+"""Unit of joint errors for :func:`quantity`."""
+
+
 def quantity(value: float, unit: str) -> str:
     """Return a number as a readable string with three digits; a rounding error is shown as an
     upper bound.
 
-    m, rad, m/s and rad/s get SI prefixes: ``1.38 mm``, ``< 1 µrad``.
+    m, rad, m/s and rad/s get SI prefixes: ``1.38 mm``, ``< 1 µrad``, ``2 mm or mrad``.
     """
     size = abs(value)
     if not unit.startswith(("m", "rad")):
-        return f"{value:.3g} {unit}" if size >= 1e-9 or not size else f"< 1e-9 {unit}"
-    if 0 < size < 1e-6:
-        return f"< 1 µ{unit}"
+        return f"< 1e-9 {unit}" if 0 < size < 1e-9 else f"{value + 0.0:.3g} {unit}"
     milli, micro = size < 0.1, size < 1e-4
     factor, prefix = (1e6, "µ") if micro else (1e3, "m") if milli else (1.0, "")
-    return f"{factor * value:.3g} {prefix if size else ''}{unit}"
+    if 0 < size < 1e-6:
+        number = "< 1"
+    else:
+        number, prefix = f"{factor * value + 0.0:.3g}", prefix if size else ""
+    return f"{number} {' or '.join(prefix + each for each in unit.split(' or '))}"
 
 
 def numbers(values: Iterable[float], digits: int = 5) -> str:

@@ -29,7 +29,7 @@ from spacerobot_ros.control.state import (
     Reference,
     TargetNotSetError,
 )
-from spacerobot_ros.errors import ParameterError, quantity
+from spacerobot_ros.errors import AT_JOINTS, ParameterError, quantity
 from spacerobot_ros.model.description import Array, RobotDescription, plane_normal
 from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.model.kinematics import link_quaternion
@@ -127,7 +127,7 @@ class OutputDistance:
     joints: float
 
     def __str__(self) -> str:
-        parts = ((self.position, "m"), (self.attitude, "rad"), (self.joints, "at the joints"))
+        parts = ((self.position, "m"), (self.attitude, "rad"), (self.joints, AT_JOINTS))
         return ", ".join(quantity(*part) for part in parts if not math.isnan(part[0]))
 
 

@@ -285,7 +285,7 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
         ({"position"}, "50 mm from the goal"),
         ({"attitude"}, "0.2 rad from the goal"),
         ({"position", "attitude"}, "50 mm and 0.2 rad from the goal"),
-        ({"attitude", "shape"}, "0.2 rad and 0.75 at the joints from the goal"),
+        ({"attitude", "shape"}, "0.2 rad and 0.75 m or rad at the joints from the goal"),
     ):
         assert describe_remaining_error(error, frozenset(controls)) == words  # type: ignore[arg-type]
     hand = PoseError(np.array([0.0, 0.3, -0.4]), np.zeros(3))
@@ -298,8 +298,11 @@ def test_a_remaining_error_names_what_is_controlled() -> None:
     within, goal = Tolerance(0.02, 0.06, 0.3), Goal.checked([1, 2, 3], [0, 0, 0, 1], [0.5, 0.25])
     for controls, words in (
         ({"position"}, "tolerance 20 mm; attitude and shape not controlled"),
-        ({"attitude", "shape"}, "tolerance 60 mrad, 0.3 at the joints; position not controlled"),
-        ({"position", "attitude", "shape"}, "tolerance 20 mm, 60 mrad, 0.3 at the joints"),
+        (
+            {"attitude", "shape"},
+            "tolerance 60 mrad, 0.3 m or rad at the joints; position not controlled",
+        ),
+        ({"position", "attitude", "shape"}, "tolerance 20 mm, 60 mrad, 0.3 m or rad at the joints"),
     ):
         told = describe_remaining_error(error, frozenset(controls), within, goal)  # type: ignore[arg-type]
         assert told.endswith(f" from the goal ({words})")

@@ -398,8 +398,9 @@ def test_a_trajectory_that_no_server_flies_fails_the_goal() -> None:
     loop.tick(2)
     loop.executive.schedule_ended("the action '/arm' has no server", final=True)
     status = loop.until(PlannerState.FAILED)
-    assert status.message.startswith("The goal is not reached: ")
-    assert status.message.endswith(", and the action '/arm' has no server.")
+    begin = "The goal is not reached: the action '/arm' has no server. Remaining: "
+    assert status.message.startswith(begin)
+    assert status.message.endswith(").")
     assert status.corrections == 0
     assert len(stub_of(loop).requests) == 1
     loop.executive.schedule_ended("too late", final=True)  # There is no goal any more.

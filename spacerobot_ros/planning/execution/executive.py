@@ -459,9 +459,9 @@ class Executive:
             return
         corrects = active.next_plan is PlanReason.CORRECTION
         if active.not_flown_reason:
-            why = f", and {active.not_flown_reason}."
+            why = f": {active.not_flown_reason}. Remaining"
         elif corrects and active.corrections >= self.config.max_corrections:
-            why = f" after {active.corrections} correction(s)."
+            why = f" after {active.corrections} correction(s)"
         if why:
             self._end_goal(active.failed(error, tolerance, why), Event.FAILED)
             return
@@ -737,7 +737,8 @@ class Executive:
             assert active is not None
             assert job.error is not None
             tolerance = self._tolerance_of(active.identified)
-            self._end_goal(active.failed(job.error, tolerance, f", and {why}"), Event.REFUSED)
+            failed = active.failed(job.error, tolerance, f": {why} Remaining")
+            self._end_goal(failed, Event.REFUSED)
             return
         self._change_phase(Event.REFUSED, self._phase_without_plan())
 

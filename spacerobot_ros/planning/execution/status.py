@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any, Literal, NamedTuple
 
-from spacerobot_ros.errors import quantity
+from spacerobot_ros.errors import AT_JOINTS, quantity
 from spacerobot_ros.events import (
     INTEGER,
     KeyValueField,
@@ -414,10 +414,10 @@ class ActiveGoal:
         return self.status(decided, reached_message(left, missed), error)
 
     def failed(self, error: PoseError, tolerance: Tolerance, why: str) -> PlannerStatus:
-        """Return the status of a goal that is not reached; ``why`` ends the message."""
+        """Return the status of a goal that is not reached; ``why`` precedes its error."""
         controls, goal = self.schedule.controls, self.identified.goal
         off = describe_remaining_error(error, controls, tolerance, goal)
-        return self.status(PlannerState.FAILED, f"The goal is not reached: {off}{why}", error)
+        return self.status(PlannerState.FAILED, f"The goal is not reached{why}: {off}.", error)
 
     def status(
         self, state: PlannerState, message: str, error: PoseError | None = None, **values: Any
@@ -453,7 +453,7 @@ def describe_remaining_error(
         "attitude": quantity(error.angle, "rad"),
     }
     if len(error.shape):
-        parts["shape"] = quantity(error.max_joint_error, "at the joints")
+        parts["shape"] = quantity(error.max_joint_error, AT_JOINTS)
     if error.end_effectors:
         distance, angle = error.largest_end_effector_distance, error.largest_end_effector_angle
         # Goals of positions alone leave no angle.
@@ -474,7 +474,7 @@ def describe_remaining_error(
         limits = (
             (quantity(tolerance.position, "m"), hands or "position" in controls),
             (quantity(tolerance.attitude, "rad"), hands or "attitude" in controls),
-            (quantity(tolerance.shape, "at the joints"), "shape" in controls and "shape" in parts),
+            (quantity(tolerance.shape, AT_JOINTS), "shape" in controls and "shape" in parts),
         )
         notes.append("tolerance " + ", ".join(text for text, counts in limits if counts))
     if parts_left:
