@@ -16,8 +16,9 @@ import numpy as np
 import yaml
 
 from spacerobot_ros.bag.config import RecorderConfig
-from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.config import ControllerConfig, waypoints_refusal
 from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
@@ -480,18 +481,22 @@ class Scenario:
 
     def require_goal(self) -> None:
         """Raise an error if the scenario has no goal, for example because it was created from a
-        robot file or a dump.
+        robot file or a dump, or if its controller does not pass the goal's waypoints.
 
         Raises
         ------
         ParameterError
-            There is no goal.
+            There is no goal, or its waypoints require another profile.
         """
         if not self.has_goal:
             raise ParameterError(
                 f"'{self.name}' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
                 "write a scenario with a goal (`spacerobot new` writes one for a robot)."
             )
+        waypoints, planned = self.goal.waypoints, PlannedReference.name
+        controlled = "coordinated_control" in self.commanders
+        if waypoints is not None and controlled and self.controller.profile != planned:
+            raise ParameterError(waypoints_refusal(len(waypoints)))
 
 
 @lru_cache(maxsize=64)

@@ -124,7 +124,9 @@ def run_command(
         fail(result.message)
     if json_file is not None:
         write_json(json_file, result.summary)
-    for line in (*_summary_lines(result.summary), *_published_lines(chosen, result.summary)):
+    verdict, *lines = _summary_lines(result.summary)
+    published = _published_lines(chosen, result.summary)
+    for line in (verdict, *_fault_lines(chosen), *lines, *published):
         click.echo(line)
     if taken and path != usual:
         click.echo(f"            {usual} contains an earlier flight and is kept")
@@ -158,12 +160,13 @@ def _changed_scenario(
     from spacerobot_ros.scenario import scenario_or_robot
 
     scenario = goal.apply_to(scenario_or_robot(name))
-    scenario.require_goal()
     if method is not None:
         scenario = scenario.with_method(method)
     if realtime is not None:
         scenario = scenario.in_real_time(realtime)
-    return scenario.with_settings(settings)
+    scenario = scenario.with_settings(settings)
+    scenario.require_goal()
+    return scenario
 
 
 def _summary_lines(summary: dict[str, Any]) -> list[str]:
@@ -197,6 +200,15 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         *_clearance_line(summary),
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
     ]
+
+
+def _fault_lines(scenario: Scenario) -> list[str]:
+    """Return the faults and disturbances that the scenario injects."""
+    from spacerobot_ros.simulation.faults import with_seconds
+
+    plant = scenario.plant
+    lines = [f"fault       {with_seconds(each)}" for each in plant.faults]
+    return [*lines, *(f"disturbance {with_seconds(each)}" for each in plant.disturbances)]
 
 
 def _shape(summary: dict[str, Any]) -> list[float]:
@@ -429,4 +441,5 @@ def scenarios_command() -> None:
     from spacerobot_ros.scenario import load_scenario, scenario_names
 
     for name in scenario_names():
-        click.echo(f"{name:<26}{load_scenario(name).description}")
+        text = click.wrap_text(load_scenario(name).description, 80, f"{name:<26}", " " * 26)
+        click.echo(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property, wraps
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import click
+from click.shell_completion import CompletionItem
 
 from spacerobot_ros.errors import reason
 from spacerobot_ros.files import read_regular, write_output
@@ -67,6 +68,11 @@ class DefaultGroup(click.Group):
             args = [self.default, *args]
         return super().parse_args(ctx, args)
 
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Return the commands, and what the first argument of the default command may be."""
+        first = next(p for p in self.commands[self.default].params if isinstance(p, click.Argument))
+        return [*first.shell_complete(ctx, incomplete), *super().shell_complete(ctx, incomplete)]
+
 
 def _path_option(*names: str) -> Callable[[str], Any]:
     return lambda help: click.option(*names, type=PATH, help=help)
@@ -94,13 +100,28 @@ def json_option(help: str) -> Any:
     )
 
 
-def complete_scenario(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
+def complete_scenario(
+    _: click.Context, __: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
     """Return the scenarios and robots whose names begin with a string, for shell completion."""
     from spacerobot_ros.resources import resource_names
     from spacerobot_ros.scenario import scenario_names
 
-    names = {*scenario_names(), *resource_names("urdf", ".urdf")}
-    return sorted(name for name in names if name.startswith(incomplete))
+    return _names_or_files({*scenario_names(), *resource_names("urdf", ".urdf")}, incomplete)
+
+
+def complete_robot(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Return the robots whose names begin with a string, for shell completion."""
+    from spacerobot_ros.resources import resource_names
+
+    return _names_or_files(resource_names("urdf", ".urdf"), incomplete)
+
+
+def _names_or_files(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
+    """Return the names that begin with a string; shells complete a file if there is none."""
+    # The item of files is first because bash drops what stands before it.
+    found = [CompletionItem(name) for name in sorted(names) if name.startswith(incomplete)]
+    return [CompletionItem(incomplete, type="file"), *found]
 
 
 def complete_setting(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from spacerobot_ros.cli.options import json_option, out_option, picture_option, write_json
+from spacerobot_ros.cli.options import (
+    complete_robot,
+    json_option,
+    out_option,
+    picture_option,
+    write_json,
+)
 from spacerobot_ros.cli.terminal import display, fail
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
@@ -35,7 +41,7 @@ listed.
 
 
 @click.command("analyze")
-@click.argument("robot")
+@click.argument("robot", shell_complete=complete_robot)
 @click.option(
     "--shape",
     metavar="'Q1 Q2 ...'",
@@ -318,7 +324,7 @@ def _distance_lines(found: Analysis) -> list[str]:
 
 
 @click.command("new")
-@click.argument("robot", metavar="URDF")
+@click.argument("robot", metavar="URDF", shell_complete=complete_robot)
 @out_option("Scenario file to write [NAME.yaml].")
 @click.option(
     "--nearest-inertia",

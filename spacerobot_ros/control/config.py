@@ -39,6 +39,13 @@ class ErrorMargin:
         return OutputErrors(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
+def waypoints_refusal(count: int) -> str:
+    """Return the message for a goal with waypoints that no planned motion passes."""
+    return (
+        f"The goal has {count} waypoint(s), which require a planned motion: set profile to planned."
+    )
+
+
 @dataclass(frozen=True)
 class ControllerConfig(CommanderConfig):
     """Parameters of a controller: outputs, law, limits, and goal criteria."""

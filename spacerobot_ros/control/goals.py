@@ -11,7 +11,7 @@ from typing import TypedDict
 
 import numpy as np
 
-from spacerobot_ros.control.config import ControllerConfig
+from spacerobot_ros.control.config import ControllerConfig, waypoints_refusal
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor, StallMonitor
 from spacerobot_ros.control.laws.law import ControlLaw
@@ -153,10 +153,7 @@ def _require_controlled(
             f"'{law.robot.description.name}' has {n}."
         )
     if goal.waypoints is not None and controller.planner is None:
-        raise PlanningError(
-            f"The goal has {len(goal.waypoints)} waypoint(s), which require a planned motion: set "
-            "profile to planned."
-        )
+        raise PlanningError(waypoints_refusal(len(goal.waypoints)))
 
 
 def require_controlled_axes(

@@ -123,6 +123,13 @@ def test_scenarios_are_listed() -> None:
     output = spacerobot("scenarios").output
     assert all(name in output for name in scenario_names())
     assert "sliding_masses" in output
+    assert max(map(len, output.splitlines())) <= 80
+
+
+def test_waypoints_without_a_planned_motion_are_bad_input() -> None:
+    result = spacerobot("run", "inspection", "--set", "coordinated_control.profile=quintic")
+    assert result.exit_code == 2
+    assert_one_sentence(result.stderr, "3 waypoint(s)", "set profile to planned")
 
 
 # -- `run` and `plan` end with the same code for the same goal: 1 out of reach, 2 bad input ------
@@ -514,7 +521,13 @@ def test_shells_complete_scenarios_robots_and_commands() -> None:
     completion = ShellComplete(main, {}, "spacerobot", "_SPACEROBOT_COMPLETE")
 
     def completed(words: list[str], begun: str) -> list[str]:
-        return [each.value for each in completion.get_completions(words, begun)]
+        found = completion.get_completions(words, begun)
+        # A file is offered beside the names, and it stands first: bash drops what precedes it.
+        assert all(each.type == "plain" for each in found[1:])
+        return [each.value for each in found if each.type == "plain"]
+
+    def completes_files(words: list[str]) -> bool:
+        return completion.get_completions(words, "no_such_na")[0].type == "file"
 
     found = completed(["run"], "servicer")
     assert found == ["servicer", "servicer_thrusters", "servicer_wheels"]
@@ -523,3 +536,8 @@ def test_shells_complete_scenarios_robots_and_commands() -> None:
     assert completed(["run", "servicer", "--set"], "planner.positi") == [
         "planner.position_tolerance="
     ]
+    for command in ("analyze", "new"):
+        assert completed([command], "three_") == ["three_joint_arm"]
+    assert completed(["campaign"], "re") == ["report", "rerun"]
+    for command in ("analyze", "new", "run", "up", "plan", "campaign", "report"):
+        assert completes_files([command])

@@ -112,6 +112,17 @@ def test_the_lines_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.exit_code == 0
 
 
+def test_injected_faults_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    faults = "['joint_stuck slider_1 at 1', 'joint_slow slider_2 0.5 until 9']"
+    words = ("--set", f"plant.faults={faults}")
+    verdict, *lines = run(monkeypatch, SUMMARY, *GOAL, *words).stdout.splitlines()
+    assert [verdict, *lines[2:]] == (LINES + NEXT).splitlines()
+    assert lines[:2] == [
+        "fault       joint_stuck slider_1 at 1 s",
+        "fault       joint_slow slider_2 0.5 until 9 s",
+    ]
+
+
 def test_a_flight_beside_an_earlier_one_says_which_is_which(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
