@@ -285,7 +285,7 @@ def _clearance_line(summary: dict[str, Any]) -> list[str]:
     distance, time = summary["clearance_m"], summary["clearance_time_s"]
     apart = quantity(abs(distance), "m")
     fact = f"come within {apart}" if distance > 0 else f"touch, {apart} deep,"
-    return [f"clearance   '{first}' and '{second}' {fact} at {time:.6g} s"]
+    return [f"clearance   '{first}' and '{second}' {fact} at {time:.4g} s"]
 
 
 def _published_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair
-from spacerobot_ros.errors import quantity
+from spacerobot_ros.errors import numbers, quantity
 from spacerobot_ros.model.description import Array
 
 _MOTION_RESOLUTION = 5e-4
@@ -52,7 +52,7 @@ class Approach:
         where = (
             ""
             if self.place_on_obstacle is None
-            else f" near {np.round(self.place_on_obstacle, 3).tolist()} m"
+            else f" near ({numbers(self.place_on_obstacle, 3)}) m"
         )
         if self.distance <= 0:
             return f"{self.links.subject} touch, {quantity(-self.distance, 'm')} deep{where}"

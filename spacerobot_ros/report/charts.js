@@ -29,6 +29,8 @@
   const text = (value) =>
     value === null || value === undefined ? "–" : String(Number(value.toPrecision(5)));
 
+  const raised = (power) => String(power).replace(/./g, (x) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(x)]);
+
   function make(tag, name, parent, content = "") {
     const made = document.createElement(tag);
     made.className = name;
@@ -198,7 +200,7 @@
             ...(!chart.rows && {
               values: (_, ticks) =>
                 ticks.map((tick) =>
-                  chart.log ? (Number.isInteger(tick) ? (10 ** tick).toExponential(0) : "") : text(tick)),
+                  chart.log ? (Number.isInteger(tick) ? `10${raised(tick)}` : "") : text(tick)),
             }),
             ...(chart.log && { incrs: [1, 2, 5, 10] }),
           },

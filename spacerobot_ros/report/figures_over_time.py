@@ -571,7 +571,7 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
         limit_name="contact",
     )
     nearest = clearance.nearest
-    sentence = f"{sentence_case(str(nearest))} at {clearance.nearest_time:.6g} s"
+    sentence = f"{sentence_case(str(nearest))} at {clearance.nearest_time:.4g} s"
     caption = f"Smallest distance between two links not connected by a joint. {sentence}"
     if touching:
         caption += "; below the dotted line, links touch according to the URDF geometry"

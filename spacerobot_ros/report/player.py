@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from spacerobot_ros.errors import quantity
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
@@ -464,8 +465,8 @@ def _caption_text(flight: FlightReport, frames: KeyFrames, radius: float, ghosts
     )
     within = max(frames.error, 1.0)
     text += (
-        f" and within {within * _POSITION_TOLERANCE * radius:.2g} m and "
-        f"{within * _ANGLE_TOLERANCE:.2g} rad of the recorded states."
+        f" and within {quantity(within * _POSITION_TOLERANCE * radius, 'm')} and "
+        f"{quantity(within * _ANGLE_TOLERANCE, 'rad')} of the recorded states."
     )
     if frames.every:
         which = "every cycle" if frames.every == 1 else f"every {frames.every}th cycle"

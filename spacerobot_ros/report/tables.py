@@ -146,8 +146,8 @@ def result_table(flight: FlightReport) -> Table:
     rows += _payload_rows(flight)
     if (clearance := flight.clearance) is not None:
         nearest = clearance.nearest
-        at_links = f"links {nearest.links} at {clearance.nearest_time:.6g} s"
-        rows.append(("Clearance", f"{quantity(nearest.distance, 'm')}, {at_links}"))
+        at = f"between {nearest.links} at {clearance.nearest_time:.4g} s"
+        rows.append(("Clearance", f"{quantity(nearest.distance, 'm')} {at}"))
     return Table(("Quantity", "Value"), rows)
 
 

@@ -97,7 +97,7 @@ def test_the_nearest_approach_is_between_the_ticks(geometry: CollisionGeometry, 
     assert place is not None
     assert place == pytest.approx(MIDDLE)
     assert "link 'left' and obstacle 'rock' come within" in str(found[pair])
-    assert str(found[pair]).endswith("near [0.4, -0.3, 0.7] m")
+    assert str(found[pair]).endswith("near (0.400, -0.300, 0.700) m")
     none = nearest_approaches(geometry, shapes, np.full(3, least - 1e-3), base)
     assert pair not in [each.pair for each in none]
 
