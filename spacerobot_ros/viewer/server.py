@@ -20,6 +20,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -139,10 +140,12 @@ def is_own_page(origin: str | None, host: str | None, served: str) -> bool:
 
 
 @functools.lru_cache(maxsize=2)
-def _with_script(page: bytes, *, packed: bool) -> bytes:
-    """Return viser's page (HTML, gzip if ``packed``) with our script before its own."""
+def _with_script(page: bytes, title: str, *, packed: bool) -> bytes:
+    """Return viser's page (HTML, gzip if ``packed``) with our title, and our script before its
+    own."""
     script = Path(__file__).with_name("page.js").read_bytes()
     html = gzip.decompress(page) if packed else page
+    html = html.replace(b"<title>Viser</title>", f"<title>{escape(title)}</title>".encode(), 1)
     html = html.replace(b"<head>", b"<head><script>" + script + b"</script>", 1)
     return gzip.compress(html) if packed else html
 
@@ -152,7 +155,7 @@ def _is_no_failed_handshake(record: logging.LogRecord) -> bool:
 
 
 @contextmanager
-def _guarded_websockets(served: str) -> Iterator[None]:
+def _guarded_websockets(served: str, title: str) -> Iterator[None]:
     """Make websocket servers that start in this block refuse other origins and frames."""
     import websockets.asyncio.server as module
     from websockets.http11 import Request, Response
@@ -177,7 +180,7 @@ def _guarded_websockets(served: str) -> Iterator[None]:
                 answer.headers.update(_NO_FRAMING_HEADERS)
                 if answer.headers.get("Content-Type", "").startswith("text/html"):
                     packed = answer.headers.get("Content-Encoding") == "gzip"
-                    answer.body = _with_script(bytes(answer.body), packed=packed)
+                    answer.body = _with_script(bytes(answer.body), title, packed=packed)
                     del answer.headers["Content-Length"]
                     answer.headers["Content-Length"] = str(len(answer.body))
             return answer
@@ -193,7 +196,7 @@ def _guarded_websockets(served: str) -> Iterator[None]:
         module.serve = serve  # type: ignore[misc]
 
 
-def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
+def start_server(host: str, port: int, title: str = "spacerobot") -> viser.ViserServer:
     """Return a server that serves its page at ``http://host:port``, or at the next free port.
 
     Raises
@@ -213,7 +216,7 @@ def start_server(host: str, port: int, title: str = "") -> viser.ViserServer:
 
     _require_address(host)
     # It prints its address; so does the node, in the format of the other commands.
-    with _server_start_lock, _guarded_websockets(host), redirect_stdout(io.StringIO()):
+    with _server_start_lock, _guarded_websockets(host, title), redirect_stdout(io.StringIO()):
         server = LocalServer(host=host, port=port, label=title, verbose=False)
     return server
 

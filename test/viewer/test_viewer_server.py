@@ -34,7 +34,7 @@ PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Any]:
-    server = start_server("127.0.0.1", 0)
+    server = start_server("127.0.0.1", 0, "Reach <2>, real time")
     yield server
     stop_server(server)
 
@@ -93,6 +93,8 @@ def test_the_page_has_its_own_script_before_that_of_viser(server: Any, encoding:
     own = Path(viewer.__file__).with_name("page.js").read_bytes()
     page = (Path(viser.__file__).parent / "client" / "build" / "index.html").read_bytes()
     assert html.index(own) < html.index(b"<script data-")
+    assert b"<title>Reach &lt;2&gt;, real time</title>" in html
+    html = html.replace(b"Reach &lt;2&gt;, real time", b"Viser", 1)
     assert html.replace(b"<script>" + own + b"</script>", b"") == page
 
 
