@@ -103,33 +103,17 @@ _MARKS = {
 
 def event_style(kind: EventKind) -> dict[str, Any]:
     """Return the appearance of an event kind on a page."""
-    mark = _MARKS[kind]
-    return {
-        "kind": kind.value,
-        "glyph": mark.glyph,
-        "colour": mark.colour,
-        "row": mark.row,
-        "strong": mark.strong,
-    }
+    shown = ("glyph", "colour", "row", "strong")
+    return {"kind": kind.value} | {name: getattr(_MARKS[kind], name) for name in shown}
 
 
-_DETAIL_KEYS = (
-    "fault",
-    "disturbance",
-    "joints",
-    "reason",
-    "method",
-    "node",
-    "first",
-    "second",
-    "wheel",
-)
+_ABOUT = ("fault", "disturbance", "joints", "reason", "method", "node", "first", "second", "wheel")
 
 
 def event_text(event: Event) -> str:
     """Return an event in a few words, such as ``fault on: joint_stuck elbow at 5 s``."""
     label, about = _MARKS[event.kind].label, event.about
-    details = [with_seconds(about[key]) for key in _DETAIL_KEYS if about.get(key)]
+    details = [with_seconds(about[key]) for key in _ABOUT if about.get(key)]
     return f"{label}: {', '.join(details)}" if details else label
 
 

@@ -159,20 +159,9 @@ def table(
 
 
 def figure(name: str, svg: bytes, text: str, caption: str, attributes: str = "") -> str:
-    """Return a picture with its caption.
+    """Return a picture (SVG) with its caption (HTML) as an element with the id ``name``.
 
-    Parameters
-    ----------
-    name
-        Id of the element.
-    svg
-        The picture.
-    text
-        Alternative text for the picture.
-    caption
-        HTML below it.
-    attributes
-        HTML attributes of the element, each preceded by a space.
+    ``text`` is the alternative text; a space precedes each of the HTML ``attributes``.
     """
     data = base64.b64encode(svg).decode()
     return (

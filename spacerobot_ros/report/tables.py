@@ -23,8 +23,6 @@ from spacerobot_ros.scenario import Published
 
 _NO_VALUE = "–"
 _LEAST_ANGLE_IN_DEGREES = 1e-4  # rad
-_SHOWN_DIGIT = 1e-6
-"""Share of a number that six significant digits do not show."""
 _EQUAL_TIME_TICKS = 1.5
 """Largest difference between times that are considered equal, in control periods."""
 
@@ -162,10 +160,8 @@ def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
     if not flight.controls("base") and flight.outputs:
         return {}
     attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
-    through = {
-        f"waypoint {number}": _pose_text(pose[:3], pose[3:])
-        for number, pose in enumerate(goal.path_values[:-1], start=1)
-    }
+    poses = goal.path_values[:-1]
+    through = {f"waypoint {i + 1}": _pose_text(x[:3], x[3:]) for i, x in enumerate(poses)}
     return through | {"position": _position_text(goal.position), "attitude": attitude}
 
 
@@ -201,8 +197,8 @@ def payload_text(estimate: PayloadEstimate) -> str:
     parts = []
     mass, spread = estimate.parameters[0], estimate.deviations[0]
     if not math.isnan(mass):
-        # The digits shown are certain if the deviation is smaller.
-        about = f" ± {spread:.1g}" if spread > _SHOWN_DIGIT * mass else ""
+        # A smaller deviation changes none of the six digits.
+        about = f" ± {spread:.1g}" if spread > 1e-6 * mass else ""
         parts.append(f"mass {mass:.6g}{about} kg")
     if not np.isnan(estimate.parameters[:4]).any():
         center = numbers(estimate.parameters[1:4] / mass)

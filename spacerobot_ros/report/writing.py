@@ -164,12 +164,12 @@ def write_figures(
                     figure = over_time.figure_of_flights([flight, *others], FIGURES[name])
                 else:
                     figure = FIGURES[name](flight)
-                if isinstance(figure, ReportFigure):
-                    letter_panels(figure.figure)
-                    widen_panels(figure.figure)
-                picture = (
-                    picture_of(figure.figure, format) if isinstance(figure, ReportFigure) else b""
-                )
+                if not isinstance(figure, ReportFigure):
+                    made[name] = figure or "The bag has no data for this figure."
+                    continue
+                letter_panels(figure.figure)
+                widen_panels(figure.figure)
+                picture = picture_of(figure.figure, format)
             except (ValueError, ArithmeticError, RuntimeError, TypeError) as error:
                 if style is None:
                     raise
@@ -177,11 +177,8 @@ def write_figures(
                 raise SpaceRobotError(
                     f"Figures cannot be drawn with the style file {style}: {error}."
                 ) from error
-            if isinstance(figure, ReportFigure):
-                made[name] = path = folder / f"{name}.{format.value}"
-                write_output(path, picture)
-            else:
-                made[name] = figure or "The bag has no data for this figure."
+            made[name] = path = folder / f"{name}.{format.value}"
+            write_output(path, picture)
     return made
 
 

@@ -150,10 +150,6 @@ def _with_script(page: bytes, title: str, *, packed: bool) -> bytes:
     return gzip.compress(html) if packed else html
 
 
-def _is_no_failed_handshake(record: logging.LogRecord) -> bool:
-    return record.getMessage() != "opening handshake failed"
-
-
 @contextmanager
 def _guarded_websockets(served: str, title: str) -> Iterator[None]:
     """Make websocket servers that start in this block refuse other origins and frames."""
@@ -188,7 +184,8 @@ def _guarded_websockets(served: str, title: str) -> Iterator[None]:
         return serve(*given, process_request=process, **options)
 
     # Whatever is no GET request, such as HEAD, ends there with a traceback.
-    logging.getLogger("websockets.server").addFilter(_is_no_failed_handshake)
+    log = logging.getLogger("websockets.server")
+    log.addFilter(lambda record: record.getMessage() != "opening handshake failed")
     module.serve = guarded_serve  # type: ignore[assignment, misc]
     try:
         yield
