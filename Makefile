@@ -138,10 +138,11 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	    --set coordinated_control.position_tolerance=0.02 \
 	    --set coordinated_control.attitude_tolerance=0.02
 	$(FLY) servicer $(NEAR)
-	$(FLY) servicer_thrusters $(NEAR) $(STRAIGHT)
+	$(FLY) servicer_thrusters $(NEAR) $(STRAIGHT) --set coordinated_control.position_tolerance=0.006 \
+	    --set coordinated_control.transposed_jacobian.joint_damping=0
 	$(FLY) free_flyer --goal 0.8 0.2 0.05 --goal-rotvec 0 0 1 --set plant.tick_rate=10 \
 	    --set coordinated_control.tick_rate=10 --set coordinated_control.settle_time=0.5 $(STRAIGHT)
-	$(FLY) inspection --set plant.tick_rate=10 --set coordinated_control.tick_rate=10 \
+	$(FLY) inspection --set plant.tick_rate=5 --set coordinated_control.tick_rate=5 \
 	    --set coordinated_control.settle_time=0.5
 	$(FLY) wheels --set plant.tick_rate=10 --set coordinated_control.tick_rate=10 \
 	    --set coordinated_control.settle_time=1

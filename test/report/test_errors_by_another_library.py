@@ -68,6 +68,7 @@ def truth_in(bag: Path) -> Truth:
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
+    first: dict[str, np.ndarray] = {}
     last: dict[str, np.ndarray] = {}
     with bag.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -76,7 +77,9 @@ def truth_in(bag: Path) -> Truth:
         ):
             of_goal = channel.topic == "/goal_pose"
             last[channel.topic] = _vector(message.pose if of_goal else message.pose.pose)
+            first.setdefault(channel.topic, last[channel.topic])
     goal, pose = last["/goal_pose"], last.get("/odom_true", last["/odom"])
+    goal = np.where(np.isnan(goal), first["/odom"], goal)  # NaN: as at the start.
     turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
     distance = float(np.linalg.norm(goal[:3] - pose[:3]))
     return Truth(distance, float(turn.magnitude()), pose, goal)
