@@ -63,9 +63,60 @@ static long long place(const Job &job, long long g, long long size, long long en
 #endif
 }
 
+typedef unsigned long long Word;
+
+// Return the upper half of a product.
+static Word upper(Word a, Word b) {
+#ifdef __CUDA_ARCH__
+  return __umul64hi(a, b);
+#else
+  return Word((unsigned __int128)a * b >> 64);
+#endif
+}
+
+// Encrypt a counter by Philox 4x64 with ten rounds (Salmon and others, SC 2011).
+static void encrypt(Word key, Word (&x)[4]) {
+  Word other = 0;
+  for (int k = 0; k < 10; ++k) {
+    const Word a = 0xD2E7470EE14C6C93 * x[0], b = 0xCA5A826395121157 * x[2];
+    const Word c = upper(0xD2E7470EE14C6C93, x[0]), d = upper(0xCA5A826395121157, x[2]);
+    x[0] = d ^ x[1] ^ key, x[1] = b, x[2] = c ^ x[3] ^ other, x[3] = a;
+    key += 0x9E3779B97F4A7C15, other += 0xBB67AE8584CAA73B;
+  }
+}
+
+// Compute four normal numbers of a group, from a column that four divides: see NormalNumbers.
+static void normals(const Job &job, long long g, long long tick, int column, V (&to)[4]) {
+  Numbers shares[4];
+  for (int lane = 0; lane < LANES; ++lane) {
+    Word x[4] = {Word(tick * ((NORMALS + 3) / 4) + column / 4 + 1)};
+    encrypt(job.seeds[g * LANES + lane], x);
+    for (int k = 0; k < 4; ++k) shares[k][lane] = (double(x[k] >> 11) + 0.5) * 0x1p-53;
+  }
+  for (int k = 0; k < 4; k += 2) {
+    const V size = sqrt(V(-2.0) * log(V(shares[k]))), turn = V(6.283185307179586) * V(shares[k + 1]);
+    to[k] = size * cos(turn), to[k + 1] = size * sin(turn);
+  }
+}
+
+// Compute the normal numbers of a group from a column on, which four divides, up to another one.
+static void normals(const Job &job, long long g, long long tick, int from, int until, V *to) {
+  for (int column = from; column < until; column += 4) {
+    V four[4];
+    normals(job, g, tick, column, four);
+    for (int k = column; k < column + 4 && k < until; ++k) to[k - from] = four[k - column];
+  }
+}
+
 static void record(const Job &job, long long g, long long tick, const V *group) {
   const long long instant = instant_of(job, tick), size = job.instant_count * REPORT_ROWS;
   if (instant < 0) return;
+  if (job.seeds) {
+    V drawn[NORMALS];
+    normals(job, g, tick, 0, NORMALS, drawn);
+    for (long long k = 0; k < NORMALS; ++k)
+      job.normals[place(job, g, job.instant_count * NORMALS, instant * NORMALS + k)] = drawn[k];
+  }
   for (const Span &span : REPORTED)
     for (long long k = 0; k < span.count; ++k)
       job.reports[place(job, g, size, instant * REPORT_ROWS + span.to + k)] = group[span.from + k];
@@ -78,12 +129,6 @@ static V lanes_of(const double *each) {
   return V(numbers);
 }
 
-static V normal(const Job &job, long long g, long long tick, long long column) {
-  const long long entry = (tick - job.normals_from) * job.normals_width + column;
-  return lanes_of(job.normals +
-                  LANES * place(job, g, job.normals_ticks * job.normals_width, entry));
-}
-
 static V entry(const Job &job, long long g, long long tick, long long column) {
   const long long entry = tick * COMMANDS + column;
   if (!job.each_table) return V(job.table[entry]);
@@ -94,10 +139,10 @@ static V entry(const Job &job, long long g, long long tick, long long column) {
 static void measure(const Job &job, long long g, long long tick, V *group) {
   V *measured = group + row::measured;
   const V *q = group + row::state, *bias = group + row::joint_bias;
+  // The first twelve are of the base.
+  if (job.noisy) normals(job, g, tick, 12, 12 + JOINTS, measured);
   for (long long j = 0; j < JOINTS; ++j)
-    // The first twelve are of the base.
-    measured[j] = job.noisy ? q[j] + bias[j] + group[row::joint_noise] * normal(job, g, tick, 12 + j)
-                            : q[j];
+    measured[j] = job.noisy ? q[j] + bias[j] + group[row::joint_noise] * measured[j] : q[j];
 }
 
 static void command(const Job &job, long long g, long long tick, V *group) {
@@ -130,8 +175,7 @@ static void command(const Job &job, long long g, long long tick, V *group) {
 #ifdef CONTROL
 // Measure the state and evaluate the command for it; return whether lanes need Python for it.
 static bool control(const Job &job, long long g, long long tick, V *group) {
-  for (long long k = 0; job.noisy && k < job.normals_width; ++k)
-    group[row::normals + k] = normal(job, g, tick, k);
+  if (job.noisy) normals(job, g, tick, 0, NORMALS, group + row::normals);
   group[row::time] = V(double(tick * job.period_ns) / 1e9);
   call<CONTROL>(group, CONTROL_ARGUMENTS, CONTROL_RESULTS);
   V &decision = group[row::decision];

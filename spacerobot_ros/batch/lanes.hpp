@@ -99,11 +99,14 @@ INLINE V where(V condition, V value) {
 #ifdef LIBMVEC
 extern "C" Numbers VECTOR_SIN(Numbers);
 extern "C" Numbers VECTOR_COS(Numbers);
+extern "C" Numbers VECTOR_LOG(Numbers);
 INLINE V sin(V a) { return V(VECTOR_SIN(a.x)); }
 INLINE V cos(V a) { return V(VECTOR_COS(a.x)); }
+INLINE V log(V a) { return V(VECTOR_LOG(a.x)); }
 #else
 LANE_BY_LANE(sin)
 LANE_BY_LANE(cos)
+LANE_BY_LANE(log)
 #endif
 
 #if LANES == 8 && defined(__AVX512F__)
@@ -124,7 +127,6 @@ LANE_BY_LANE(asin)
 LANE_BY_LANE(acos)
 LANE_BY_LANE(atan)
 LANE_BY_LANE(exp)
-LANE_BY_LANE(log)
 LANE_BY_LANE_OF_TWO(atan2)
 LANE_BY_LANE_OF_TWO(pow)
 

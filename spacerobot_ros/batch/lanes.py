@@ -21,7 +21,6 @@ from spacerobot_ros.batch.flights import (
     Flights,
     FollowedSchedule,
     HeldCommands,
-    SensorErrors,
     plant_of,
 )
 from spacerobot_ros.batch.native import CompiledTick, Job, Program
@@ -41,7 +40,7 @@ _MAX_BLOCK_GROUPS = 64
 """Largest number of lane groups in a block; more would not be faster."""
 
 _CHUNK_TICKS = 2000
-"""Number of ticks for which noise is drawn at once, and also between checks for signals."""
+"""Number of ticks between checks for signals and for flights that continue."""
 
 _PROGRAMS = {
     HeldCommands: Program.HELD,
@@ -102,10 +101,7 @@ def starts_accepted_by_plant(flights: Flights) -> Flags:
 
 
 def _block_size(flights: Flights, tick: CompiledTick) -> int:
-    n, chunk = flights.robot.n, min(flights.ticks, _CHUNK_TICKS)
-    each = 8 * (2 * tick.memory_layout.total_rows + 60 * len(flights.report_ticks))
-    if flights.sensors is not None:
-        each += 8 * chunk * (12 + 2 * n) * 2
+    each = 8 * (2 * tick.memory_layout.total_rows + 100 * len(flights.report_ticks))
     table = flights.table
     if table.ndim == 3:
         each += 2 * table[0].nbytes
@@ -141,7 +137,6 @@ class LaneBlock:
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
         self._write_rows("alive", 1.0)
-        self._noise = SensorNoise(flights, self._rows_of_lanes)
         self._ended: dict[int, int] = {}
         """Ticks at which flights failed, by lane in the block."""
         self._profiles: dict[int, ReferenceProfile] = {}
@@ -156,6 +151,11 @@ class LaneBlock:
         self._reports = self._target.zeros(
             (self._groups, len(flights.report_ticks), tick.report_width, self._lanes)
         )
+        self._normals: Any = None
+        """Random numbers of the sensors at the instants, in the order of :class:`.Sensors`."""
+        if flights.sensors is not None:
+            width = 12 + 2 * flights.robot.n
+            self._normals = self._target.zeros((*self._reports.shape[:2], width, self._lanes))
         self._job, self._referenced = self._prepare_job()
 
     def _write_rows(self, name: str, values: Any, lanes: Counts | None = None) -> None:
@@ -217,6 +217,9 @@ class LaneBlock:
             "instants": self._instants,
             "reports": self._reports,
         }
+        if flights.sensors is not None:
+            seeds = flights.sensors.seeds[self._rows_of_lanes].astype(np.uint64)
+            arrays |= {"seeds": self._target.arrays.asarray(seeds), "normals": self._normals}
         job = Job(
             groups=self._loops,
             period=flights.control_period,
@@ -224,7 +227,7 @@ class LaneBlock:
             program=_PROGRAMS[type(program)],
             table_ticks=table.shape[1] if each_table else table.shape[0],
             each_table=each_table,
-            noisy=self._noise.is_fed_back,
+            noisy=self._feeds_back_errors(),
             instant_count=len(flights.report_ticks),
             ends=isinstance(program, ControlledGoals) and program.ends_when_decided,
             **{name: self._target.address(array) for name, array in arrays.items()},
@@ -233,6 +236,15 @@ class LaneBlock:
             job.gain = min(program.shape_gain, 1.0 / flights.control_period)
             job.deadband = program.deadband
         return job, list(arrays.values())
+
+    def _feeds_back_errors(self) -> bool:
+        """Return whether commands depend on sensor errors; those along schedules depend only on
+        joint errors."""
+        errors, rows = self._flights.sensors, self._flown
+        if errors is None:
+            return False
+        joints = errors.noise[rows, 4].any() or errors.joint_bias[rows].any()
+        return isinstance(self._flights.program, ControlledGoals) or bool(joints)
 
     def _table_of_lanes(self) -> Array:
         """Return commands (ticks, width), or (groups, ticks, width, lanes) if they differ."""
@@ -253,17 +265,9 @@ class LaneBlock:
             alive = self._target.to_numpy(self._memory[:, self._rows.first_row("alive")])
             if not alive.any():
                 break
-            end = min(begin + _CHUNK_TICKS, flights.ticks)
-            # The sensors measure the state at the end, too.
-            last = end + (end == flights.ticks)
-            normals = self._noise.draw_noise(begin, last, alive)
-            if normals is not None:
-                on_target = self._target.arrays.asarray(normals)
-                job.normals = self._target.address(on_target)
-                job.normals_from, job.normals_ticks, job.normals_width = begin, *normals.shape[1:3]
             if not begin:
                 self._begin_control()
-            self._fly_until(end)
+            self._fly_until(min(begin + _CHUNK_TICKS, flights.ticks))
         if self._tick.controller is not None:
             library.end_flights(job)
         self._write_results()
@@ -326,14 +330,15 @@ class LaneBlock:
             self._write_rows("command", command, np.array([lane]))
             self._result.fallback_ticks[row] += 1
 
-    def _reported(self) -> Array:
-        """Return the reports (flights, instants, width)."""
-        reports = np.moveaxis(self._target.to_numpy(self._reports), 3, 1)
-        return reports.reshape(-1, *self._reports.shape[1:3])[: len(self._flown)]
+    def _reported(self, reports: Any) -> Array:
+        """Return what is reported at instants (groups, instants, width, lanes) as (flights,
+        instants, width)."""
+        each = np.moveaxis(self._target.to_numpy(reports), 3, 1)
+        return each.reshape(-1, *reports.shape[1:3])[: len(self._flown)]
 
     def _write_results(self) -> None:
         result, rows, n = self._result, self._flown, self._flights.robot.n
-        reports = self._reported()
+        reports = self._reported(self._reports)
         for lane, tick in self._ended.items():
             reports[lane, np.array(self._flights.report_ticks) > tick] = np.nan
         result.states[rows] = reports
@@ -345,7 +350,19 @@ class LaneBlock:
         result.limited_ticks["stroke"][rows] = limits[:, n:]
         if self._tick.controller is not None:
             self._write_decisions(self._tick.controller)
-        self._noise.measure(result, rows)
+        self._measure()
+
+    def _measure(self) -> None:
+        """Write the measurements of the reported states."""
+        result, rows, errors = self._result, self._flown, self._flights.sensors
+        measured = result.pose[rows], result.q[rows]
+        if errors is not None:
+            at, names = np.repeat(rows, result.pose.shape[1]), ("pose", "twist", "q", "qdot")
+            states = [np.concatenate(getattr(result, name)[rows]) for name in names]
+            normals = np.concatenate(self._reported(self._normals))
+            pose, _, q, _ = errors[at].measure(normals, *states)
+            measured = pose.reshape(measured[0].shape), q.reshape(measured[1].shape)
+        result.measured_pose[rows], result.measured_q[rows] = measured
 
     def _write_decisions(self, controller: BatchController) -> None:
         result, rows = self._result, self._flown
@@ -359,69 +376,3 @@ class LaneBlock:
             goal, state = self._profiles[lane].goal, ControlState.unstack(states[lane])
             distance = controller.controller.distance_between(state, goal)
             result.decision_distance[rows[lane]] = astuple(distance)
-
-
-class SensorNoise:
-    """Random numbers for the sensors in a block of flights, drawn as in :class:`.Sensors`."""
-
-    def __init__(self, flights: Flights, rows: Counts) -> None:
-        self._errors: SensorErrors | None = flights.sensors
-        self._affects_all = isinstance(flights.program, ControlledGoals)
-        self._instants = flights.report_ticks
-        self._n = flights.robot.n
-        self._rows = rows
-        if self._errors is None:
-            return
-        self._used = self._errors.is_active[rows] & self._errors.noise[rows].any(axis=1)
-        self._generators = [
-            np.random.default_rng(int(seed)) if used else None
-            for seed, used in zip(self._errors.seeds[rows], self._used, strict=True)
-        ]
-        self._at_instants = np.zeros((len(rows), len(self._instants), 12 + 2 * self._n))
-
-    @property
-    def is_fed_back(self) -> bool:
-        """Whether commands depend on sensor errors; commands along schedules depend only on joint
-        errors."""
-        errors = self._errors
-        if errors is None:
-            return False
-        joints = errors.noise[self._rows, 4].any() or errors.joint_bias[self._rows].any()
-        return bool(self._affects_all or joints)
-
-    def draw_noise(self, begin: int, end: int, alive: Array) -> Array | None:
-        """Draw the noise for the ticks from ``begin`` up to, but excluding, ``end``.
-
-        ``alive`` (groups, lanes): whether flights are in progress. Returns the noise (groups,
-        ticks, 12 + 2 n, lanes); None if commands do not depend on it.
-        """
-        if self._errors is None:
-            return None
-        ticks, width = end - begin, 12 + 2 * self._n
-        kept = np.zeros((len(self._rows), ticks, width)) if self.is_fed_back else None
-        chosen = [(i, tick - begin) for i, tick in enumerate(self._instants) if begin <= tick < end]
-        drawn = np.empty((ticks, width))
-        for index, generator in enumerate(self._generators):
-            if generator is None or not alive.flat[index]:
-                continue
-            generator.standard_normal(out=drawn)
-            if kept is not None:
-                kept[index] = drawn
-            for instant, tick in chosen:
-                self._at_instants[index, instant] = drawn[tick]
-        if kept is None:
-            return None
-        grouped = kept.reshape(-1, alive.shape[1], *kept.shape[1:])
-        return np.ascontiguousarray(np.moveaxis(grouped, 1, 3))
-
-    def measure(self, result: BatchResult, rows: Counts) -> None:
-        """Write the measurements for the reported states of some flights."""
-        measured = result.pose[rows], result.q[rows]
-        if self._errors is not None:
-            at = np.repeat(self._rows[: len(rows)], len(self._instants))
-            names = ("pose", "twist", "q", "qdot")
-            states = [np.concatenate(getattr(result, name)[rows]) for name in names]
-            normals = np.concatenate(self._at_instants[: len(rows)])
-            pose, _, q, _ = self._errors[at].measure(normals, *states)
-            measured = pose.reshape(measured[0].shape), q.reshape(measured[1].shape)
-        result.measured_pose[rows], result.measured_q[rows] = measured

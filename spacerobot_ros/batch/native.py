@@ -50,15 +50,13 @@ _JOB_MEMBERS = (
     ("long long", "table_ticks", "FOLLOWED: joint positions, one row more than ticks"),
     ("long long", "each_table", ""),
     ("long long", "noisy", "whether commands depend on measurement errors"),
-    ("const double *", "normals", "(groups, ticks from normals_from on, normals_width, LANES)"),
-    ("long long", "normals_from", ""),
-    ("long long", "normals_ticks", ""),
-    ("long long", "normals_width", ""),
+    ("const unsigned long long *", "seeds", "(groups, LANES) of noise; null: no sensor errors"),
     ("double", "gain", "FOLLOWED: feedback gain for joint position errors, 1/s"),
     ("double", "deadband", "FOLLOWED: m or rad"),
     ("const long long *", "instants", "ticks at which states are reported, ascending"),
     ("long long", "instant_count", ""),
     ("V *", "reports", "(groups, instants, REPORT_ROWS)"),
+    ("V *", "normals", "(groups, instants, NORMALS) random numbers at the instants"),
     ("long long", "ends", "CONTROLLED: whether flights end with their goal decision"),
 )
 """Members of :class:`Job`: C++ type, name, meaning."""
@@ -224,7 +222,7 @@ class CompiledTick:
             "REPORTED": report,
         }
         constants = {"ROWS": rows.total_rows, "JOINTS": n, "COMMANDS": sizes["command"]}
-        constants |= {"REPORT_ROWS": width}
+        constants |= {"REPORT_ROWS": width, "NORMALS": 12 + 2 * n}
         if effort:
             constants |= {"STOP_ROW": limited + n, "REALISED_ROW": efforts}
             constants |= {"SUBSTEPS": flights.substeps, "BISECTIONS": effort_plant.BISECTIONS}

@@ -287,7 +287,7 @@ class _SteppedLanes(LaneBlock):
         self._instants[0] = 0
         self._tick.library.start_flights(self._job)
         self._write_rows("h", flights.control_period, rows)
-        return self._reported()[rows, 0]
+        return self._reported(self._reports)[rows, 0]
 
     def step(self, commands: Array, ticks: int, under_way: Flags) -> Array:
         """Step the flights in progress under held commands, and return all reports."""
@@ -295,7 +295,7 @@ class _SteppedLanes(LaneBlock):
         self._write_rows("command", commands)
         self._at[:], self._instants[0] = 0, ticks
         self._fly_until(ticks)
-        return self._reported()[:, 0]
+        return self._reported(self._reports)[:, 0]
 
 
 class _SteppedPlants:

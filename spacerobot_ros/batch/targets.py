@@ -163,7 +163,7 @@ class Target:
         if libmvec:
             # The names of the x86-64 vector ABI: kind of registers, lanes, one vector argument.
             values["LIBMVEC"] = ""
-            for name in ("sin", "cos"):
+            for name in ("sin", "cos", "log"):
                 values[f"VECTOR_{name.upper()}"] = f"_ZGV{libmvec}N{self.lanes}v_{name}"
         return "\n".join(f"#define {name} {value}" for name, value in values.items())
 

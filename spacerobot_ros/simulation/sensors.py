@@ -32,6 +32,39 @@ _NOISE_PARAMETERS = {
 }
 """Noise parameters by sensor group (:data:`~spacerobot_ros.simulation.faults.SENSOR_GROUPS`)."""
 
+_ROWS_DRAWN_TOGETHER = 32
+
+
+class NormalNumbers:
+    """Independent standard normal numbers, computed from a seed and their place alone.
+
+    Row k has the numbers of Philox 4x64 for the counters k B + 1 to (k + 1) B, where B is a quarter
+    of the row's size, rounded up. Pairs become normal by Box and Muller's transform. Therefore,
+    programs of lanes and devices (``batch/driver.hpp``) compute the numbers of any tick.
+
+    Parameters
+    ----------
+    seed
+        Key of the generator.
+    size
+        Numbers in a row.
+    """
+
+    def __init__(self, seed: int, size: int) -> None:
+        self._bits, self._size = np.random.Philox(key=seed), size
+        self._rows: deque[Array] = deque()
+
+    def next_row(self) -> Array:
+        """Return the next row, (size,)."""
+        if not self._rows:
+            blocks = -(-self._size // 4)
+            raw = self._bits.random_raw(_ROWS_DRAWN_TOGETHER * blocks * 4)
+            shares = ((raw >> 11) + 0.5) * 2.0**-53
+            sizes, turns = np.sqrt(-2.0 * np.log(shares[::2])), 2.0 * np.pi * shares[1::2]
+            normals = np.stack([sizes * np.cos(turns), sizes * np.sin(turns)], axis=1)
+            self._rows.extend(normals.reshape(_ROWS_DRAWN_TOGETHER, -1)[:, : self._size])
+        return self._rows.popleft()
+
 
 class Sensors:
     """Plant state measurements, with bias, noise, delay and dropouts.
@@ -65,7 +98,7 @@ class Sensors:
                 f"has {n} joints."
             )
         self._plant, self._config, self._control_period = plant, config, control_period
-        self._rng = np.random.default_rng(config.seed)
+        self._normals = NormalNumbers(config.seed, 12 + 2 * n)
         self._joint_index = {name: i for i, name in enumerate(plant.robot.joint_names)}
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
         self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
@@ -104,21 +137,20 @@ class Sensors:
             self.used = self.used or self.is_imperfect
         if not self.used:
             return
-        plant, normal, noise = self._plant, self._rng.standard_normal, self._noise
+        plant, noise, errors = self._plant, self._noise, self._normals.next_row()
         self._past.append((plant.pose.copy(), plant.twist.copy()))
         # At the beginning of a delay, fewer past states than its ticks exist.
         pose, twist = self._past[max(0, len(self._past) - 1 - self._delay)]
         n = len(self.q)
-        errors = normal(12)
         turn = self._pose_bias[3:] + noise["attitude"] * errors[3:6]
         self.pose[:3] = pose[:3] + self._pose_bias[:3] + noise["position"] * errors[:3]
         self.pose[3:] = pose[3:]
         if turn.any():
             self.pose[3:] = quaternion_multiply(pose[3:], quaternion_from_rotvec(turn))
         self.twist[:3] = twist[:3] + noise["velocity"] * errors[6:9]
-        self.twist[3:] = twist[3:] + noise["angular_velocity"] * errors[9:]
-        self.q[:] = plant.q + self._joint_bias + noise["joints"] * normal(n)
-        self.qdot[:] = plant.qdot + noise["joint_rates"] * normal(n)
+        self.twist[3:] = twist[3:] + noise["angular_velocity"] * errors[9:12]
+        self.q[:] = plant.q + self._joint_bias + noise["joints"] * errors[12 : 12 + n]
+        self.qdot[:] = plant.qdot + noise["joint_rates"] * errors[12 + n :]
 
     def _apply_faults(self, faults: tuple[Fault, ...]) -> None:
         self._faults = faults

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
+from scipy.stats import kstest
 from std_msgs.msg import Float64MultiArray
 from support.effort_flights import robot_of
 from support.oracles import Array, PinocchioOracle
@@ -22,7 +23,7 @@ from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
-from spacerobot_ros.simulation.sensors import ReportedState, Sensors, TargetSensors
+from spacerobot_ros.simulation.sensors import NormalNumbers, ReportedState, Sensors, TargetSensors
 from spacerobot_ros.topics import TOPICS, StateField, Topic
 
 TICK = 0.05
@@ -33,6 +34,24 @@ START = InitialState(
     joint_positions=np.array([0.2, -0.4, 0.9]),
     angular_momentum=np.array([0.5, -0.2, 0.3]),
 )
+
+
+def test_noise_is_normal_independent_and_given_by_its_seed() -> None:
+    count, size = 20_000, 18
+    rows, others = (
+        np.array([source.next_row() for _ in range(count)])
+        for source in (NormalNumbers(7, size), NormalNumbers(8, size))
+    )
+    assert kstest(rows.ravel(), "norm").pvalue > 0.01
+    # Of columns, of successive rows, of successive seeds: five standard deviations.
+    correlations = np.corrcoef(np.hstack([rows[1:], rows[:-1], others[1:]]).T)
+    assert np.abs(correlations - np.eye(3 * size)).max() < 5.0 / np.sqrt(count)
+    again = NormalNumbers(7, size)
+    np.testing.assert_array_equal([again.next_row() for _ in range(100)], rows[:100])
+    # The first two numbers from the words of the generator of NumPy, by Box and Muller.
+    one, two = (np.random.Philox(key=7).random_raw(2) >> 11) / 2.0**53
+    radius, angle = np.hypot(*rows[0, :2]), np.arctan2(rows[0, 1], rows[0, 0]) % (2.0 * np.pi)
+    np.testing.assert_allclose([np.exp(-(radius**2) / 2.0), angle / (2.0 * np.pi)], [one, two])
 
 
 class Flight:
