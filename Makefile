@@ -71,6 +71,10 @@ test-oldest: ## run the quick tests with the versions of Ubuntu 24.04, in .venv-
 
 OLDEST := click lxml lz4 matplotlib numpy pin pyarrow pyparsing PyYAML scipy zstandard
 
+.PHONY: gpu
+gpu: $(STAMP)/gpu ## run the tests of lanes, campaigns and environments on a CUDA device; print its ticks per second
+	$(BIN)/python3 -m pytest -m gpu
+
 # The wheel carries axe-core's script; what it depends on is not needed.
 AXE := axe-playwright-python==0.1.8
 $(STAMP)/axe.min.js: | $(STAMP)/test
@@ -210,12 +214,13 @@ $(STAMP)/venv:
 
 $(STAMP)/demo: EXTRAS := jazzy,viewer,collision,pytest
 $(STAMP)/test: EXTRAS := jazzy,test
+$(STAMP)/gpu: EXTRAS := jazzy,test,cuda
 $(STAMP)/bench: EXTRAS := jazzy,campaign,bench
 $(STAMP)/docs: EXTRAS := jazzy,docs
 
 # A changed declaration or a new stamp: the package with its dependencies. Changed sources: the
 # package alone. What is left in build/lib would be installed again, deleted files too.
-$(STAMP)/demo $(STAMP)/test $(STAMP)/bench $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
+$(STAMP)/demo $(STAMP)/test $(STAMP)/gpu $(STAMP)/bench $(STAMP)/docs: $(DECLARATION) $(SOURCES) | $(STAMP)/venv
 	@rm -rf build/lib
 	@echo "Installing spacerobot_ros[$(EXTRAS)] into $(VENV)$(if $(ALL), (once; a minute or two)) ..."
 	@$(PIP) install --no-build-isolation \

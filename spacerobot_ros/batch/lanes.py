@@ -7,6 +7,7 @@ commands that lanes cannot compute.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import astuple, replace
 from typing import Any
 
@@ -49,11 +50,14 @@ _PROGRAMS = {
 }
 
 
-def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
+def fly_lanes(
+    flights: Flights, target: Target | None = None, stopped: Callable[[], bool] = lambda: False
+) -> BatchResult:
     """Fly many flights at once, one per SIMD lane or device thread.
 
     Every flight equals the plant's flight with the same values up to rounding (1e-12 in the
-    benchmark flights).
+    benchmark flights). ``stopped`` is called every 2000 ticks; once it returns True, the result is
+    incomplete.
 
     Raises
     ------
@@ -76,7 +80,7 @@ def fly_lanes(flights: Flights, target: Target | None = None) -> BatchResult:
     rows = np.flatnonzero(fit)
     size = _block_size(flights, tick)
     for first in range(0, len(rows), size):
-        LaneBlock(flights, tick, model, p, rows[first : first + size], result).fly()
+        LaneBlock(flights, tick, model, p, rows[first : first + size], result).fly(stopped)
     return result
 
 
@@ -255,13 +259,15 @@ class LaneBlock:
             table = np.moveaxis(grouped, 1, 3)
         return np.ascontiguousarray(table)
 
-    def fly(self) -> None:
-        """Fly the flights and write the results."""
+    def fly(self, stopped: Callable[[], bool]) -> None:
+        """Fly the flights and write the results, unless stopped."""
         flights, job, library = self._flights, self._job, self._tick.library
         # A tick of no duration under no command reports the start.
         library.start_flights(job)
         self._memory[:, self._rows["h"]] = flights.control_period
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
+            if stopped():
+                return
             alive = self._target.to_numpy(self._memory[:, self._rows.first_row("alive")])
             if not alive.any():
                 break

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from spacerobot_ros.batch.targets import is_device_name
 from spacerobot_ros.campaign.distributions import (
     Dispersion,
     checked_dispersions,
@@ -42,7 +43,7 @@ _CAMPAIGN_KEYS = (
 )
 _MAX_FLIGHTS = 10_000_000
 ENGINES = ("auto", "lanes", "flights")
-"""Names of engines that can fly a campaign."""
+"""Names of engines that can fly a campaign, besides devices."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ class Campaign:
     metrics
         Names of metrics that are reported in addition to those in the criteria.
     engine
-        Name of the engine: ``auto``, ``lanes`` or ``flights``.
+        Name of the engine: ``auto``, ``lanes``, ``flights``, or of a device
+        (:func:`.device_named`).
     description
         Description for readers of the report.
     section
@@ -224,7 +226,7 @@ def parse_campaign(
     sampler = str(section.get("sampler", "random"))
     engine = str(section.get("engine", "auto"))
     _require_known("sampler", sampler, SAMPLERS)
-    _require_known("engine", engine, ENGINES)
+    require_engine(engine)
     dispersions = checked_dispersions(drawn)
     if sampler == "saltelli" and not dispersions:
         raise ParameterError("the sampler 'saltelli' requires at least one dispersion.")
@@ -247,6 +249,12 @@ def parse_campaign(
         description=printable(str(section.get("description", ""))),
         section=dict(section),
     )
+
+
+def require_engine(name: str) -> None:
+    """Raise ParameterError if there is no engine with a name."""
+    if not is_device_name(name):
+        _require_known("engine", name, (*ENGINES, "cuda"))
 
 
 def _require_known(kind: str, name: Any, known: Sequence[str]) -> None:

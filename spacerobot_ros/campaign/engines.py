@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cache
+from importlib.util import find_spec
 
-from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.batch.targets import device_named
+from spacerobot_ros.campaign.config import ENGINES, Campaign
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 
-ENGINE_FACTORIES: Mapping[str, Callable[[], Engine]] = {
-    "lanes": LanesEngine,
-    "flights": FlightsEngine,
-}
-"""Engines by name, in order of preference."""
+_FLIGHTS_WORTH_A_DEVICE = 100_000
+"""Flights under coordinated control from which a device saves more time than its program takes to
+compile; other campaigns take most time for plans."""
 
 
-def select_engine(campaign: Campaign, engine_name: str) -> Engine:
+def select_engine(campaign: Campaign, engine_name: str, *, local: bool = True) -> Engine:
     """Return the engine ``engine_name``; ``auto`` selects the first engine that can fly the
-    campaign.
+    campaign, if the flights are ``local`` also a device.
 
     Raises
     ------
     SpaceRobotError
         The engine cannot fly the campaign, or no engine can; the message states the reason.
     """
-    reasons = []
-    for name in ENGINE_FACTORIES if engine_name == "auto" else (engine_name,):
+    reasons, names = [], [engine_name]
+    if engine_name == "auto":
+        names = [*["cuda"] * (local and _is_worth_a_device(campaign)), *ENGINES[1:]]
+    for name in names:
         engine = engine_by_name(name)
         reason = engine.refusal(campaign)
         if not reason:
@@ -39,10 +41,21 @@ def select_engine(campaign: Campaign, engine_name: str) -> Engine:
     raise SpaceRobotError(" ".join(reasons))
 
 
+def _is_worth_a_device(campaign: Campaign) -> bool:
+    is_large = campaign.flights >= _FLIGHTS_WORTH_A_DEVICE
+    if not is_large or "planner" in campaign.scenario.commanders or not find_spec("cupy"):
+        return False
+    try:
+        device_named("cuda")
+    except SpaceRobotError:
+        return False
+    return True
+
+
 @cache
 def engine_by_name(name: str) -> Engine:
     """Return an engine by name: one instance per process, so that its models are reused."""
-    return ENGINE_FACTORIES[name]()
+    return FlightsEngine() if name == FLIGHTS else LanesEngine(name)
 
 
 def fly_all(

@@ -1,9 +1,9 @@
-"""Flies campaign draws in SIMD lanes, along planned schedules or under coordinated control.
+"""Flies campaign draws in SIMD lanes or on a device.
 
-A lane can follow one schedule to the end of the schedule and evaluate the goal, or fly under
-coordinated control until the outcome is known. A draw that requires more (a correction, a joint at
-a limit, a loss of control) becomes a :class:`.Fallback` for the engine ``flights``; the resulting
-rows of the dataset are the same.
+A lane, or a thread of a device, can follow one schedule to the end of the schedule and evaluate the
+goal, or fly under coordinated control until the outcome is known. A draw that requires more (a
+correction, a joint at a limit, a loss of control) becomes a :class:`.Fallback` for the engine
+``flights``; the resulting rows of the dataset are the same.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from spacerobot_ros.batch import (
     fly_lanes,
 )
 from spacerobot_ros.batch.flights import BatchResult
+from spacerobot_ros.batch.targets import device_named, vector_unit
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw, drawn_flights
 from spacerobot_ros.campaign.one_by_one import FlightsEngine, nominal_robots, plant_robot, robots_of
@@ -58,6 +59,9 @@ _STATES_PER_FLIGHT = 40
 
 _MAX_BATCH_TICKS = 4_000_000
 """Largest number of ticks in one batch; all its schedules are in memory."""
+
+_DEVICE_FLIGHTS = 4096
+"""Flights of a batch on a device: about as many as are prepared in the following time."""
 
 _MAX_BATCH_PREPARATION_TIME = 4.0
 """Wall time, s, after which a batch is flown with the draws that are ready; this limits the loss if
@@ -127,12 +131,18 @@ class _PreparedDraw:
 
 
 class LanesEngine:
-    """Engine that flies many draws at once in SIMD lanes."""
+    """Engine that flies many draws at once, in SIMD lanes or on a device.
 
-    name = LANES
-    efficient_flights = 64
+    Parameters
+    ----------
+    name
+        ``lanes``, or the name of a device; see :func:`.device_named`.
+    """
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = LANES) -> None:
+        self.name = name
+        self._target = vector_unit() if name == LANES else device_named(name)
+        self.efficient_flights = _DEVICE_FLIGHTS if self._target.threads else 64
         self._flights = FlightsEngine()
         self._scheduled, self._controlled = _ScheduledLanes(), _ControlledLanes()
 
@@ -194,22 +204,26 @@ class LanesEngine:
             batch.append(ready)
             ticks += 0 if ready.plan is None else ready.schedule.ticks
             late = time.perf_counter() - began > _MAX_BATCH_PREPARATION_TIME
-            if late or len(batch) >= lanes.max_batch_flights or ticks > _MAX_BATCH_TICKS:
-                yield from self._fly_batch(campaign, lanes, batch)
+            most = max(lanes.max_batch_flights, self.efficient_flights)
+            if late or len(batch) >= most or ticks > _MAX_BATCH_TICKS:
+                yield from self._fly_batch(campaign, lanes, batch, stopped)
                 batch, ticks, began = [], 0, time.perf_counter()
         if batch:
-            yield from self._fly_batch(campaign, lanes, batch)
+            yield from self._fly_batch(campaign, lanes, batch, stopped)
 
     def _fly_batch(
         self,
         campaign: Campaign,
         lanes: _ScheduledLanes | _ControlledLanes,
         batch: Sequence[_PreparedDraw],
+        stopped: Callable[[], bool],
     ) -> Iterator[Row | Fallback]:
         began = time.perf_counter()
         try:
             flights = lanes.flights(campaign, batch)
-            result = fly_lanes(flights)
+            result = fly_lanes(flights, self._target, stopped)
+            if stopped():
+                return
         # The error is of one draw, so each draw is flown by itself.
         except SpaceRobotError as error:
             yield from (Fallback(each.draw, str(error)) for each in batch)

@@ -111,7 +111,8 @@ def run_campaign(
         missing.
     """
     draws, dataset = Draws(campaign), Dataset(folder)
-    chosen = select_engine(campaign, campaign.engine if engine == "auto" else engine)
+    wanted = campaign.engine if engine == "auto" else engine
+    chosen = select_engine(campaign, wanted, local=not cluster.scheduler)
     with ExitStack() as opened:
         workers = None
         if cluster.scheduler and len(dataset.flown_numbers()) < len(draws):

@@ -21,7 +21,15 @@ if TYPE_CHECKING:
     from spacerobot_ros.campaign.running import Progress
     from spacerobot_ros.campaign.workers import Cluster
 
-_ENGINES = ("auto", "lanes", "flights")
+
+def _checked_engine(context: click.Context, parameter: click.Parameter, name: str) -> str:
+    from spacerobot_ros.campaign.config import require_engine
+
+    try:
+        require_engine(name)
+    except ParameterError as refusal:
+        raise click.BadParameter(str(refusal)) from refusal
+    return name
 
 
 class _CampaignGroup(DefaultGroup):
@@ -41,10 +49,11 @@ def campaign_command() -> None:
 @click.option("--flights", type=click.IntRange(min=1), help="Number of flights [as in FILE].")
 @click.option(
     "--engine",
-    type=click.Choice(_ENGINES),
     default="auto",
     show_default=True,
-    help="Flight engine.",
+    metavar="NAME",
+    callback=_checked_engine,
+    help="Flight engine: auto, lanes, flights or cuda (cuda:1, cuda:single; see the docs).",
 )
 @click.option(
     "--workers",

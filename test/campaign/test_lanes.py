@@ -11,6 +11,8 @@ import pytest
 from support.campaigns import campaign
 from support.slow import some_fast
 
+from spacerobot_ros.batch import targets
+from spacerobot_ros.campaign import engines, lanes
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.engines import fly_all, select_engine
@@ -36,14 +38,35 @@ DISPERSED: dict[str, Any] = {
 }
 
 
+def on_engines(*fast: str) -> Any:
+    """Parametrise a test by the engine: lanes, or the program of a device, here or on one."""
+    marks = {"lanes": [], "host": [], "cuda": [pytest.mark.gpu]}
+    for name, each in marks.items():
+        if name not in fast:
+            each.append(pytest.mark.slow)
+    return pytest.mark.parametrize(
+        "engine", [pytest.param(name, marks=each) for name, each in marks.items()]
+    )
+
+
+def engine_named(name: str) -> LanesEngine:
+    """Return an engine; the test is skipped if there is no such device."""
+    try:
+        return LanesEngine(name)
+    except SpaceRobotError as error:
+        pytest.skip(str(error))
+
+
 def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]:
     rows = fly_all(engine, made, list(Draws(made)), lambda: False)
     return {row.draw.number: row for row in rows}
 
 
-@pytest.mark.slow
+@on_engines()
 @pytest.mark.parametrize(("tolerance", "most"), [(0.05, 3), (0.0012, 3), (0.0012, 0)])
-def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float, most: int) -> None:
+def test_the_same_draw_is_the_same_flight_in_every_engine(
+    engine: str, tolerance: float, most: int
+) -> None:
     """A tight tolerance makes some need a correction, which lanes leave to the planner."""
     settings = {
         "planner.position_tolerance": 0.05,
@@ -51,19 +74,19 @@ def test_the_same_draw_is_the_same_flight_in_every_engine(tolerance: float, most
         "planner.max_corrections": most,
     }
     made = campaign(disperse=DISPERSED, flights=12, seed=1, set=settings)
-    lanes, one_by_one = flown(LanesEngine(), made), flown(FlightsEngine(), made)
-    assert lanes.keys() == one_by_one.keys() == set(range(12))
+    of_lanes, one_by_one = flown(engine_named(engine), made), flown(FlightsEngine(), made)
+    assert of_lanes.keys() == one_by_one.keys() == set(range(12))
     for number, row in one_by_one.items():
-        other = lanes[number]
+        other = of_lanes[number]
         deviation, at = largest_deviation(row.metrics, other.metrics)
         assert deviation < RERUN_TOLERANCE, (number, at, deviation)
         assert (row.outcome, row.reason) == (other.outcome, other.reason)
         assert row.passed is other.passed
-    engines = [row.engine for row in lanes.values()]
+    engines = [row.engine for row in of_lanes.values()]
     corrected = sum(row.metrics["corrections"] > 0 for row in one_by_one.values())
     assert engines.count("flights") == corrected
     assert 0 < corrected < 12 if tolerance < 0.01 and most else not corrected
-    failed = [row.outcome for row in lanes.values()].count("failed")
+    failed = [row.outcome for row in of_lanes.values()].count("failed")
     assert 0 < failed < 12 if not most else not failed
 
 
@@ -103,27 +126,27 @@ def controlled(**given: Any) -> Campaign:
     return parse_campaign("controlled", {**wanted, "set": {**CONTROL, **given.get("set", {})}})
 
 
-def assert_same_flights(made: Campaign) -> tuple[dict[int, Row], dict[int, Row]]:
-    lanes, one_by_one = flown(LanesEngine(), made), flown(FlightsEngine(), made)
-    assert lanes.keys() == one_by_one.keys() == set(range(made.flights))
+def assert_same_flights(made: Campaign, engine: str) -> tuple[dict[int, Row], dict[int, Row]]:
+    of_lanes, one_by_one = flown(engine_named(engine), made), flown(FlightsEngine(), made)
+    assert of_lanes.keys() == one_by_one.keys() == set(range(made.flights))
     for number, row in one_by_one.items():
-        other = lanes[number]
+        other = of_lanes[number]
         deviation, at = largest_deviation(row.metrics, other.metrics)
         assert deviation < RERUN_TOLERANCE, (number, at, deviation)
         assert (row.outcome, row.reason) == (other.outcome, other.reason)
         assert row.passed is other.passed
-    return lanes, one_by_one
+    return of_lanes, one_by_one
 
 
-@pytest.mark.slow
-def test_coordinated_control_in_lanes_is_that_of_the_plant_and_the_controller() -> None:
+@on_engines()
+def test_coordinated_control_in_lanes_is_that_of_the_plant_and_the_controller(engine: str) -> None:
     """Masses, noise, biases, goals, starts and gains differ; some come too late."""
     made = controlled(flights=9)
     assert select_engine(made, "auto").name == "lanes"
-    lanes, _ = assert_same_flights(made)
-    assert {row.engine for row in lanes.values()} == {"lanes"}
-    assert {row.outcome for row in lanes.values()} == {"reached", "failed"}
-    assert len({row.metrics["duration_s"] for row in lanes.values()}) > 3
+    of_lanes, _ = assert_same_flights(made, engine)
+    assert {row.engine for row in of_lanes.values()} == {engine}
+    assert {row.outcome for row in of_lanes.values()} == {"reached", "failed"}
+    assert len({row.metrics["duration_s"] for row in of_lanes.values()}) > 3
 
 
 @pytest.mark.parametrize("engine", some_fast([LanesEngine, FlightsEngine], LanesEngine))
@@ -142,30 +165,36 @@ def test_every_flight_has_noise_of_its_own(engine: type[LanesEngine | FlightsEng
     assert len({*first, *other}) == 6
 
 
-@pytest.mark.slow
-def test_flights_in_lanes_are_interrupted_or_left_to_the_controller() -> None:
+@on_engines()
+def test_flights_in_lanes_are_interrupted_or_left_to_the_controller(engine: str) -> None:
     """The longest time ends them all; joints that seem to race have control given up."""
-    lanes, _ = assert_same_flights(controlled(flights=3, longest=0.305))
-    assert {row.outcome for row in lanes.values()} == {"interrupted"}
+    of_lanes, _ = assert_same_flights(controlled(flights=3, longest=0.305), engine)
+    assert {row.outcome for row in of_lanes.values()} == {"interrupted"}
     wild = {**CONTROLLED, "plant.sensors.joint_rate_noise": {"choice": [0.0, 8.0]}}
-    lanes, one_by_one = assert_same_flights(controlled(flights=6, disperse=wild, longest=0.5))
+    of_lanes, one_by_one = assert_same_flights(
+        controlled(flights=6, disperse=wild, longest=0.5), engine
+    )
     lost = {number for number, row in one_by_one.items() if row.outcome == "aborted"}
     assert 0 < len(lost) < 6
-    assert {n for n, row in lanes.items() if row.engine == "flights"} == lost
-    assert {lanes[number].fallback for number in lost} == {"lost control"}
+    assert {n for n, row in of_lanes.items() if row.engine == "flights"} == lost
+    assert {of_lanes[number].fallback for number in lost} == {"lost control"}
 
 
-def test_a_goal_out_of_the_plane_is_refused_in_lanes_as_elsewhere() -> None:
+@on_engines("lanes")
+def test_a_goal_out_of_the_plane_is_refused_in_lanes_as_elsewhere(engine: str) -> None:
     disperse = {"goal.position.z": {"choice": [0.0, 0.4]}}
-    lanes, _ = assert_same_flights(controlled(flights=6, disperse=disperse, longest=0.2))
-    assert {row.outcome for row in lanes.values()} == {"interrupted", "refused"}
-    for row in lanes.values():
+    of_lanes, _ = assert_same_flights(controlled(flights=6, disperse=disperse, longest=0.2), engine)
+    assert {row.outcome for row in of_lanes.values()} == {"interrupted", "refused"}
+    for row in of_lanes.values():
         refused = row.outcome == "refused"
-        assert row.engine == ("flights" if refused else "lanes")
+        assert row.engine == ("flights" if refused else engine)
         assert ("along z of the world" in row.reason) is refused
 
 
-def test_a_part_that_is_asked_for_and_not_controlled_is_missed_in_lanes_as_elsewhere() -> None:
+@on_engines("lanes")
+def test_a_part_that_is_asked_for_and_not_controlled_is_missed_in_lanes_as_elsewhere(
+    engine: str,
+) -> None:
     """An arm turns its spacecraft, and leaves the place that a draw asks for."""
     settings = {"planner.max_corrections": 0, "planner.method": "optimal"}
     for disperse, outcome in (
@@ -174,31 +203,31 @@ def test_a_part_that_is_asked_for_and_not_controlled_is_missed_in_lanes_as_elsew
     ):
         wanted = {"scenario": "arm_attitude", "seed": 2, "flights": 3, "set": settings}
         made = parse_campaign("arm", {**wanted, "disperse": disperse})
-        lanes, _ = assert_same_flights(made)
-        assert {(row.engine, row.outcome) for row in lanes.values()} == {("lanes", outcome)}
-        assert all(row.passed is (outcome == "reached") for row in lanes.values())
+        of_lanes, _ = assert_same_flights(made, engine)
+        assert {(row.engine, row.outcome) for row in of_lanes.values()} == {(engine, outcome)}
+        assert all(row.passed is (outcome == "reached") for row in of_lanes.values())
 
 
-@pytest.mark.slow
-def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes() -> None:
+@on_engines()
+def test_a_draw_that_is_refused_leaves_the_others_of_its_batch_in_lanes(engine: str) -> None:
     """Each has its own reason: a start beyond the joint limits, noise below zero."""
     refused: dict[str, Any] = {
         "initial.joints.elbow": {"choice": [0.0, 9.0]},
         "plant.sensors.joint_noise": {"uniform": {"loc": -0.0001, "scale": 0.0003}},
     }
     made = controlled(flights=12, disperse=refused, longest=0.2)
-    lanes, _ = assert_same_flights(made)
-    reasons = {number: row.reason for number, row in lanes.items() if row.outcome == "error"}
+    of_lanes, _ = assert_same_flights(made, engine)
+    reasons = {number: row.reason for number, row in of_lanes.items() if row.outcome == "error"}
     for part in ("is outside its limits", "must be a number from 0"):
         assert any(part in reason for reason in reasons.values()), (part, reasons)
     assert 3 <= len(reasons) < 12
-    flown_in_lanes = {number for number, row in lanes.items() if row.engine == "lanes"}
-    assert set(lanes) - set(reasons) <= flown_in_lanes
-    assert all(row.fallback == row.reason for row in lanes.values() if row.fallback)
+    flown_in_lanes = {number for number, row in of_lanes.items() if row.engine == engine}
+    assert set(of_lanes) - set(reasons) <= flown_in_lanes
+    assert all(row.fallback == row.reason for row in of_lanes.values() if row.fallback)
 
 
-@pytest.mark.slow
-def test_lanes_measure_the_end_effector_that_a_planner_does_not_move() -> None:
+@on_engines()
+def test_lanes_measure_the_end_effector_that_a_planner_does_not_move(engine: str) -> None:
     """Its goal is one of the scenario: the criterion is of where it is, in every engine."""
     made = campaign(
         disperse={"mass.*": {"norm": {"loc": 1.0, "scale": 0.03}}},
@@ -207,26 +236,27 @@ def test_lanes_measure_the_end_effector_that_a_planner_does_not_move() -> None:
     )
     goal = Goal.checked([0.4, 0.1, 0.2], [0.0, 0.0, 0.0, 1.0])
     scenario = made.scenario.with_poses(made.scenario.goal, goal)
-    lanes, one_by_one = assert_same_flights(replace(made, scenario=scenario))
-    for row in (*lanes.values(), *one_by_one.values()):
+    of_lanes, one_by_one = assert_same_flights(replace(made, scenario=scenario), engine)
+    for row in (*of_lanes.values(), *one_by_one.values()):
         assert 0.0 < row.metrics["end_effector_position_error_m"] < 5.0
-    assert {row.engine for row in lanes.values()} == {"lanes"}
+    assert {row.engine for row in of_lanes.values()} == {engine}
 
 
-def test_draws_that_are_no_robot_and_no_number_end_no_other_flight() -> None:
+@on_engines("lanes")
+def test_draws_that_are_no_robot_and_no_number_end_no_other_flight(engine: str) -> None:
     nothing = {"mass": {"choice": [0.0, 1.0]}}
-    lanes, _ = assert_same_flights(controlled(flights=6, disperse=nothing, longest=0.2))
+    of_lanes, _ = assert_same_flights(controlled(flights=6, disperse=nothing, longest=0.2), engine)
     infinite = {"plant.sensors.seed": {"pareto": {"b": 0.001}}}
-    lanes_of_none, _ = assert_same_flights(controlled(flights=4, disperse=infinite))
+    of_none, _ = assert_same_flights(controlled(flights=4, disperse=infinite), engine)
     sentence = "The value drawn for 'plant.sensors.seed' is inf."
-    assert sentence in {row.reason for row in lanes_of_none.values()}
+    assert sentence in {row.reason for row in of_none.values()}
     # Some are finite, and larger than a ROS parameter can be.
-    assert any("a 64-bit integer" in row.reason for row in lanes_of_none.values())
-    assert {row.outcome for row in lanes_of_none.values()} == {"error"}
-    weightless = [row.reason for row in lanes.values() if not row.draw.values["mass"]]
+    assert any("a 64-bit integer" in row.reason for row in of_none.values())
+    assert {row.outcome for row in of_none.values()} == {"error"}
+    weightless = [row.reason for row in of_lanes.values() if not row.draw.values["mass"]]
     assert 0 < len(weightless) < 6
     assert set(weightless) == {"The total robot mass is zero."}
-    assert {row.engine for row in lanes.values()} == {"lanes"}
+    assert {row.engine for row in of_lanes.values()} == {engine}
 
 
 class HalfLaw(TransposedJacobianLaw):
@@ -251,8 +281,8 @@ def test_lanes_fly_the_whole_command_of_a_law_or_leave_it(monkeypatch: pytest.Mo
     with pytest.raises(SpaceRobotError, match=r"'transposed_jacobian' .* not a single function"):
         select_engine(made, "lanes")
     monkeypatch.setitem(LAWS, "transposed_jacobian", SaidHalfLaw)
-    lanes, _ = assert_same_flights(made)
-    assert {row.engine for row in lanes.values()} == {"lanes"}
+    of_lanes, _ = assert_same_flights(made, "lanes")
+    assert {row.engine for row in of_lanes.values()} == {"lanes"}
 
 
 def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
@@ -306,6 +336,41 @@ def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
         assert select_engine(campaign(set=given), "auto").name == "flights"
 
 
+def test_a_device_flies_large_campaigns_of_controllers_where_there_is_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    large = replace(controlled(), flights=100_000)
+    assert select_engine(large, "auto").name == "lanes"
+    with pytest.raises(SpaceRobotError, match="require cupy, which is not installed: pip install"):
+        select_engine(large, "cuda:3")
+    with pytest.raises(SpaceRobotError, match="There is no device 'cuda:x': use cuda, cuda:1, "):
+        select_engine(large, "cuda:x")
+    monkeypatch.setattr(engines, "find_spec", lambda name: name == "cupy")
+    for module in (engines, lanes):
+        monkeypatch.setattr(module, "device_named", lambda name: targets.THREADS_OF_HOST)
+    engines.engine_by_name.cache_clear()
+    assert select_engine(large, "auto").name == "cuda"
+    assert select_engine(large, "auto", local=False).name == "lanes"
+    assert select_engine(replace(large, flights=99_999), "auto").name == "lanes"
+    assert select_engine(replace(campaign(), flights=100_000), "auto").name == "lanes"
+    engines.engine_by_name.cache_clear()
+
+
+@on_engines("lanes")
+def test_a_campaign_that_is_stopped_in_flight_has_no_rows_of_that_batch(engine: str) -> None:
+    """It is stopped by the second check in the batch, after 2000 of 3000 ticks."""
+    far = {"coordinated_control.time_limit": 40.0, "coordinated_control.position_tolerance": 1e-9}
+    made, asked = controlled(flights=2, set=far, longest=30.0), 0
+
+    def stopped() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > made.flights + 1
+
+    assert not list(engine_named(engine).fly(made, list(Draws(made)), stopped))
+    assert asked == made.flights + 3
+
+
 SHARED = "is dispersed, but shared by all lanes"
 
 
@@ -356,6 +421,7 @@ def test_what_lanes_do_not_fly_of_a_controller(given: dict[str, Any], reason: st
     assert LanesEngine().refusal(controlled(set=given)) == reason
 
 
+@on_engines("lanes")
 @pytest.mark.parametrize(
     ("corrections", "longest", "outcome", "fallback"),
     [
@@ -365,12 +431,12 @@ def test_what_lanes_do_not_fly_of_a_controller(given: dict[str, Any], reason: st
     ],
 )
 def test_what_a_first_schedule_does_not_decide_is_left_to_the_planner(
-    corrections: int, longest: float, outcome: str, fallback: str
+    engine: str, corrections: int, longest: float, outcome: str, fallback: str
 ) -> None:
     """The tolerance is smaller than what noise and gaits of first order leave."""
     tight = {"planner.position_tolerance": 1e-9, "planner.attitude_tolerance": 1e-9}
     given = {**tight, "planner.max_corrections": corrections}
     made = campaign(disperse=DISPERSED, flights=2, set=given, longest=longest)
-    rows = flown(LanesEngine(), made)
+    rows = flown(engine_named(engine), made)
     assert {row.outcome for row in rows.values()} == {outcome}
     assert {row.fallback for row in rows.values()} == {fallback}
