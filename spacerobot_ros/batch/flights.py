@@ -387,8 +387,11 @@ def state_size(n: int) -> int:
 def state_parts(states: Array, n: int) -> dict[str, Array]:
     """Return the components of states (..., 2 n + 20) as views: q, qdot, pose, twist, momentum."""
     names = ("q", "qdot", "pose", "twist", "momentum")
-    ends = np.cumsum([n, n, 7, 6, 7])
-    return dict(zip(names, np.split(states, ends, axis=-1), strict=False))
+    ends = np.cumsum([0, n, n, 7, 6, 7]).tolist()
+    return {
+        name: states[..., first:last]
+        for name, first, last in zip(names, ends[:-1], ends[1:], strict=True)
+    }
 
 
 def plant_of(flights: Flights, row: int) -> Plant:

@@ -165,6 +165,13 @@ class LaneBlock:
     def _write_rows(self, name: str, values: Any, lanes: Counts | None = None) -> None:
         """Write rows of a name, (lanes, size) or a number, of all flights or of some lanes."""
         arrays = self._target.arrays
+        if lanes is None and len(self._flown) == self._groups * self._lanes:
+            part, each = self._memory[:, self._rows[name]], arrays.asarray(values)
+            if each.ndim == 2:
+                part[:] = each.reshape(self._groups, self._lanes, -1).swapaxes(1, 2)
+            else:
+                part[:] = each.reshape(-1, 1)
+            return
         chosen = np.arange(len(self._flown)) if lanes is None else lanes
         group, lane = np.divmod(chosen[:, np.newaxis], self._lanes)
         rows = np.arange(self._rows.total_rows)[self._rows[name]]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,7 +45,8 @@ from spacerobot_ros.simulation.plant import Plant
 class SteppedFlights:
     """N flights of one robot, advanced together tick by tick under given commands.
 
-    An ended flight keeps the state of its last tick.
+    An ended flight keeps the state of its last tick. On a device, the arrays are those of the
+    device.
 
     Parameters
     ----------
@@ -117,17 +119,20 @@ class SteppedFlights:
         self.robot, self.control_period = robot, control_period
         self.command_size = self._flights.command_size
         """See :attr:`.Flights.command_size`."""
-        self.ticks = np.zeros(count, dtype=np.int64)
-        """(N,) ticks since the last reset of each flight."""
-        self.has_not_ended = np.ones(count, dtype=np.bool_)
-        """(N,) whether the flight is in progress: it has neither failed nor been ended."""
         self.require_startable(starts, None)
         self._engine = self._choose_engine(link, plants, in_lanes, target)
+        self.arrays = self._engine.arrays
+        """Array module: NumPy, or that of the device."""
+        self.ticks = self.arrays.zeros(count, dtype=np.int64)
+        """(N,) ticks since the last reset of each flight."""
+        self.has_not_ended = self.arrays.ones(count, dtype=np.bool_)
+        """(N,) whether the flight is in progress: it has neither failed nor been ended."""
         self.engine = self._engine.name
         """Engine name: lanes with their registers, or ``scalar``."""
         self.failures = self._engine.failures
         """The messages of flights that failed since their last reset, by row."""
-        self._reports = np.zeros((count, state_size(robot.n) + (3 if link else 0)))
+        width = state_size(robot.n) + (3 if link else 0)
+        self._reports = self.arrays.zeros((count, width), self._engine.dtype)
         vars(self).update(state_parts(self._reports, robot.n))
         self.link_r = self._reports[:, state_size(robot.n) :]
         self._begin(every)
@@ -138,7 +143,7 @@ class SteppedFlights:
     @property
     def time(self) -> Array:
         """(N,) simulated time since the last reset of each flight, s."""
-        return np.asarray(self.ticks * self.control_period)
+        return self.ticks * self.control_period
 
     def reset(
         self, rows: npt.ArrayLike, starts: InitialStates, inertial: InertialParameters | None = None
@@ -177,6 +182,20 @@ class SteppedFlights:
             assign_rows(self._flights.inertial, chosen, inertial)
         self._begin(chosen)
 
+    def remember_starts(self) -> None:
+        """Keep the states and masses with which flights on a device began, for :meth:`restart`."""
+        self._lanes.remember_starts()
+
+    def restart(self, rows: Any, starts: Any) -> None:
+        """Restart some flights on a device (K,), each as the remembered flight in ``starts`` (K,)
+        began; both are flight indices on the device, which no other processor reads."""
+        self._write_reports(rows, self._lanes.restart(rows, starts))
+
+    @property
+    def _lanes(self) -> _SteppedLanes:
+        assert isinstance(self._engine, _SteppedLanes), "there is no device"
+        return self._engine
+
     def require_startable(self, starts: InitialStates, inertial: InertialParameters | None) -> None:
         """Validate start states (K rows) and masses as in :meth:`reset`, without a reset.
 
@@ -193,8 +212,7 @@ class SteppedFlights:
 
     def end(self, rows: npt.ArrayLike) -> None:
         """End some flights; they are not stepped until they are reset."""
-        chosen = np.atleast_1d(np.asarray(rows, dtype=np.int64))
-        self.has_not_ended[chosen] = False
+        self.has_not_ended[self.arrays.asarray(rows, dtype=np.int64)] = False
 
     def step(self, commands: Array, ticks: int = 1) -> None:
         """Advance all flights in progress by some ticks under held commands.
@@ -214,26 +232,32 @@ class SteppedFlights:
         CommandError
             A command for a flight in progress is not finite; no flight is stepped.
         """
-        if np.shape(commands) != (len(self), self.command_size):
+        arrays = self.arrays
+        commands = arrays.asarray(commands)
+        if commands.shape != (len(self), self.command_size):
             raise ParameterError(
-                f"The commands have shape {np.shape(commands)}, not "
-                f"({len(self)}, {self.command_size})."
+                f"The commands have shape {commands.shape}, not ({len(self)}, {self.command_size})."
             )
         if ticks < 1:
             raise ParameterError(f"A step of {ticks} ticks is too short: use at least 1.")
-        bad = np.flatnonzero(self.has_not_ended & ~np.isfinite(commands).all(axis=1))
+        bad = arrays.flatnonzero(self.has_not_ended & ~arrays.isfinite(commands).all(axis=1))
         if bad.size:
             raise CommandError(f"The command for flight {bad[0]} is not finite.")
         reports = self._engine.step(commands, ticks, self.has_not_ended)
-        self.has_not_ended[list(self.failures)] = False
-        self._reports[self.has_not_ended] = reports[self.has_not_ended]
-        self.ticks[self.has_not_ended] += ticks
+        if self.failures:
+            self.end(list(self.failures))
+        arrays.copyto(self._reports, reports, where=self.has_not_ended[:, None])
+        self.ticks += ticks * self.has_not_ended
 
     def _begin(self, rows: Counts) -> None:
-        self._reports[rows] = self._engine.start(rows)
+        self._write_reports(self.arrays.asarray(rows), self._engine.start(rows))
+
+    def _write_reports(self, rows: Any, reports: Any) -> None:
+        self._reports[rows] = reports
         self.ticks[rows], self.has_not_ended[rows] = 0, True
-        for row in rows.tolist():
-            self.failures.pop(row, None)
+        if self.failures:
+            for row in rows.tolist():
+                self.failures.pop(row, None)
 
     def _choose_engine(
         self, link: str, plants: Sequence[PlantConfig], in_lanes: bool, target: Target | None
@@ -242,6 +266,8 @@ class SteppedFlights:
             try:
                 return _SteppedLanes(self._flights, link, target or vector_unit())
             except NoLibraryError as reason:
+                if target is not None:
+                    raise SpaceRobotError(f"'{target.name}' has no program: {reason}.") from reason
                 warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
         return _SteppedPlants(self._flights, link, plants)
 
@@ -251,6 +277,7 @@ class _SteppedLanes(LaneBlock):
 
     def __init__(self, flights: Flights, link: str, target: Target) -> None:
         self.name, self._link = target.engine, link
+        self.arrays, self.dtype = target.arrays, target.dtype
         result = BatchResult.empty(flights)
         self.failures = result.failures
         self._lay_out(flights, target, result)
@@ -279,27 +306,46 @@ class _SteppedLanes(LaneBlock):
                     self._write_rows(name, values)
             p = all_p[rows]
         self._write_starts(p, rows)
+        return self._report_starts(self.arrays.asarray(rows))
+
+    def remember_starts(self) -> None:
+        """See :meth:`SteppedFlights.remember_starts`."""
+        names = ("p", "state", "momenta", "r_cm")
+        parts = [self._rows[name] for name in names if name in self._rows.slices]
+        self._starts = [(part, self._memory[0, part].copy()) for part in parts]
+
+    def restart(self, rows: Any, starts: Any) -> Any:
+        """Begin flights on a device; see :meth:`SteppedFlights.restart`."""
+        for part, first in self._starts:
+            self._memory[0, part][:, rows] = first[:, starts]
+        return self._report_starts(rows)
+
+    def _report_starts(self, rows: Any) -> Any:
         self._write_rows("command", 0.0, rows)
-        if flights.actuation == "velocity":
+        if self._flights.actuation == "velocity":
             self._write_rows("before", 0.0, rows)
         # A tick of no duration reports the start; groups that have none are left alone.
         self._write_rows("h", 0.0, rows)
         self._instants[0] = 0
         self._tick.library.start_flights(self._job)
-        self._write_rows("h", flights.control_period, rows)
-        return self._reported(self._reports)[rows, 0]
+        self._write_rows("h", self._flights.control_period, rows)
+        return self._reports_of_flights()[rows]
 
-    def step(self, commands: Array, ticks: int, under_way: Flags) -> Array:
+    def step(self, commands: Any, ticks: int, under_way: Any) -> Any:
         """Step the flights in progress under held commands, and return all reports."""
         self._write_rows("alive", under_way[:, np.newaxis])
         self._write_rows("command", commands)
         self._at[:], self._instants[0] = 0, ticks
         self._fly_until(ticks)
-        return self._reported(self._reports)[:, 0]
+        return self._reports_of_flights()
+
+    def _reports_of_flights(self) -> Any:
+        each = self._reports[:, 0].swapaxes(1, 2)
+        return each.reshape(-1, each.shape[2])[: len(self._flown)]
 
 
 class _SteppedPlants:
-    name = "scalar"
+    name, arrays, dtype = "scalar", np, np.float64
 
     def __init__(self, flights: Flights, link: str, configs: Sequence[PlantConfig]) -> None:
         self._flights, self._configs = flights, configs

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -237,20 +237,29 @@ class CudaDevice(Target):
             number=number,
         )
 
-    @cached_property
+    @property
     def arrays(self) -> Any:
-        """CuPy."""
-        return optional_module("cupy", "cuda", "Flights on a GPU require")
+        """CuPy, which from now on makes arrays on this device."""
+        cupy = optional_module("cupy", "cuda", "Flights on a GPU require")
+        cupy.cuda.Device(self.number).use()
+        return cupy
 
     def zeros(self, shape: tuple[int, ...]) -> Any:
         """Return an array on the device."""
+        with self.named_errors() as cupy:
+            return cupy.zeros(shape, self.dtype)
+
+    @contextmanager
+    def named_errors(self) -> Iterator[Any]:
+        """Yield CuPy; errors of the device become a SpaceRobotError with a remedy."""
+        cuda = self.arrays.cuda
+        errors = cuda.runtime.CUDARuntimeError, cuda.driver.CUDADriverError
         try:
-            with self.arrays.cuda.Device(self.number):
-                return self.arrays.zeros(shape, self.dtype)
-        except self.arrays.cuda.memory.OutOfMemoryError as error:
+            yield self.arrays
+        except (cuda.memory.OutOfMemoryError, *errors) as error:
             raise SpaceRobotError(
-                f"The memory of CUDA device {self.number} is too small for so many robots "
-                f"({error}): use fewer."
+                f"CUDA device {self.number} failed ({error}): if its memory is too small, use "
+                "fewer robots."
             ) from error
 
     def address(self, array: Any) -> int:
@@ -281,14 +290,14 @@ class _Kernels:
         self._device, self._kernels = device, kernels
 
     def __getattr__(self, name: str) -> Callable[..., None]:
-        kernel, cupy = self._kernels[name], self._device.arrays
+        kernel = self._kernels[name]
 
         def launch(job: Any, *arguments: int) -> None:
-            with cupy.cuda.Device(self._device.number) as device:
+            with self._device.named_errors() as cupy:
                 on_device = cupy.asarray(np.frombuffer(bytes(job), np.uint8))
                 blocks = -(-job.groups // _THREADS)
                 kernel((blocks,), (_THREADS,), (on_device, *map(np.int64, arguments)))
-                device.synchronize()
+                cupy.cuda.get_current_stream().synchronize()
 
         return launch
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.batch import InitialStates, SensorErrors, SteppedFlights
 from spacerobot_ros.batch.flights import Counts, assign_rows, joined_rows
+from spacerobot_ros.batch.targets import device_named
 from spacerobot_ros.campaign.config import Campaign, load_campaign
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
@@ -85,6 +86,9 @@ class EpisodeConfig:
     )
     action_scale: Sequence[float] = parameter(
         (), "command for an action whose entries are all 1; empty: limits"
+    )
+    device: str = parameter(
+        "", "device of a vector environment, such as cuda; its arrays are of CuPy; empty: lanes"
     )
     reward: Mapping[str, float] | None = None
 
@@ -174,6 +178,20 @@ class _Starts:
         self._made: dict[int, _Start | str] = {}
         """Starts by draw number; a string is the reason why the draw was rejected."""
 
+    def first(self, count: int, flights: SteppedFlights) -> list[_Start]:
+        """Return the starts of the scenario or of the first ``count`` draws."""
+        if self._campaign is None:
+            return [self.nominal]
+        for number in range(min(count, len(self._draws))):
+            self._made[number] = self._drawn(self._campaign, number, flights)
+        starts = [each for each in self._made.values() if isinstance(each, _Start)]
+        if not starts:
+            raise ParameterError(
+                f"{len(self._made)} campaign draws were rejected, the first one because: "
+                f"{self._made[0]} Restrict the dispersions to values that the robot permits."
+            )
+        return starts
+
     def draw(
         self, generators: Sequence[np.random.Generator], flights: SteppedFlights
     ) -> tuple[list[_Start], Counts]:
@@ -259,6 +277,9 @@ class Episodes:
         scenario, self.robot = self._source.scenario, self._source.robot
         plant, every = scenario.plant, np.zeros(count, dtype=np.int64)
         self._goals_of_scenario = (config.goals or _GOALS[bool(config.campaign)]) == "scenario"
+        self._on_device = bool(config.device)
+        if self._on_device:
+            self._require_device_support(config, in_lanes)
         self._link = self._reaching_link(config.link, scenario) if config.kind.has_link else ""
         self._plants = [plant] * count if self._source.needs_plants else []
         self.flights = SteppedFlights(
@@ -270,25 +291,61 @@ class Episodes:
             link=self._link,
             in_lanes=in_lanes,
             plants=self._plants,
+            target=device_named(config.device) if self._on_device else None,
         )
+        self._arrays = self.flights.arrays
         link_r = self.flights.link_r if self._link else None
         parts = self.flights.pose, self.flights.twist, self.flights.q, self.flights.qdot
         self._states = RobotStates(*parts, link_r)
         self.scale, self.taken = self._action_scale(config, scenario)
+        self._scale, self._taken = map(self._arrays.asarray, (self.scale, self.taken))
         wrench = self.taken[self.taken >= self.robot.n] - self.robot.n
         pushed = bool((wrench < 3).any()), bool((wrench >= 3).any())
         self.task: Task = config.kind(self.robot, self._link, pushed)
         self._apply(config)
-        self.goals = np.zeros((count, self.task.goal_size))
+        zeros, dtype = self._arrays.zeros, self.flights.pose.dtype
+        self.goals = zeros((count, self.task.goal_size), dtype)
         self.goals[:, -1] = 1.0
         self._sensors = self._source.nominal.sensors[every]
         self._generators: Sequence[np.random.Generator] = ()
         self.step_duration = config.hold * plant.control_period
-        self.rewards, self.errors = np.zeros((2, count))
-        self.observations = np.zeros((count, len(self.task.observation_bounds()[0])))
-        self.terminations, self.truncations, self.reached = np.zeros((3, count), dtype=np.bool_)
+        self.rewards, self.errors = zeros((2, count), dtype)
+        self.observations = zeros((count, len(self.task.observation_bounds()[0])), dtype)
+        self.terminations, self.truncations, self.reached = zeros((3, count), np.bool_)
+        if self._on_device:
+            self._remember_starts()
         if not self._source.has_sensor_errors:
             self._observe()
+
+    def _require_device_support(self, config: EpisodeConfig, in_lanes: bool) -> None:
+        kind, source = config.kind, self._source
+        draws_together = self._goals_of_scenario or kind.random_goals is not Task.random_goals
+        for part, given in {
+            "single environments; use gymnasium.make_vec": not in_lanes,
+            "sensor errors": source.has_sensor_errors,
+            "actuator faults, on/off thrusters, disturbances, orbits and tables": (
+                source.needs_plants
+            ),
+            f"task '{config.task}', which has no random_goals": not draws_together,
+            f"task '{config.task}', which has a start of its own": kind.start is not Task.start,
+        }.items():
+            if given:
+                raise ParameterError(
+                    f"Argument 'device' is '{config.device}', but devices do not support {part}."
+                )
+
+    def _remember_starts(self) -> None:
+        """Let each robot begin like the scenario or a draw of its own, for all later episodes."""
+        every = np.arange(len(self.goals))
+        starts = self._source.first(len(every), self.flights)
+        which = every % len(starts)
+        masses = [each.inertial for each in starts if each.inertial is not None]
+        inertial = InertialParameters.stacked(masses)[which] if masses else None
+        self.flights.reset(every, joined_rows([each.states for each in starts])[which], inertial)
+        self.flights.remember_starts()
+        if self._goals_of_scenario:
+            goals = np.array([self.task.goal_of(each.scenario) for each in starts])[which]
+            self._first_goals = self._arrays.asarray(goals)
 
     def _apply(self, config: EpisodeConfig) -> None:
         self._weights = self.task.weights.of(config.reward)
@@ -352,12 +409,13 @@ class Episodes:
 
     def begin(
         self,
-        rows: Sequence[int] | Counts,
-        generators: Sequence[np.random.Generator],
+        rows: Any,
+        generators: Any,
         goal: Any = None,
         start: Any = None,
     ) -> None:
-        """Restart the episodes in some rows, given the random generators of all rows.
+        """Restart the episodes in some rows, given the random generators of all rows, or the one
+        of a device.
 
         ``goal``, either (goal_size,) for all rows or (N, goal_size) with one goal per row,
         overrides the drawn goals. ``start``, either one dictionary for all rows or one per row,
@@ -368,8 +426,13 @@ class Episodes:
         ParameterError
             A draw, the goal or the start is invalid.
         """
-        chosen, task = np.asarray(rows, dtype=np.int64), self.task
         goals = None if goal is None else self._checked_goals(goal)
+        if self._on_device:
+            if start is not None:
+                raise ParameterError("Environments on a device take no option 'start': omit it.")
+            self._begin_on_device(rows, generators, goals)
+            return
+        chosen, task = np.asarray(rows, dtype=np.int64), self.task
         changes = None if start is None else self._checked_starts(start)
         self._generators, numbers = generators, chosen.tolist()
         own = [generators[row] for row in numbers]
@@ -398,6 +461,17 @@ class Episodes:
         else:
             self.goals[chosen] = task.random_goals(self._states[chosen], self.spread, own)
         self._observe(chosen)
+
+    def _begin_on_device(self, rows: Any, rng: Any, goals: Array | None) -> None:
+        starts = rng.integers(0, len(self.goals), size=len(rows))
+        self.flights.restart(rows, starts)
+        if goals is not None:
+            self.goals[rows] = self._arrays.asarray(goals)[rows]
+        elif self._goals_of_scenario:
+            self.goals[rows] = self._first_goals[starts]
+        else:
+            self.goals[rows] = self.task.random_goals(self._states[rows], self.spread, rng)
+        self._observe(rows)
 
     def _checked_starts(self, start: Any) -> list[dict[str, Array]]:
         count, n = len(self.goals), self.robot.n
@@ -448,12 +522,16 @@ class Episodes:
             The shape is wrong, or an action is not finite.
         """
         flights, task, wanted = self.flights, self.task, (len(self.goals), len(self.taken))
-        shares = as_numbers(actions, "The array of actions", CommandError)
+        if self._arrays is np:
+            shares: Any = as_numbers(actions, "The array of actions", CommandError)
+        else:
+            shares = self._arrays.asarray(actions, dtype=self.observations.dtype)
         if shares.shape != wanted:
             raise CommandError(f"The actions have shape {shares.shape}, not {wanted}.")
         under_way, errors = flights.has_not_ended.copy(), self.errors.copy()
-        before, after = self._states[np.arange(len(shares))], self._states  # The former is a copy.
-        flights.step(command_of(shares, self.scale, self.taken), self._config.hold)
+        # The former is a copy.
+        before, after = self._states[self._arrays.arange(len(shares))], self._states
+        flights.step(command_of(shares, self._scale, self._taken), self._config.hold)
         # Robots that stand still are not measured: they take no random numbers.
         self._observe(np.flatnonzero(under_way) if self._source.has_sensor_errors else slice(None))
         alive = flights.has_not_ended

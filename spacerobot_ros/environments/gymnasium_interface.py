@@ -29,13 +29,15 @@ def _prepare(
     if render_mode not in (None, "rgb_array"):
         # Libraries make environments without one after this type of error.
         raise TypeError(f"There is no render_mode '{render_mode}': use 'rgb_array', or omit it.")
+    if render_mode and arguments.get("device"):
+        raise TypeError("Environments on a device have no pictures: omit render_mode.")
     episodes = Episodes(EpisodeConfig.of(arguments), count, in_lanes=lanes)
     environment.episodes, environment.render_mode = episodes, render_mode
     fps = {"render_modes": ["rgb_array"], "render_fps": 1.0 / episodes.step_duration}
     environment.metadata = {**environment.metadata, **fps}
-    low, high = episodes.task.observation_bounds()
-    actions = Box(-1.0, 1.0, (len(episodes.taken),), dtype=np.float64)
-    return Box(low, high, dtype=np.float64), actions
+    dtype = episodes.observations.dtype.type
+    low, high = (bound.astype(dtype) for bound in episodes.task.observation_bounds())
+    return Box(low, high, dtype=dtype), Box(-1.0, 1.0, (len(episodes.taken),), dtype=dtype)
 
 
 def _begin_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -128,7 +130,8 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     """Many robots in SIMD lanes, with the same episodes as :class:`SpaceRobotEnv`.
 
     With seed s, lane i has the same episodes as a single environment with seed s + i. A copy
-    (also by pickling) has the same arguments but a new state.
+    (also by pickling) has the same arguments but a new state. On a device, all arrays are those of
+    the device, one generator serves all robots, and ``final_obs`` is one array.
 
     Parameters
     ----------
@@ -159,11 +162,17 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         self.metadata["autoreset_mode"] = self.autoreset_mode
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        seeded = [np_random(None) for _ in range(num_envs)]
-        self._generators = [generator for generator, _ in seeded]
-        self._seeds = [seed for _, seed in seeded]
-        self._begun = np.zeros(num_envs, dtype=np.bool_)
-        self._ended = np.zeros(num_envs, dtype=np.bool_)
+        self._arrays = self.episodes.flights.arrays
+        self._on_device = bool(arguments.get("device"))
+        self._generators: Any = []
+        if self._on_device:
+            self._seed_device(None)
+        else:
+            seeded = [np_random(None) for _ in range(num_envs)]
+            self._generators = [generator for generator, _ in seeded]
+            self._seeds = [seed for _, seed in seeded]
+        self._begun = self._arrays.zeros(num_envs, dtype=np.bool_)
+        self._ended = self._arrays.zeros(num_envs, dtype=np.bool_)
         """Episodes that have ended and have not been restarted."""
 
     @property
@@ -173,8 +182,8 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:
-        """Random generators of the robots."""
-        return tuple(self._generators)
+        """Random generators of the robots; on a device, the generator for all."""
+        return (self._generators,) if self._on_device else tuple(self._generators)
 
     def reset(
         self,
@@ -187,17 +196,22 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         Options ``goal`` and ``start``, each given once for all robots or once per robot, override
         the drawn values.
         """
-        mask, begin = np.ones(self.num_envs, dtype=np.bool_), _begin_options(options)
+        mask, begin = self._arrays.ones(self.num_envs, dtype=np.bool_), _begin_options(options)
         if options is not None and "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"])
+            mask = self._arrays.asarray(options["reset_mask"])
             if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
                 raise ValueError(
                     f"options['reset_mask'] must be {self.num_envs} booleans, at least one true."
                 )
-        seeds, rows = _seeds_of(seed, self.num_envs), np.flatnonzero(mask)
-        for row in rows.tolist():
-            if (own := seeds[row]) is not None:
-                self._generators[row], self._seeds[row] = np_random(own)
+        rows = self._arrays.flatnonzero(mask)
+        if self._on_device:
+            if seed is not None:
+                self._seed_device(seed)
+        else:
+            seeds = _seeds_of(seed, self.num_envs)
+            for row in rows.tolist():
+                if (own := seeds[row]) is not None:
+                    self._generators[row], self._seeds[row] = np_random(own)
         self._begin(rows, **begin)
         self._begun |= mask
         return self.episodes.observations.copy(), self._info(mask)
@@ -215,7 +229,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
                 f"{int(self._ended.sum())} episodes have ended: reset them with "
                 "options['reset_mask'] before the next step."
             )
-        again = np.flatnonzero(self._ended)
+        again = self._arrays.flatnonzero(self._ended)
         if again.size:
             episodes.flights.end(again)
         episodes.step(actions)
@@ -227,13 +241,12 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
             infos = {"is_success": episodes.reached & ended, "_is_success": ended.copy()}
         self._ended = ended.copy()
         if mode is AutoresetMode.SAME_STEP and ended.any():
-            last, rows = np.full(self.num_envs, None, dtype=object), np.flatnonzero(ended)
-            for row in rows.tolist():
-                last[row] = episodes.observations[row].copy()
+            rows = self._arrays.flatnonzero(ended)
+            last = self._last_observations(rows)
             infos = {"final_info": infos | self._info(ended), "_final_info": ended.copy()}
             infos |= {"final_obs": last, "_final_obs": ended.copy()}
             self._begin(rows)
-        infos |= self._info(np.ones(self.num_envs, dtype=np.bool_))
+        infos |= self._info(self._arrays.ones(self.num_envs, dtype=np.bool_))
         results = episodes.rewards, episodes.terminations, episodes.truncations
         return episodes.observations.copy(), *results, infos
 
@@ -252,6 +265,20 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     def set_attr(self, name: str, values: Any) -> None:
         """Change an attribute of all robots; see `Episodes.change`."""
         self.episodes.change(name, values)
+
+    def _seed_device(self, seed: Any) -> None:
+        (checked,) = _seeds_of(seed if seed is None else [seed], 1)
+        self._seeds = [np_random(checked)[1]]
+        self._generators = self._arrays.random.default_rng(self._seeds[0])
+
+    def _last_observations(self, rows: Any) -> Any:
+        seen = self.episodes.observations
+        if self._on_device:
+            return seen.copy()
+        last = np.full(self.num_envs, None, dtype=object)
+        for row in rows.tolist():
+            last[row] = seen[row].copy()
+        return last
 
     def _begin(self, rows: Any, **options: Any) -> None:
         self.episodes.begin(rows, self._generators, **options)

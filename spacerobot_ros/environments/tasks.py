@@ -1,8 +1,9 @@
 """Environment tasks: goals, observations, rewards, episode ends, and the commands for actions.
 
 All functions take the states of N robots at once, so the same code can observe one robot in a
-plant, many robots in lanes, or a robot controlled through ROS topics. A custom task is a class
-derived from :class:`Task`.
+plant, many robots in lanes, or a robot controlled through ROS topics. NumPy's functions work on
+arrays of a device, too, and return such arrays; constants go there by ``np.asarray(constant,
+like=array)``. A custom task is a class derived from :class:`Task`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ _MIN_SHARE_OF_MOTION = 1e-7
 """Directions with singular values below this fraction of the largest are treated as immovable."""
 
 Flags = npt.NDArray[np.bool_]
-Generators = Sequence[np.random.Generator]
+Generators = Sequence[np.random.Generator] | Any
+"""A generator for each robot, or the generator of a device for all."""
 
 LARGEST_OBSERVATION = 1e6
 """Bound for observed quantities that have no other bound; observations are clipped to this
@@ -171,7 +173,8 @@ class Task(ABC):
         """Return a random goal (goal_size,) for one robot at its start."""
 
     def random_goals(self, starts: RobotStates, spread: float, rngs: Generators) -> Array:
-        """Return random goals (N, goal_size) for N robots, each from its own generator."""
+        """Return random goals (N, goal_size) for N robots, each from its own generator; on a
+        device, all from one."""
         each = (self.random_goal(starts[i : i + 1], spread, rng) for i, rng in enumerate(rngs))
         return np.array(list(each))
 
@@ -215,27 +218,28 @@ class Task(ABC):
 
     def errors(self, remaining: Array) -> Array:
         """Return the error magnitudes (N,)."""
-        return np.asarray(np.linalg.norm(remaining, axis=1))
+        return np.linalg.norm(remaining, axis=1)
 
     def reached(self, states: RobotStates, errors: Array, tolerance: float) -> Flags:
         """Return which goals are reached (N,); a reached goal ends its episode."""
-        return np.asarray(errors <= tolerance)
+        return errors <= tolerance
 
     def failed(self, states: RobotStates, goals: Array) -> Flags:
         """Return which episodes fail (N,), apart from those whose flights cannot continue."""
-        return np.zeros(len(states.q), dtype=np.bool_)
+        return np.zeros_like(states.pose[:, 0], dtype=np.bool_)
 
     def reward(self, step: Step, weights: Any) -> Array:
         """Return the rewards (N,) for a step."""
         reward = weights.progress * (step.errors_before - step.errors)
         square = np.mean(step.actions**2, axis=1)
         reward -= step.duration * (weights.time + weights.action * square)
-        return np.asarray(reward + weights.reached * step.reached - weights.failed * step.failed)
+        return reward + weights.reached * step.reached - weights.failed * step.failed
 
     def observe(self, states: RobotStates, remaining: Array) -> Array:
         """Return observations: remaining error, q, qdot and base twist."""
-        parts = [remaining, states.q, states.qdot, states.twist]
-        return np.clip(np.concatenate(parts, axis=1), *self.observation_bounds())
+        seen = np.concatenate([remaining, states.q, states.qdot, states.twist], axis=1)
+        bounds = (np.asarray(x, seen.dtype, like=seen) for x in self.observation_bounds())
+        return np.clip(seen, *bounds)
 
     def observation_bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the observations (error_size + 2 n + 6,)."""
@@ -252,8 +256,10 @@ class _DrawnTogether(Task):
         return np.asarray(self.random_goals(start[:1], spread, [rng])[0])
 
 
-def _directions_and_shares(rngs: Generators) -> tuple[Array, Array]:
+def _directions_and_shares(rngs: Generators, count: int) -> tuple[Array, Array]:
     """Return random vectors (N, 3), even in all directions, and numbers (N, 1) from 0 to 1."""
+    if not isinstance(rngs, Sequence):
+        return rngs.standard_normal((count, 3)), rngs.random((count, 1))
     drawn = np.array([(*rng.standard_normal(3), rng.random()) for rng in rngs])
     return drawn[:, :3], drawn[:, 3:]
 
@@ -283,7 +289,8 @@ class Reorient(_DrawnTogether):
     def random_goals(self, starts: RobotStates, spread: float, rngs: Generators) -> Array:
         """Return attitudes within ``spread`` rad of the starts; planar robots rotate in their
         plane."""
-        axes, (turns, shares) = self._directions, _directions_and_shares(rngs)
+        turns, shares = _directions_and_shares(rngs, len(starts.pose))
+        axes = np.asarray(self._directions, like=turns)
         if len(axes) == 1:
             turns = axes[0] * np.copysign(1.0, turns[:, :1])
         turns = spread * shares * turns / np.linalg.norm(turns, axis=1, keepdims=True)
@@ -338,20 +345,21 @@ class Reach(_DrawnTogether):
         """Return positions within ``spread`` m of the initial link positions, in the directions in
         which the links can move.
         """
-        axes, (ways, shares) = self._directions, _directions_and_shares(rngs)
+        ways, shares = _directions_and_shares(rngs, len(starts.pose))
+        axes = np.asarray(self._directions, like=ways)
         if len(axes) < 3:
             R = matrices_from_quaternions(starts.pose[:, 3:])
             ways = np.einsum("nij,nj->ni", R, ways[:, : len(axes)] @ axes)
         distances = spread * shares ** (1 / len(axes))
         ways *= distances / np.linalg.norm(ways, axis=1, keepdims=True)
-        return np.asarray(self.link_positions(starts) + ways)
+        return self.link_positions(starts) + ways
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
         """Return the displacements (N, 3), m, from link to goal, in B."""
         R = matrices_from_quaternions(states.pose[:, 3:])
         of_base = np.einsum("nji,nj->ni", R, goals - states.pose[:, :3])
         assert states.link_r is not None
-        return np.asarray(of_base - states.link_r)
+        return of_base - states.link_r
 
     def goal_of(self, scenario: Scenario) -> Array:
         """Return the link's goal position; see :meth:`Task.goal_of`."""
@@ -372,7 +380,7 @@ class Reach(_DrawnTogether):
         """Return the link positions in W (N, 3), m."""
         R = matrices_from_quaternions(states.pose[:, 3:])
         assert states.link_r is not None
-        return np.asarray(states.pose[:, :3] + np.einsum("nij,nj->ni", R, states.link_r))
+        return states.pose[:, :3] + np.einsum("nij,nj->ni", R, states.link_r)
 
 
 TASKS: Registry[Task] = Registry(
@@ -409,7 +417,7 @@ def command_of(actions: Any, scale: Array, taken: Sequence[int] | npt.NDArray[np
 
     ``taken`` are the command entries set by actions; the others are zero.
     """
-    shares = np.asarray(actions, dtype=float)
-    commands = np.zeros((len(shares), len(scale)))
+    shares = actions if hasattr(actions, "ndim") else np.asarray(actions, dtype=float)
+    commands = np.zeros_like(scale, shape=(len(shares), len(scale)))
     commands[:, taken] = np.clip(shares, -1.0, 1.0) * scale[taken]
     return commands

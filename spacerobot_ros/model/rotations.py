@@ -38,11 +38,13 @@ def cross(a: Array, b: Array) -> Array:
     return product
 
 
-def _components(quaternion: npt.ArrayLike) -> Any:
-    """Return the numbers x, y, z and w of a quaternion, or their arrays (...) of many (4, ...)."""
-    values = np.asarray(quaternion, dtype=float)
+def _components(quaternion: Any) -> Any:
+    """Return the numbers x, y, z and w of a quaternion (4,), or their arrays (...) of many (...,
+    4), which may be on a device."""
+    if getattr(quaternion, "ndim", 1) > 1:
+        return [quaternion[..., k] for k in range(4)]
     # Arithmetic of Python's numbers is the same to the last bit, and several times faster.
-    return values.tolist() if values.ndim == 1 else values
+    return np.asarray(quaternion, dtype=float).tolist()
 
 
 def matrix_about_axis(axis: npt.ArrayLike, angle: float) -> Array:
@@ -80,21 +82,22 @@ def rpy_from_matrix(R: npt.ArrayLike) -> Array:
 
 def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
-    x, y, z, w = _components(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array(_rows_from_quaternion(*_components(quaternion)))
 
 
 def matrices_from_quaternions(quaternions: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    axes = tuple(range(quaternions.ndim))
-    matrices = matrix_from_quaternion(quaternions.transpose(axes[-1], *axes[:-1]))
-    return matrices.transpose(*(axis + 1 for axis in axes[1:]), 0, 1)
+    rows = _rows_from_quaternion(*(quaternions[..., k] for k in range(4)))
+    entries = np.stack([entry for row in rows for entry in row])
+    return np.moveaxis(entries.reshape(3, 3, *quaternions.shape[:-1]), (0, 1), (-2, -1))
+
+
+def _rows_from_quaternion(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
@@ -103,21 +106,21 @@ def quaternion_multiply(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
 
     If either is an array (N, 4), so is the product.
     """
-    ax, ay, az, aw = _components(np.asarray(a, dtype=float).T)
-    bx, by, bz, bw = _components(np.asarray(b, dtype=float).T)
-    return np.array(
-        [
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ]
-    ).T
+    ax, ay, az, aw = _components(a)
+    bx, by, bz, bw = _components(b)
+    product = [
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    ]
+    return np.array(product) if isinstance(product[0], float) else np.stack(product).T
 
 
 def quaternion_inverse(quaternion: npt.ArrayLike) -> Array:
     """Return the inverse of unit quaternions (..., 4)."""
-    return np.asarray(quaternion, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
+    values: Any = quaternion if hasattr(quaternion, "ndim") else np.asarray(quaternion, dtype=float)
+    return values * np.asarray((-1.0, -1.0, -1.0, 1.0), values.dtype, like=values)
 
 
 def quaternion_from_rotvec(rotvec: npt.ArrayLike) -> Array:

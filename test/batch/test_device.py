@@ -103,6 +103,10 @@ class _CupyError(Exception):
     """Raised by CuPy's runtime."""
 
 
+class _FullError(MemoryError):
+    """Raised by CuPy if the memory of a device is full."""
+
+
 def cupy_with(devices: int | str) -> Any:
     """Return what stands for CuPy on a machine with so many devices, or without a driver."""
 
@@ -117,8 +121,18 @@ def cupy_with(devices: int | str) -> Any:
         runtimeGetVersion=lambda: 12090,
         getDeviceProperties=lambda number: {"name": f"card {number}".encode()},
     )
-    device = SimpleNamespace(mem_info=(8 * 2**30, 2**33))
-    return SimpleNamespace(cuda=SimpleNamespace(runtime=runtime, Device=lambda number: device))
+
+    def zeros(shape: tuple[int, ...], dtype: Any) -> None:
+        raise _FullError(f"Out of memory allocating {np.prod(shape)} numbers")
+
+    device = SimpleNamespace(mem_info=(8 * 2**30, 2**33), use=lambda: None)
+    cuda = SimpleNamespace(
+        runtime=runtime,
+        Device=lambda number: device,
+        driver=SimpleNamespace(CUDADriverError=_CupyError),
+        memory=SimpleNamespace(OutOfMemoryError=_FullError),
+    )
+    return SimpleNamespace(cuda=cuda, zeros=zeros)
 
 
 @pytest.mark.parametrize(
@@ -138,6 +152,16 @@ def test_a_device_that_is_not_there_is_refused_in_one_sentence(
     with pytest.raises(SpaceRobotError) as refusal:
         device_named(name)
     assert str(refusal.value).startswith(sentence)
+
+
+def test_a_device_that_is_full_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cupy", cupy_with(1))
+    with pytest.raises(SpaceRobotError) as refusal:
+        device_named("cuda").zeros((10, 20))
+    assert str(refusal.value) == (
+        "CUDA device 0 failed (Out of memory allocating 200 numbers): if its memory is too small, "
+        "use fewer robots."
+    )
 
 
 def test_devices_have_names(monkeypatch: pytest.MonkeyPatch) -> None:
