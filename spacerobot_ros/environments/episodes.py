@@ -307,7 +307,7 @@ class Episodes:
         self.goals = zeros((count, self.task.goal_size), dtype)
         self.goals[:, -1] = 1.0
         self._sensors = self._source.nominal.sensors[every]
-        self._generators: Sequence[np.random.Generator] = ()
+        self._generators: Any = ()
         self.step_duration = config.hold * plant.control_period
         self.rewards, self.errors = zeros((2, count), dtype)
         self.observations = zeros((count, len(self.task.observation_bounds()[0])), dtype)
@@ -322,7 +322,7 @@ class Episodes:
         draws_together = self._goals_of_scenario or kind.random_goals is not Task.random_goals
         for part, given in {
             "single environments; use gymnasium.make_vec": not in_lanes,
-            "sensor errors": source.has_sensor_errors,
+            "sensor errors of links": source.has_sensor_errors and kind.has_link,
             "actuator faults, on/off thrusters, disturbances, orbits and tables": (
                 source.needs_plants
             ),
@@ -343,6 +343,10 @@ class Episodes:
         inertial = InertialParameters.stacked(masses)[which] if masses else None
         self.flights.reset(every, joined_rows([each.states for each in starts])[which], inertial)
         self.flights.remember_starts()
+        sensors = joined_rows([each.sensors for each in starts])[which]
+        parts = (self._arrays.asarray(getattr(sensors, x.name)) for x in fields(SensorErrors))
+        self._first_sensors = SensorErrors(*parts)
+        self._sensors = self._first_sensors[self._arrays.arange(len(every))]
         if self._goals_of_scenario:
             goals = np.array([self.task.goal_of(each.scenario) for each in starts])[which]
             self._first_goals = self._arrays.asarray(goals)
@@ -463,8 +467,9 @@ class Episodes:
         self._observe(chosen)
 
     def _begin_on_device(self, rows: Any, rng: Any, goals: Array | None) -> None:
-        starts = rng.integers(0, len(self.goals), size=len(rows))
+        self._generators, starts = rng, rng.integers(0, len(self.goals), size=len(rows))
         self.flights.restart(rows, starts)
+        assign_rows(self._sensors, rows, self._first_sensors[starts])
         if goals is not None:
             self.goals[rows] = self._arrays.asarray(goals)[rows]
         elif self._goals_of_scenario:
@@ -533,7 +538,8 @@ class Episodes:
         before, after = self._states[self._arrays.arange(len(shares))], self._states
         flights.step(command_of(shares, self._scale, self._taken), self._config.hold)
         # Robots that stand still are not measured: they take no random numbers.
-        self._observe(np.flatnonzero(under_way) if self._source.has_sensor_errors else slice(None))
+        measured = self._arrays.flatnonzero(under_way)
+        self._observe(measured if self._source.has_sensor_errors else slice(None))
         alive = flights.has_not_ended
         reached = alive & task.reached(after, self.errors, self.tolerance)
         failed = (under_way & ~alive) | (alive & ~reached & task.failed(after, self.goals))
@@ -554,11 +560,15 @@ class Episodes:
             remaining = self.task.remaining(states, goals)
         self.observations[rows] = self.task.observe(states, remaining)
 
-    def _measured(self, states: RobotStates, rows: Counts) -> RobotStates:
+    def _measured(self, states: RobotStates, rows: Any) -> RobotStates:
         size = 12 + 2 * self.robot.n
-        normals = [self._generators[row].standard_normal(size) for row in rows.tolist()]
+        if self._on_device:
+            normals = self._generators.standard_normal((len(rows), size))
+        else:
+            each = [self._generators[row].standard_normal(size) for row in rows.tolist()]
+            normals = np.array(each)
         parts = states.pose, states.twist, states.q, states.qdot
-        measured = self._sensors[rows].measure(np.array(normals), *parts)
+        measured = self._sensors[rows].measure(normals, *parts)
         if not self._link:
             return RobotStates(*measured)
         places = self.robot.function("link_poses")(measured[2].T)[1].full()

@@ -151,6 +151,34 @@ def test_random_goals_on_a_device_are_within_their_spread(device: str) -> None:
     assert 0.05 < on_host(infos["error"]).max() <= 0.1
 
 
+@needs_compiler
+def test_sensors_err_on_a_device(device: str, tmp_path: Path) -> None:
+    """By the noise of all and the bias of each draw; rewards are of the true states."""
+    file = tmp_path / "chain.yaml"
+    noise = "set: {plant.sensors.joint_noise: 0.02}"
+    biased = "plant.sensors.velocity_noise: {uniform: [0.0, 0.1]}"
+    chosen = CAMPAIGN.replace("  seed: 1\n", f"  seed: 1\n  {noise}\n")
+    file.write_text(f"{chosen}    {biased}\n", encoding="utf-8")
+    vector = gymnasium.make_vec(ARM, 400, campaign=str(file), device=device, time_limit=0.05)
+    inner = vector.unwrapped.episodes
+    vector.reset(seed=3)
+    actions = inner.flights.arrays.asarray(np.zeros(vector.action_space.shape))
+    errors, velocities = [], []
+    for _ in range(12):
+        seen, _, _, _, infos = vector.step(actions)
+        flights, n = inner.flights, inner.robot.n
+        q, twist = on_host(flights.q), on_host(flights.twist)
+        errors.append(on_host(seen)[:, 3 : 3 + n] - q)
+        velocities.append(np.std(on_host(seen)[:, 3 + 2 * n :][:, :3] - twist[:, :3]))
+        remaining = inner.task.remaining(inner.flights, inner.goals)
+        np.testing.assert_allclose(
+            on_host(infos["error"]), np.linalg.norm(on_host(remaining), axis=1), rtol=1e-9
+        )
+    assert len({each[0, 0] for each in errors}) == 12
+    assert abs(np.std(errors) / 0.02 - 1.0) < 5.0 / np.sqrt(2 * np.size(errors))
+    assert 0.01 < np.mean(velocities) < 0.1
+
+
 class Alone(Reorient):
     """Draws its goals one by one."""
 
@@ -161,7 +189,7 @@ class Alone(Reorient):
 @pytest.mark.parametrize(
     ("name", "arguments", "part"),
     [
-        (ARM, {"scenario": "noisy"}, "sensor errors"),
+        (REACH, {"scenario": "noisy"}, "sensor errors of links"),
         (ARM, {"scenario": "servicer_thrusters"}, "actuator faults, on/off thrusters, dist"),
         (OWN, {"task": Alone}, "task 'alone', which has no random_goals"),
     ],
@@ -171,7 +199,7 @@ def test_what_devices_do_not_support_is_refused(
 ) -> None:
     given = dict(arguments)
     if given.get("scenario") == "noisy":
-        given["scenario"] = "config/faults/noisy_sensors.yaml"
+        given |= {"scenario": "config/faults/noisy_sensors.yaml", "link": "mass_1"}
     with pytest.raises(ParameterError, match=f"'device' is 'host', but devices do not .* {part}"):
         gymnasium.make_vec(name, 2, device="host", **given)
 
