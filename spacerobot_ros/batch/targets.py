@@ -11,7 +11,7 @@ import ctypes
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -302,7 +302,7 @@ class _Kernels:
         return launch
 
 
-_DEVICE_NAME = re.compile(r"host|cuda(?::(\d{1,4}))?(:single)?")
+_DEVICE_NAME = re.compile(r"(?:host|cuda(?::(\d{1,4}))?)(:single)?")
 
 
 def is_device_name(name: str) -> bool:
@@ -312,8 +312,8 @@ def is_device_name(name: str) -> bool:
 
 def device_named(name: str) -> Target:
     """Return a device by name: ``cuda``, ``cuda:1`` (the second one), or ``cuda:single`` and
-    ``cuda:1:single``, which compute with 32-bit numbers. ``host`` is the program of a device on
-    this processor, for tests.
+    ``cuda:1:single``, which compute with 32-bit numbers. ``host`` and ``host:single`` are the
+    program of a device on this processor, for tests.
 
     Raises
     ------
@@ -325,9 +325,10 @@ def device_named(name: str) -> Target:
         raise ParameterError(
             f"There is no device '{name}': use cuda, cuda:1, cuda:single, cuda:1:single or host."
         )
-    if name == "host":
-        return THREADS_OF_HOST
-    return CudaDevice.of(int(found[1] or 0), single=bool(found[2]))
+    single = bool(found[2])
+    if name.startswith("host"):
+        return replace(THREADS_OF_HOST, single=single)
+    return CudaDevice.of(int(found[1] or 0), single=single)
 
 
 def _vector_source(functions: Sequence[ca.Function]) -> str:

@@ -528,9 +528,8 @@ class Episodes:
         """
         flights, task, wanted = self.flights, self.task, (len(self.goals), len(self.taken))
         if self._arrays is np:
-            shares: Any = as_numbers(actions, "The array of actions", CommandError)
-        else:
-            shares = self._arrays.asarray(actions, dtype=self.observations.dtype)
+            actions = as_numbers(actions, "The array of actions", CommandError)
+        shares = self._arrays.asarray(actions, dtype=self.observations.dtype)
         if shares.shape != wanted:
             raise CommandError(f"The actions have shape {shares.shape}, not {wanted}.")
         under_way, errors = flights.has_not_ended.copy(), self.errors.copy()
@@ -546,7 +545,8 @@ class Episodes:
         shares = np.clip(shares, -1.0, 1.0)
         done = (before, after, self.goals, shares, errors, self.errors, reached, failed)
         step = Step(*done, self.step_duration)
-        self.rewards = np.where(under_way, task.reward(step, self._weights), 0.0)
+        rewards = np.where(under_way, task.reward(step, self._weights), 0.0)
+        self.rewards = rewards.astype(self.errors.dtype, copy=False)
         self.reached, self.terminations = reached, reached | failed
         late = flights.time > self.time_limit - 0.5 * self.step_duration
         self.truncations = alive & late & ~self.terminations

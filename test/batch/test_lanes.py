@@ -154,6 +154,17 @@ def test_velocity_flights_in_lanes_are_those_of_the_plant(
     assert not here.fallback_ticks.any()
 
 
+@on_targets("threads")
+def test_flights_fit_into_memory_block_by_block(
+    robots: dict[str, SpaceRobot], target_name: str
+) -> None:
+    """Each block has its own seeds, masses, schedules and reports."""
+    flights = velocity_flights(robots["sliding_masses"], 19, each=True, deadband=0.0)
+    target = target_named(target_name)
+    small = dataclasses.replace(target, block_bytes=30_000)
+    assert_equal_flights(fly_lanes(flights, small), fly_lanes(flights, target), rtol=0.0)
+
+
 @on_targets()
 def test_effort_flights_in_lanes_are_those_of_the_plant(
     robots: dict[str, SpaceRobot], target_name: str

@@ -101,6 +101,26 @@ def test_steps_and_ends_on_a_device_are_those_in_lanes(
 
 
 @needs_compiler
+def test_single_precision_is_that_of_all_arrays() -> None:
+    """Steps differ from those with 64 bits by rounding."""
+    arguments = {"scenario": "planar_chain", "hold": 20}
+    seen = {}
+    for device in ("host", "host:single"):
+        vector = gymnasium.make_vec(ARM, 8, device=device, **arguments)
+        vector.reset(seed=1)
+        rng = np.random.default_rng(1)
+        for _ in range(10):
+            actions = rng.uniform(-0.2, 0.2, vector.action_space.shape)
+            observations, rewards, *_ = vector.step(actions)
+        seen[device] = observations
+        assert observations.dtype == rewards.dtype == vector.action_space.dtype
+        assert vector.observation_space.contains(observations)
+    assert seen["host:single"].dtype == np.float32
+    difference = np.abs(seen["host:single"] - seen["host"]).max()
+    assert 1e-9 < difference < 1e-4
+
+
+@needs_compiler
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
 def test_robots_restart_on_the_device(device: str, mode: str, tmp_path: Path) -> None:
     """Each episode begins at the start and goal of a draw, with its masses."""
