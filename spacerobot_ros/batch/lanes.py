@@ -287,7 +287,7 @@ class LaneBlock:
 
     def _fly_until(self, tick: int) -> None:
         self._tick.library.fly_until(self._job, tick)
-        while self._pending.any():
+        while self._tick.controller is not None and self._pending.any():
             self._command_outside_lanes()
             self._tick.library.fly_until(self._job, tick)
         self._note_failures()
