@@ -44,6 +44,9 @@ _PREDICTION_TOLERANCE = 0.02
 """Deviation (m and rad) of a target from its predicted motion beyond which the approach is
 replanned."""
 
+_AVERAGED = 100
+"""Measurements over which the momenta of a target are averaged."""
+
 
 class Task(str, Enum):
     """Controller tasks with a target, performed before a goal is pursued."""
@@ -95,7 +98,11 @@ _ACTIVE, _DONE = TaskProgress(TaskState.ACTIVE), TaskProgress(TaskState.DONE)
 
 
 class MeasuredTarget:
-    """Description and last measurement of the target; None: not received."""
+    """Description and last measurement of the target; None: not received.
+
+    The momenta of a free target are constant, so their average predicts its motion better than one
+    measurement: noise in a rate grows with the time of a prediction.
+    """
 
     def __init__(self) -> None:
         self.description: RobotDescription | None = None
@@ -106,10 +113,16 @@ class MeasuredTarget:
         """Motion of the target's root link."""
         self.time = -math.inf
         """Time of the measurement, s."""
+        self.forget_momenta()
+
+    def forget_momenta(self) -> None:
+        """Average the momenta from the next measurement on, because they have changed."""
+        self._count, self._momenta = 0, np.zeros(6)
 
     def describe(self, target: RobotDescription, grapple_frame: str) -> None:
         """Set the target description."""
         self.description = target
+        self.forget_momenta()
         try:
             self.body, self.why_unknown = TargetBody.of(target, grapple_frame), ""
         except RobotDescriptionError as error:
@@ -119,6 +132,24 @@ class MeasuredTarget:
         """Set the root link's pose (7,) and twist (6,) at a given time (s); the twist is in the
         link frame."""
         self.motion, self.time = BodyMotion.of(pose, twist), time
+        if self.body is not None:
+            self._count += 1
+            change = np.concatenate(self.motion.momenta(self.body.inertia)) - self._momenta
+            self._momenta += change / min(self._count, _AVERAGED)
+
+    @property
+    def has_new_average(self) -> bool:
+        """Whether the last measurement completes an average."""
+        return self._count > 0 and self._count % _AVERAGED == 0
+
+    def free_motion(self) -> TorqueFreeMotion:
+        """Return the predicted motion from the last measurement on, of a target with a body."""
+        assert self.body is not None
+        assert self.motion is not None
+        if self._count < 2:
+            return TorqueFreeMotion(self.body, self.motion)
+        averaged = self.motion.with_momenta(self.body.inertia, self._momenta)
+        return TorqueFreeMotion(self.body, averaged)
 
 
 _LATEST_BEGIN = 0.1
@@ -175,7 +206,7 @@ class ApproachTask:
             if controller.planner is not None:
                 self._plan_motion(time, state, controller, off=off, in_background=in_background)
             elif off:
-                self._make_plan(time, state, controller, target.body, target.motion)
+                self._make_plan(time, state, controller, target.body)
         except PlanningError as error:
             why = str(error).rstrip(".")
             return self._ended(f"{why[0].lower()}{why[1:]}")
@@ -232,12 +263,19 @@ class ApproachTask:
         return TaskProgress(TaskState.FAILED, f"The approach is aborted: {why}.")
 
     def _is_off_prediction(self, measured: BodyMotion) -> bool:
+        """Whether the target deviates from its prediction now, or would at contact."""
         assert self._predicted is not None
         assert self.target.body is not None
         elapsed = max(self.target.time - self._planned_at, 0.0)
         expected = self._predicted.grapple([elapsed]).body_motion()
-        off = RelativeMotion.between(expected, measured.at(self.target.body.grapple))
-        return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
+        if _is_off(expected, measured.at(self.target.body.grapple)):
+            self.target.forget_momenta()
+            return True
+        if not self.target.has_new_average or self._contact <= elapsed:
+            return False
+        expected = self._predicted.grapple([self._contact]).body_motion()
+        later = self.target.free_motion().grapple([self._contact - elapsed])
+        return _is_off(expected, later.body_motion())
 
     def _plan_motion(
         self,
@@ -253,10 +291,8 @@ class ApproachTask:
         """
         options, target = self.config.target, self.target
         if self._job is None and off:
-            assert target.body is not None
-            assert target.motion is not None
             grapple = Grapple(
-                TorqueFreeMotion(target.body, target.motion).later(max(time - target.time, 0.0)),
+                target.free_motion().later(max(time - target.time, 0.0)),
                 target.description,
                 options.clearance,
                 options.horizon,
@@ -298,7 +334,6 @@ class ApproachTask:
         state: ControlState,
         controller: CoordinatedController,
         body: TargetBody,
-        measured: BodyMotion,
     ) -> None:
         law, options, described = controller.law, self.config.target, self.target.description
         outputs, clearance = law.outputs.selection, None
@@ -313,7 +348,7 @@ class ApproachTask:
                 body.grapple,
                 options.clearance,
             )
-        target, rates = TorqueFreeMotion(body, measured), controller.joint_rate_limits.rates
+        target, rates = self.target.free_motion(), controller.joint_rate_limits.rates
         axes = outputs.end_effector
         reach = ArmReach(law.robot, outputs.end_effector_link, axes, state, rates)
         plan = plan_approach(target, held, options, self.config.motion, reach, axes, clearance)
@@ -334,6 +369,11 @@ class ApproachTask:
         names = ("starts_s", "closes_s", "contact_s")
         about = {name: f"{time:.9g}" for name, time in zip(names, times, strict=True)}
         self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about | (more or {})))
+
+
+def _is_off(expected: BodyMotion, found: BodyMotion) -> bool:
+    off = RelativeMotion.between(expected, found)
+    return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
 
 
 class DetumblingTask:

@@ -213,6 +213,13 @@ class BodyMotion:
         moving = self.at(Pose(r=inertia.com))
         return inertia.mass * moving.v, self.R_WT @ inertia.about_com @ self.R_WT.T @ self.omega
 
+    def with_momenta(self, inertia: Inertia, momenta: Array) -> BodyMotion:
+        """Return the motion from the same pose with other :meth:`momenta` (6,), linear first."""
+        R = self.R_WT
+        omega = R @ np.linalg.solve(inertia.about_com, R.T @ momenta[3:])
+        v = momenta[:3] / inertia.mass - cross(omega, R @ inertia.com)
+        return BodyMotion(R, self.r_WT, v, omega)
+
 
 @dataclass(frozen=True)
 class RelativeMotion:

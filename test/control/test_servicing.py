@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.executive_loop import (
     AIM,
     PERIOD,
@@ -19,6 +21,7 @@ from support.executive_loop import (
     planar_manipulator,
 )
 from support.sentences import assert_one_sentence
+from support.thrust_flights import tumbled
 
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.servicing import MeasuredTarget, Task
@@ -26,7 +29,7 @@ from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model.description import Inertia
-from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.grasp import BodyMotion, Payload
 from spacerobot_ros.model.urdf import parse_robot
 
 URDF = """
@@ -402,6 +405,31 @@ def test_a_measured_target_has_its_twist_in_the_world() -> None:
     assert target.motion is not None
     np.testing.assert_allclose(target.motion.v, [0, 1, 0], atol=1e-15)
     np.testing.assert_allclose(target.motion.omega, [-2, 0, 0], atol=1e-15)
+
+
+def test_a_noisy_target_is_predicted_from_the_average_of_its_momenta() -> None:
+    root = parse_robot(URDF.replace('ixx="1"', 'ixx="1.7"').replace('iyy="1"', 'iyy="1.3"'))
+    omega = np.array([0.03, -0.01, 0.04])
+    free = BodyMotion(np.eye(3), NEAR, np.array([0.002, -0.001, 0.003]), omega)
+    times = np.linspace(0.0, 32.0, 3201)
+    X, r = tumbled(root, free, times)
+    rates = [
+        (Rotation.from_quat(a).inv() * Rotation.from_quat(b)).as_rotvec() / 0.01
+        for a, b in pairwise(X)
+    ]
+    rng, target, late = np.random.default_rng(3), MeasuredTarget(), []
+    target.describe(root, "handle")
+    for k in range(200):
+        twist = np.concatenate([Rotation.from_quat(X[k]).inv().apply(free.v), rates[k]])
+        target.measure(times[k], np.concatenate([r[k], X[k]]), twist + 1e-3 * rng.normal(size=6))
+        (there,), (place,) = target.free_motion().body_poses([30.0])
+        turn = Rotation.from_quat(X[k + 3000]).inv() * Rotation.from_quat(there)
+        late.append([np.linalg.norm(place - r[k + 3000]), turn.magnitude()])
+    assert np.min(late[0]) > 0.015, "the test is sharp"
+    assert np.max(late[100:]) < 0.01
+    target.forget_momenta()
+    (_,), (place,) = target.free_motion().body_poses([30.0])
+    assert np.linalg.norm(place - r[3199]) > 0.02
 
 
 def test_a_status_tells_its_task() -> None:
