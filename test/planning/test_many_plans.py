@@ -231,6 +231,20 @@ def test_plans_to_random_goals_keep_clear(
             assert each.same
 
 
+@pytest.mark.slow
+def test_two_arms_keep_clear_where_all_solutions_without_clearance_collide(tmp_path: Path) -> None:
+    """Clear paths near any of the sixteen solutions in collision are not found either."""
+    robot = SpaceRobot.from_file(robot_file("dual_arm"))
+    start = np.zeros(robot.n)
+    clearance = Clearance(robot.description, CLEARANCE)
+    (goal,) = list(random_goals(robot, start, 23))[22:]
+    options = method_options("optimal", {"cache": 0, "base_position": 1})
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), start)
+    request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6, 1e-6))
+    schedule = OptimalGait(robot, 0.05, 0.01, options, clearance).plan(request)
+    assert Distances(robot, clearance, start, tmp_path).nearest(schedule) >= CLEARANCE - 1e-5
+
+
 @pytest.mark.study
 def test_clearance_costs_little_over_all_robots(rows_of_all: list[Row]) -> None:
     found = summary_of(rows_of_all)

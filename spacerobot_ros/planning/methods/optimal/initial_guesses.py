@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import casadi as ca
 import numpy as np
@@ -33,8 +33,9 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
 )
 
-_CANDIDATES_PER_GUESS = 24
-"""Number of random loops, of which the one closest to the goal becomes the guess."""
+_CANDIDATES_PER_GUESS, _CANDIDATES_PER_CLEAR_GUESS = 24, 240
+"""Number of random loops, of which the one closest to the goal becomes the guess; for clear ones,
+of which there are one in ten for two arms, more."""
 
 _MIN_LOOP_SIZE = 0.1
 """Smallest loop size on the path to a possible end shape, in half ranges of the joints, for all
@@ -76,8 +77,17 @@ class InitialGuesses:
         self._instants = np.linspace(0.0, 1.0, intervals + 1)
         self._angular_momentum = angular_momentum
 
-    def generate(self, boundary: BoundaryConditions, limits: MotionLimits) -> Iterator[Trajectory]:
-        """Yield guesses that end in the likely shape, or in each possible end shape in turn."""
+    def generate(
+        self,
+        boundary: BoundaryConditions,
+        limits: MotionLimits,
+        is_clear: Callable[[Trajectory], bool] | None = None,
+    ) -> Iterator[Trajectory]:
+        """Yield guesses that end in the likely shape, or in each possible end shape in turn.
+
+        ``is_clear``: whether a guess keeps clear; then all do, unless none of their candidates
+        does.
+        """
         rng = np.random.default_rng(1)
         half = limits.joint_ranges(boundary.start)[1]
         likely = PossibleEnd(boundary.likely_final_shape, boundary.goal_rotation)
@@ -96,13 +106,15 @@ class InitialGuesses:
             size = max(sizes[place], _MIN_LOOP_SIZE if boundary.possible_ends and around else 0.0)
             rounds = [
                 size * rng.uniform(0.3, 1.5) * _loop(rng, self._instants, len(half))
-                for _ in range(_CANDIDATES_PER_GUESS)
+                for _ in range(_CANDIDATES_PER_CLEAR_GUESS if is_clear else _CANDIDATES_PER_GUESS)
             ]
             shapes = self._add_loops(np.array(rounds), boundary.start, final, limits)
             candidates = self._build_trajectories(shapes, limits)
             # The cosine of half the remaining angle.
             near = np.abs([each.quaternions[-1] @ turn for each in candidates])
-            yield candidates[int(near.argmax())]
+            nearest_first = [candidates[k] for k in np.argsort(-near, kind="stable")]
+            clear = (each for each in nearest_first if is_clear is None or is_clear(each))
+            yield next(clear, nearest_first[0])
 
     def generate_with_wheels(
         self,

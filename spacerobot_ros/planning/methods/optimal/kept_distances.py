@@ -186,6 +186,12 @@ class KeptDistances:
         turns /= np.linalg.norm(turns, axis=2, keepdims=True)
         return path.at_ticks(intervals * instants)[1:], turns.reshape(-1, 4)
 
+    def is_clear(self, path: Trajectory) -> bool:
+        """Whether no pair comes too close along a path."""
+        # Most paths that are not clear are not at their knots, which costs a fiftieth to find.
+        clearance = self._library.clearance
+        return clearance.is_clear(path.shapes, self._required) and not self.approaches_of(path)
+
     def approaches_of(self, path: Trajectory) -> list[Approach]:
         """Return the pairs that come too close along a path, nearest first."""
         shapes, turns = self.along(path)

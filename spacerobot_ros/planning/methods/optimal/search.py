@@ -114,7 +114,7 @@ the rest is for held commands. Without it, they need 1.3 to 2.3 times as long in
 _HELD_REACH_SHARE = 0.3
 """Fraction of the largest reach by which a clear path may change in a solution in whole ticks."""
 
-_CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR = 2.0, 1.2
+_CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR, _RECLEARED_TIME_FACTOR = 2.0, 1.2, 1.1
 """Duration of a path to be made clear, relative to the duration of a path in collision, and to that
 of a clear path on a coarse grid: slow joints leave room to move around obstacles."""
 
@@ -135,6 +135,10 @@ _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
 12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5, two arms took 40 s for the same
 plan."""
+
+_MAX_STALLED_ROUNDS, _STALLED_SHARE = 3, 0.9
+"""Number of paths in succession, on the way to a clear path, that still lack more than this share
+of the smallest lack before them: a path for two arms lacked 55 mm in twelve rounds."""
 
 _MIN_SHORTENING_ROUNDS = 3
 """Number of paths that are always tried on the way to a fast path."""
@@ -439,20 +443,23 @@ class _Search:
 
     # -- 1. guesses -------------------------------------------------------------------------------
 
-    def _guesses(self, grid: _Grid) -> Iterator[Trajectory]:
-        """Yield guesses on a grid without end, in the same order for equal problems."""
+    def _guesses(
+        self, grid: _Grid, is_clear: Callable[[Trajectory], bool] | None = None
+    ) -> Iterator[Trajectory]:
+        """Yield guesses on a grid without end, in the same order for equal problems; those that
+        are clear, if ``is_clear`` is given."""
         problem, source = self._problem, self._source(grid)
         boundary, limits, motion = problem.boundary, problem.limits, problem.motion
         if motion is not None:
             velocity = np.broadcast_to(boundary.velocity, boundary.start.shape)
             if len(motion.remaining) > 1:
                 yield source.from_ticks(motion.remaining, velocity, self._period)
-            for guess in source.generate(boundary, limits):
+            for guess in source.generate(boundary, limits, is_clear):
                 yield source.with_initial_velocity(guess, velocity, limits)
         if len(self._wheels) and len(self._model.axes):
             robot = self._model.robot
             yield from source.generate_with_wheels(self._wheels, boundary, limits, robot)
-        yield from source.generate(boundary, limits)
+        yield from source.generate(boundary, limits, is_clear)
 
     def _source(self, grid: _Grid) -> InitialGuesses:
         boundary, curvature = (
@@ -616,35 +623,38 @@ class _Search:
     def _other_paths(
         self, kept: KeptDistances, known: Trajectory
     ) -> Iterator[tuple[Trajectory, float]]:
-        """Yield other paths with the share of the largest reach in which clear ones are looked for:
-        solutions that need not keep clear, from guesses on a coarse grid, then guesses that keep
-        clear, but do not end at the goal.
+        """Yield other paths with the share of the largest reach in which clear ones are looked for,
+        by turns: guesses that keep clear, but do not end at the goal, and solutions that need not
+        keep clear, from guesses on a coarse grid.
         """
-        problem, grid = self._problem, self._coarse
+        problem = self._problem
         if problem.boundary.drifts and problem.motion is None:
             # A robot that drifts finds others sooner after it has coasted.
             return
-        costs = [problem.cost(known)]
         brakes = problem.motion is not None and not problem.boundary.drifts
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
         starts = min(problem.options.starts, most)
+        guesses = itertools.islice(self._guesses(self._coarse, kept.is_clear), starts)
+        clear = (each for each in guesses if kept.is_clear(each))
+        for pair in itertools.zip_longest(clear, self._other_solutions(known, starts)):
+            for path, reach in zip(pair, (_REACH_FROM_GUESS, 1.0), strict=True):
+                if self._is_over(found=False):
+                    return
+                if path is not None:
+                    yield path, reach
+
+    def _other_solutions(self, known: Trajectory, starts: int) -> Iterator[Trajectory]:
+        """Yield solutions from guesses on the coarse grid that differ from the known one."""
+        grid, costs = self._coarse, [self._problem.cost(known)]
         others = itertools.islice(self._guesses(grid), len(self._coarse_solutions), starts)
         solved = (self._solve_start(grid, guess) for guess in others)
         for solution in itertools.chain(self._coarse_solutions[:starts], solved):
-            if self._is_over(found=False):
-                return
             if solution is None:
                 continue
-            cost = problem.cost(solution)
+            cost = self._problem.cost(solution)
             if all(abs(cost - other) > _SAME_COST_TOLERANCE * other for other in costs):
                 costs.append(cost)
-                yield solution, 1.0
-        few = starts if brakes else problem.options.starts
-        for guess in itertools.islice(self._guesses(grid), few):
-            if self._is_over(found=False):
-                return
-            if not kept.approaches_of(guess):
-                yield guess, _REACH_FROM_GUESS
+                yield solution
 
     @property
     def _clears_coarsely(self) -> bool:
@@ -665,6 +675,7 @@ class _Search:
             path, reach = path.stretched(_RESAMPLED_TIME_FACTOR), 1.0
             duration = path.duration
             path, made = self._shorten(kept, grid, path, None)
+            duration = _RECLEARED_TIME_FACTOR * path.duration
         if made is None:
             path, made = self._clear(kept, grid, path, duration, reach)
             if options.duration == 0:
@@ -685,12 +696,17 @@ class _Search:
         around = Neighbourhood.within(self._problem.limits, reach, _LARGEST_LACK)
         near = kept.approaches_of(path)
         kept.add(near)
+        least, stalled = math.inf, 0
         for _ in range(_MAX_CLEARING_ROUNDS):
             path = self._solve_apart(kept, grid, path, duration, around)
             lack = self._lack
             near, made = self._approaches(kept, grid, path)
             if not near:
                 return path, made
+            stalled = stalled + 1 if lack > max(_STALLED_SHARE * least, _NO_LACK) else 0
+            least = min(least, lack)
+            if stalled >= _MAX_STALLED_ROUNDS:
+                break
             if grid != self._full and self._is_over(found=False):
                 break
             (kept.widen if lack < _NO_LACK else kept.add)(near)
@@ -719,8 +735,8 @@ class _Search:
                 reach /= _REACH_DIVISOR
                 kept.add(near)
                 if made is None and grid == self._full:
-                    # It is no path that is clear by its held commands, either.
-                    break
+                    # The path is not clear by its held commands, either, but this one is faster.
+                    return faster, None
                 continue
             gain = 1 - faster.duration / path.duration
             if gain > 0:
