@@ -16,6 +16,7 @@ from std_srvs.srv import Trigger
 from support.control_loop import TICK_NS, Loop
 from support.made_bags import array, joint_states, made_bag, odometry
 from support.odometry import pose_of, twist_of
+from support.planner_flight import values_of
 from support.plant_rig import Rig
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
@@ -56,10 +57,6 @@ def _interpreted() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SPACEROBOT_COMPILE", "0")
         yield
-
-
-def values_of(status: DiagnosticStatus) -> dict[str, str]:
-    return {pair.key: pair.value for pair in status.values}
 
 
 def events_of(rig: Rig) -> list[tuple[str, str]]:

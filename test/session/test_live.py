@@ -19,8 +19,6 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from nav_msgs.msg import Odometry
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
@@ -421,33 +419,6 @@ def test_momentum_against_the_momentum_in_motion(result: RunResult) -> None:
     assert result.summary["angular_momentum_drift"] <= 1e-12 * base_angular
 
 
-@pytest.mark.slow
-def test_every_message_opens_with_other_libraries(result: RunResult) -> None:
-    """rosbags and mcap-ros2-support decode the same messages, every one of them."""
-    path = Path(result.summary["bag"])
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
-        by_mcap = [(c.topic, m.log_time, d) for _, c, m, d in reader.iter_decoded_messages()]
-        assert summary.statistics.message_count == len(by_mcap)
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
-        by_rosbags = [
-            (c.topic, time, bag.deserialize(raw, c.msgtype)) for c, time, raw in bag.messages()
-        ]
-    assert len(by_mcap) == len(by_rosbags) == result.summary["messages_recorded"]
-    topics = {"/clock", "/odom", "/base_pose", "/joint_states", "/momentum", "/joint_commands"}
-    topics |= {"/goal_pose", "/gait_schedule", "/planned_path", "/planner/status", "/markers"}
-    topics |= {"/plant/status", "/events", "/tf"}
-    assert {topic for topic, _, _ in by_mcap} == topics | {"/diagnostics", "/robot_description"}
-
-    def positions(entries: list[tuple[str, int, Any]]) -> list[float]:
-        return [d.pose.pose.position.x for topic, _, d in entries if topic == "/odom"]
-
-    assert positions(by_mcap) == positions(by_rosbags)
-
-
 def test_nothing_is_lost_or_recorded_twice(result: RunResult) -> None:
     bag = read_bag(result.summary["bag"])
     ticks = result.summary["ticks"]
@@ -470,25 +441,14 @@ def test_bag_says_how_it_was_made(result: RunResult) -> None:
 
 
 def test_two_runs_are_the_same_to_the_last_message(tmp_path: Path) -> None:
-    from rclpy.serialization import deserialize_message
-
     bags = [tmp_path / f"{i}.mcap" for i in range(2)]
     for bag in bags:
         run_scenario(short(), bag)
-    first, second = (list(iterate_raw(bag)) for bag in bags)
-    assert len(first) == len(second) > 500
-    for a, b in zip(first, second, strict=True):
-        assert a[:4] == b[:4]
-        if a[4] != b[4]:  # Padding is not initialised; what is in it must be equal.
-            kind = message_class(a[1])
-            assert deserialize_message(a[4], kind) == deserialize_message(b[4], kind)
-
-
-def message_class(type_name: str) -> Any:
-    import importlib
-
-    package, _, name = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
+    first, second = ([each[:4] for each in iterate_raw(bag)] for bag in bags)
+    assert len(first) > 500
+    assert first == second
+    # Padding is not initialised, so that bytes may differ.
+    assert messages(bags[0]) == messages(bags[1])
 
 
 def test_unreachable_goal_is_summed_up_too(tmp_path: Path) -> None:
