@@ -7,21 +7,13 @@ import resource
 import signal
 from collections.abc import Callable, Iterator
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
-from mcap.reader import make_reader
+from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import JointState
 from support.nodes_apart import START, NodeProcess
 from support.ros_harness import Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
@@ -31,16 +23,7 @@ from spacerobot_ros.nodes import NODE_TYPES
 
 ROOT = Path(__file__).parents[2]
 
-TICK_NS = 50_000_000
 FAST = {"robot": "sliding_masses", "tick_rate": "20", "real_time_factor": "5.0"}
-GAIT = {
-    "method": "lie_bracket",
-    "lie_bracket.t1": "2.0",
-    "lie_bracket.n1": "1",
-    "lie_bracket.cycle_period": "1.0",
-}
-
-
 Start = Callable[..., NodeProcess]
 
 
@@ -130,86 +113,6 @@ def await_node(harness: Harness, probe: Probe, process: NodeProcess) -> None:
     assert process.process.poll() is None, process.said
     state = harness.call(client, GetState.Request()).current_state
     assert state.label == "active", process.said
-
-
-def goal(x: float) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = "world"
-    message.pose.position.x, message.pose.orientation.w = x, 1.0
-    return message
-
-
-def state_of(probe: Probe) -> str:
-    kept = probe.messages["planner/status"]
-    return next((v.value for v in kept[-1].values if v.key == "state"), "") if kept else ""
-
-
-def test_three_processes_fly_to_a_goal_and_record_it(
-    start: Start, harness: Harness, tmp_path: Path
-) -> None:
-    bag = tmp_path / "flight.mcap"
-    topics = {"odom": Odometry, "joint_states": JointState, "planner/status": DiagnosticStatus}
-    probe = harness.probe(topics, latched=("planner/status",))
-    goals = probe.create_publisher(PoseStamped, "goal_pose", 10)
-    recorder = start("recorder", {"bag": str(bag)})
-    planner = start("planner", GAIT)  # Its robot comes from the plant.
-    await_nodes(harness, probe, [recorder, planner])
-    plant = start("plant", FAST)
-    await_nodes(harness, probe, [plant])
-    harness.matched(goals, readers=2)  # Recorder and planner: the first alone would fly nothing.
-    harness.spin_until(
-        lambda: all(probe.count_subscribers(topic) >= 3 for topic in ("odom", "joint_states")),
-        "recorder, planner and probe listening to the plant",
-        timeout=START,
-    )
-    goals.publish(goal(0.05))
-    harness.spin_until(
-        lambda: state_of(probe) in ("reached", "failed", "refused"), "the goal", timeout=START
-    )
-    assert state_of(probe) == "reached", probe.last("planner/status").message
-    reached = probe.last("odom").pose.pose.position
-    assert abs(reached.x - 0.05) <= 1e-3
-
-    # Time stands still, and everything that was published arrives.
-    change = probe.create_client(ChangeState, "plant/change_state")
-    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-    assert harness.call(change, request).success
-    harness.settle(probe)
-    state = probe.create_client(GetState, "recorder/get_state")
-    for _ in range(3):
-        harness.call(state, GetState.Request())
-    for process in (recorder, plant, planner):
-        process.signal(signal.SIGINT)
-    for process in (recorder, plant, planner):
-        assert process.end() == 0, process.said
-        assert "Traceback" not in process.said
-
-    recorded = messages_of(bag)
-    heard = {topic: probe.messages[topic] for topic in ("odom", "joint_states")}
-    for topic, kept in heard.items():
-        stamps = [nanoseconds(m.header.stamp) for m in recorded[f"/{topic}"]]
-        assert set(np.diff(stamps)) == {TICK_NS}, "no tick is missing"
-        assert stamps[-1] == nanoseconds(kept[-1].header.stamp)
-        by_stamp = {nanoseconds(m.header.stamp): m for m in recorded[f"/{topic}"]}
-        assert all(by_stamp[t] == m for m in kept if (t := nanoseconds(m.header.stamp)) in by_stamp)
-    assert set(recorded) >= {
-        "/clock", "/odom", "/base_pose", "/joint_states", "/joint_commands", "/momentum",
-        "/goal_pose", "/gait_schedule", "/planned_path", "/planner/status", "/robot_description",
-    }  # fmt: skip
-
-
-def messages_of(bag: Path) -> dict[str, list[Any]]:
-    """Return the decoded messages of a bag by topic, in the order they were written."""
-    content: dict[str, list[Any]] = {}
-    with bag.open("rb") as file:
-        for schema, channel, record in make_reader(file).iter_messages(log_time_order=False):
-            assert schema is not None
-            package, _, name = schema.name.split("/")
-            if find_spec(package) is None:
-                continue  # tf2_msgs is no part of the wheels; bags have /tf all the same.
-            kind = getattr(import_module(f"{package}.msg"), name)
-            content.setdefault(channel.topic, []).append(deserialize_message(record.data, kind))
-    return content
 
 
 @pytest.mark.slow
