@@ -18,16 +18,22 @@ import numpy as np
 import pytest
 from support.command_line import CliRunner, Result
 
+from spacerobot_ros.bag import salvage
 from spacerobot_ros.bag.salvage import Salvaged
+from spacerobot_ros.cli import flights as command
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import PlanningError, numbers
+from spacerobot_ros.flight import trials, verification
 from spacerobot_ros.flight.second_opinion import EngineComparison
 from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.flight.verification import Difference, Verification
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.session import live
+from spacerobot_ros.session import run as flights
 from spacerobot_ros.session.run import RunResult
 
 SUMMARY: dict[str, Any] = {
@@ -96,8 +102,6 @@ def _empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def run(patch: pytest.MonkeyPatch, summary: dict[str, Any], *words: str) -> Result:
     """Run the command with a flight that comes to this summary."""
-    from spacerobot_ros.session import run as flights
-
     patch.setattr(flights, "run_scenario", lambda *_, **__: RunResult(summary))
     return CliRunner().invoke(main, ["run", "sliding_masses", *words])
 
@@ -259,8 +263,6 @@ def test_a_flight_that_misses_its_goal_is_exit_1_and_the_sentence(
 def test_an_interrupted_flight_says_how_its_report_is_made(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from spacerobot_ros.cli import flights as command
-
     monkeypatch.setattr(command, "termination", lambda: object())
     report = tmp_path / "ein Flug.html"
     result = run(monkeypatch, SUMMARY, *GOAL, "--report", str(report))
@@ -297,8 +299,6 @@ def test_no_published_figures_for_another_goal_another_method_or_no_flight(
 def test_what_the_command_line_changes_reaches_the_flight(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from spacerobot_ros.session import run as flights
-
     taken: list[Any] = []
 
     def fly(scenario: Any, bag: Path, progress: Any, *, nodes: bool, longest: float) -> RunResult:
@@ -378,8 +378,6 @@ def trial(problem: PlanningProblem, name: str, reached: bool = True) -> PlanEval
 
 def plan(patch: pytest.MonkeyPatch, reached: bool, *words: str) -> Result:
     """Run the command with plans that come to the trial above."""
-    from spacerobot_ros.flight import trials
-
     patch.setenv("SPACEROBOT_COMPILE", "0")
     patch.setattr(trials, "try_method", lambda problem, name: trial(problem, name, reached))
     return CliRunner().invoke(main, ["plan", *words])
@@ -460,8 +458,6 @@ def test_the_json_of_a_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 def test_a_comparison_has_a_row_for_each_method(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from spacerobot_ros.flight import trials
-
     def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | PlanningError]:
         refusal = PlanningError("It has no slider.")
         found = {name: trial(problem, name) for name in ("square_path", "optimal")}
@@ -492,8 +488,6 @@ def test_a_comparison_has_a_row_for_each_method(
 def test_random_goals_that_are_missed_are_exit_1(
     monkeypatch: pytest.MonkeyPatch, missed: int, missed_beside: int, code: int
 ) -> None:
-    from spacerobot_ros.flight import trials
-
     tried: list[Any] = []
 
     def random_goals(
@@ -542,8 +536,6 @@ def test_random_goals_that_are_missed_are_exit_1(
 
 
 def verified(patch: pytest.MonkeyPatch, *words: str, **changes: Any) -> Result:
-    from spacerobot_ros.flight import verification
-
     at = Difference(1.25, "/odom", "pose.pose.position.y", 0.5, 0.25)
     whole = Verification(340, 34.0, 1705, 1.5e-13, at, None, ("/joint_states", "/odom"))
 
@@ -613,8 +605,6 @@ def test_states_that_a_bag_lacks_are_exit_1_and_a_sentence(monkeypatch: pytest.M
 
 
 def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:
-    from spacerobot_ros.bag import salvage
-
     given: list[Any] = []
 
     def save(path: Path, out: Path | None) -> Salvaged:
@@ -642,9 +632,6 @@ def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_only_a_goal_that_is_reached_is_exit_0(
     monkeypatch: pytest.MonkeyPatch, outcome: str, code: int
 ) -> None:
-    from spacerobot_ros.measures import Outcome
-    from spacerobot_ros.session import live
-
     sent: list[Any] = []
 
     def send(goal: Goal, show: Any, *, namespace: str, timeout: float) -> Outcome:

@@ -11,8 +11,10 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import State
+from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
 from support.recorded_stack import has_parameters
@@ -207,7 +209,7 @@ def plant(harness: Harness) -> PlantNode:
 
 def test_a_node_answers_with_its_endpoints(harness: Harness, plant: PlantNode) -> None:
     plant.trigger_configure()
-    probe = harness.probe({"odom": _odometry()})
+    probe = harness.probe({"odom": Odometry})
     harness.connect()
     client = probe.create_client(Trigger, "plant/connections")
     found = MatchedEndpoints.from_json(harness.call(client, Trigger.Request()).message)
@@ -217,16 +219,8 @@ def test_a_node_answers_with_its_endpoints(harness: Harness, plant: PlantNode) -
     assert not {"/rosout", "/parameter_events"} & {topic for topic, _ in found.publishers}
     probe.create_publisher(String, "fault_injection", 10)
     harness.connect()
-    assert (
-        topics_without_all_matches([MatchedEndpoints.of(plant), MatchedEndpoints.of(probe)])
-        == set()
-    )
-
-
-def _odometry() -> Any:
-    from nav_msgs.msg import Odometry
-
-    return Odometry
+    both = [MatchedEndpoints.of(plant), MatchedEndpoints.of(probe)]
+    assert topics_without_all_matches(both) == set()
 
 
 def test_a_node_that_was_shut_down_ends_without_another_transition(
@@ -240,9 +234,6 @@ def test_a_node_that_was_shut_down_ends_without_another_transition(
 
 
 def test_a_plant_in_real_time_rests_before_its_process_ends(harness: Harness) -> None:
-    import numpy as np
-    from sensor_msgs.msg import JointState
-
     plant = harness.make(PlantNode, {"robot": "sliding_masses", "tick_rate": 100.0})
     probe = harness.probe({"joint_states": JointState})
     commands = probe.create_publisher(JointState, "joint_commands", 10)
