@@ -12,6 +12,7 @@ from support.planners import Planner
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState
+from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
@@ -43,7 +44,7 @@ def plant_at(
     return VelocityPlant(robot, period, initial, STEP)
 
 
-def measured(plant: VelocityPlant) -> RobotState:
+def measured(plant: VelocityPlant | PlantWithFaults) -> RobotState:
     return RobotState(plant.pose[:3].copy(), plant.pose[3:].copy(), plant.q.copy())
 
 

@@ -15,6 +15,7 @@ from planning.flown import STEP, fly, measured, plant_at
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
+from support.planar_manoeuvres import goal_of
 from support.planners import Planner, planner_of
 from support.random_robots import random_robot_urdf
 from support.slow import some_fast
@@ -44,10 +45,6 @@ def planner(
     robot: SpaceRobot, attitude: float = 1e-3, period: float = PERIOD, **options: Any
 ) -> Planner:
     return planner_of("area_loop", robot, period, Tolerance(1.0, attitude, 1e-6), STEP, **options)
-
-
-def goal_of(attitude: Rotation, shape: npt.ArrayLike | None = None) -> Goal:
-    return Goal.checked([0.0, 0.0, 0.0], attitude.as_quat(), shape)
 
 
 def turned(*degrees: float) -> Rotation:

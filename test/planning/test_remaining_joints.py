@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from planning.flown import measured
 from scipy.spatial.transform import Rotation
 from support.effort_flights import robot_of
 from support.planners import Planner
@@ -205,10 +206,6 @@ def gait(
     return Planner(without, Tolerance(1e-3, 1e-3))
 
 
-def state_of(plant: PlantWithFaults) -> RobotState:
-    return RobotState(plant.pose[:3].copy(), plant.pose[3:].copy(), plant.q.copy())
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -225,7 +222,7 @@ def test_an_arm_turns_its_base_without_its_elbow(options: dict[str, Any]) -> Non
     method = gait(SERVICER, SHAPE, "elbow_pitch", k=0.5, **options)
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.01, 0.005, -0.01]).as_quat())
     for _ in range(30):
-        schedule = method.plan(state_of(plant), goal)
+        schedule = method.plan(measured(plant), goal)
         assert schedule.joint_names == plant.robot.joint_names
         assert np.ptp(schedule.positions[:, elbow]) == 0.0
         for rates in schedule.velocities:
@@ -310,7 +307,7 @@ def test_a_chain_turns_its_base_by_the_one_pin_that_is_left() -> None:
     plant = PlantWithFaults(VelocityPlant(robot, TICK), ["joint_stuck pin_1"], TICK, wrench=False)
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.0, 0.0, 0.1]).as_quat())
     method = gait(chain, plant.q, "pin_1", method="square_path")
-    for rates in method.plan(state_of(plant), goal).velocities:
+    for rates in method.plan(measured(plant), goal).velocities:
         plant.step(rates)
     left = Rotation.from_quat(plant.pose[3:]).inv() * Rotation.from_quat(goal.quaternion)
     assert left.magnitude() < 1e-3
