@@ -341,14 +341,6 @@ def test_limits_without_room_name_the_joint() -> None:
         refusing_planner(narrow).plan(at([0, 0, 1]), GOAL)
 
 
-@pytest.mark.parametrize("name", ["linear_momentum", "angular_momentum"])
-def test_a_drifting_robot_is_refused(arm_of_area_loop_refusals: SpaceRobot, name: str) -> None:
-    with pytest.raises(PlanningError, match="total momentum is not zero"):
-        refusing_planner(arm_of_area_loop_refusals).plan(
-            at(NOMINAL, **{name: np.array([0, 0, 0.1])}), GOAL
-        )
-
-
 def test_a_goal_that_takes_too_many_cycles_is_refused_at_once(
     arm_of_area_loop_refusals: SpaceRobot,
 ) -> None:

@@ -15,6 +15,7 @@ from planning.test_optimal import ARM_START, FOLDER
 from scipy.spatial.transform import Rotation
 from support.planner_loop import TICK, TICK_NS, Loop, StubMethod, goal_at
 from support.planners import planner_of
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
@@ -172,11 +173,29 @@ def test_a_planar_robot_that_tumbles_is_refused() -> None:
         plan("planar_chain", rotvec=[0, 0, 0.1], angular_momentum=tumbling, **QUICK)
 
 
-def test_methods_that_plan_at_rest_name_the_one_that_does_not() -> None:
-    with pytest.raises(PlanningError, match=r"lie_bracket plans for zero momentum, .* use optimal"):
-        plan(
-            "sliding_masses", position=(0.1, 0, 0), method="lie_bracket", linear_momentum=[1, 0, 0]
-        )
+@pytest.mark.parametrize(
+    ("robot", "method"),
+    [
+        ("sliding_masses", "lie_bracket"),
+        ("planar_chain", "square_path"),
+        ("three_joint_arm", "area_loop"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("momentum", "shown"),
+    [
+        ({"linear_momentum": [0.0, 3e-3, 4e-3]}, "0.005 kg m/s"),
+        ({"angular_momentum": [0.0, 0.0, -2e-3]}, "0.002 kg m^2/s"),
+    ],
+)
+def test_methods_that_plan_at_rest_name_the_one_that_does_not(
+    robot: str, method: str, momentum: dict[str, Any], shown: str
+) -> None:
+    with pytest.raises(PlanningError, match="The robot drifts: its total momentum") as refused:
+        plan(robot, rotvec=(0.0, 0.0, 0.1), method=method, **momentum)
+    assert_one_sentence(
+        str(refused.value), shown, f"{method} plans for zero momentum", "use optimal"
+    )
 
 
 @pytest.mark.parametrize("given", [[1.0, 2.0], [0.0, np.nan, 1.0]])

@@ -322,19 +322,6 @@ def test_a_turn_that_takes_too_long_is_refused_with_the_time() -> None:
     assert "20 s" in text
 
 
-@pytest.mark.parametrize(
-    ("momentum", "shown"),
-    [
-        ({"linear_momentum": np.array([0.0, 3e-3, 4e-3])}, "0.005 kg m/s"),
-        ({"angular_momentum": np.array([0.0, -2e-3, 0.0])}, "0.002 kg m^2/s"),
-    ],
-)
-def test_a_drifting_robot_is_refused(momentum: dict[str, Array], shown: str) -> None:
-    text = refusal_of(paper_robot(), replace(origin(), **momentum), NEAR)
-    assert "drifts" in text
-    assert shown in text
-
-
 # -- the gait of sliding masses: paper 1's manoeuvre and its numbers -----------------------------
 
 

@@ -402,21 +402,6 @@ def test_a_manoeuvre_that_takes_too_long_is_refused(chain: SpaceRobot) -> None:
     assert "longest = 20 s" in text
 
 
-@pytest.mark.parametrize(
-    ("momentum", "shown"),
-    [
-        ({"linear_momentum": np.array([0.0, 3e-3, 4e-3])}, "0.005 kg m/s"),
-        ({"angular_momentum": np.array([0.0, 0.0, -2e-3])}, "0.002 kg m^2/s"),
-    ],
-)
-def test_a_drifting_robot_is_refused(
-    chain: SpaceRobot, momentum: dict[str, Array], shown: str
-) -> None:
-    text = refusal_of(chain, replace(at_rest(FOLDED), **momentum), NEAR)
-    assert "drifts" in text
-    assert shown in text
-
-
 @pytest.mark.parametrize("times", [{"t2": 8.0}, {"t3": 11.0}, {"t1": 30.0}, {"t4": 20.0}])
 def test_times_that_do_not_follow_each_other_are_refused(
     chain: SpaceRobot, times: dict[str, Any]
