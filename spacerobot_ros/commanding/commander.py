@@ -192,8 +192,8 @@ class Commander(ABC):
         until another robot is described.
         """
         self._robot_refusal = f"The robot on 'robot_description' is refused: {reason}"
-        waiting, self._waiting_goals = self._waiting_goals, {}
-        for goal in waiting.values():
+        refused, self._waiting_goals = self._waiting_goals, {}
+        for goal in refused.values():
             self._refuse_goal(self._robot_refusal, goal.goal_id)
         self._report_missing()
 
