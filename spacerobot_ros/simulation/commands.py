@@ -254,7 +254,7 @@ class CommandValidator:
                 source, values
             )
         if refusal is None and self.fault:
-            refusal = Refusal(Reason.LATCHED, self.fault)
+            refusal = Refusal(Reason.LATCHED, f"the plant is latched: {self.fault}")
         if stamp_ns < self._earliest and refusal is None and not unset:
             refusal = Refusal(Reason.STALE, _OUTDATED_STATE_CLAUSE)
         if refusal is None:

@@ -121,7 +121,8 @@ def test_real_time_refuses_what_is_old_early_or_out_of_order() -> None:
     assert refusal is not None
     assert refusal.reason is Reason.SECOND_COMMANDER
     assert refusal.latches, "by default"
-    assert rig.offer(now + TICK, now + TICK) == Refusal(Reason.LATCHED, rig.commands.fault)
+    latched = Refusal(Reason.LATCHED, f"the plant is latched: {rig.commands.fault}")
+    assert rig.offer(now + TICK, now + TICK) == latched
 
 
 @pytest.mark.parametrize("timeout", [0.5, 0.0])
