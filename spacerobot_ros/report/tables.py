@@ -144,8 +144,8 @@ def result_table(flight: FlightReport) -> Table:
     rows += _payload_rows(flight)
     if (clearance := flight.clearance) is not None:
         nearest = clearance.nearest
-        at = f"between {nearest.links} at {clearance.nearest_time:.4g} s"
-        rows.append(("Clearance", f"{quantity(nearest.distance, 'm')} {at}"))
+        where = f"between {nearest.links} at {clearance.nearest_time:.4g} s"
+        rows.append(("Clearance", f"{quantity(nearest.distance, 'm')} {where}"))
     return Table(("Quantity", "Value"), rows)
 
 

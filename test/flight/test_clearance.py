@@ -19,6 +19,7 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import FlightBag, open_flight_bag, read_flight, read_run
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import metrics_of_each
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
@@ -137,7 +138,7 @@ def test_its_bag_and_its_report_show_the_contacts(through: Flight, tmp_path: Pat
     assert group.limits == [(0, 0.0)]
     assert group.signal.values.min() == pytest.approx(truth.min(), abs=1e-4)
     ((_, text),) = [row for row in result_table(report).rows if row[0] == "Clearance"]
-    assert text.startswith("-0.186 m, links 'mass_1' and 'mass_2' at ")
+    assert text.startswith("-0.186 m between 'mass_1' and 'mass_2' at ")
 
 
 def test_a_flight_that_does_not_measure_it_has_no_clearance(
@@ -177,12 +178,17 @@ def test_the_nodes_report_what_a_flight_without_ros_does(
 
 
 def test_flights_recorded_before_there_was_a_clearance_are_without() -> None:
-    flight = read_run(Path(__file__).parents[2] / "bags" / "sliding_masses.mcap")
+    bag = Path(__file__).with_name("earlier_version.mcap")
+    flight = read_run(bag)
     assert flight.scenario.planner.clearance == 0.0
     assert flight.scenario.plant.clearance_period == 0.0
     # Its masses overlap, and its robot knows no SRDF.
     assert flight.clearance is None
     assert PlannerConfig().clearance == 0.01
+    # It has no events either, and is flown again all the same.
+    assert flight.succeeded
+    assert not flight.events
+    assert verify_bag(bag).difference is None
 
 
 ROBOT = Path(robot_file("planar_chain")).read_text("utf-8")
