@@ -178,7 +178,7 @@ def replay_command(
     texts = {"bag": str(bag), "topics": " ".join(topics), "remap": " ".join(remap)}
     values = {**options, **texts, "hold": view}
     overrides = [Parameter(name, value=value) for name, value in values.items()]
-    with viewer_if_requested(view, {}):
+    with viewer_if_requested(view, {"title": f"{bag.name}, replay"}):
         code = run_node(lambda: ReplayNode(parameter_overrides=overrides), [])
     sys.exit(code)
 

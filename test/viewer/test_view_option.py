@@ -127,7 +127,7 @@ def test_a_recording_is_moved_in_time(ros_domain: int, tmp_path: Path) -> None:
     with viewed(ros_domain, tmp_path, "replay", str(bag)) as (process, url):
         with browser(tmp_path / "profile") as window:
             page = Page(window, url)
-            page.wait_for_text("Replay ended", without="No state")
+            page.wait_for_text("planar_chain.mcap, replay", "Replay ended", without="No state")
             assert "Fly" not in page.text(), "a recording takes no goals"
             page.press("Play")
             page.wait_for_text("Replay playing")
