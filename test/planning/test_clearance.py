@@ -142,9 +142,16 @@ def test_a_pair_that_begins_nearer_comes_no_nearer(arm: SpaceRobot) -> None:
     assert np.sort(required) == pytest.approx([0.07, 0.1, 0.1], abs=1e-5)
 
 
-def test_a_start_that_is_too_near_is_refused(arm: SpaceRobot) -> None:
-    with pytest.raises(PlanningError, match=r"Links '.*' and '.*' are 0\.25 m apart at the start"):
-        plan(arm, rotvec=(0.1, 0.0, 0.0), clearance=0.6)
+def test_links_that_begin_much_nearer_keep_half_of_their_distance(
+    arm: SpaceRobot, caplog: pytest.LogCaptureFixture
+) -> None:
+    clearance = Clearance(arm.description, 0.6)
+    closest = clearance.geometry.nearest(np.zeros(3))
+    assert closest is not None
+    assert closest[0] == pytest.approx(0.25)
+    schedule = planned(arm, "optimal", (0.1, 0.0, 0.0), np.zeros(3), clearance, **QUICK)
+    assert 0.125 <= nearest_of(clearance.geometry, schedule.positions) < 0.3
+    assert "apart at the start, closer than planner.clearance = 0.6 m: they are kept" in caplog.text
 
 
 @pytest.mark.parametrize("distance", [-0.01, float("nan"), float("inf")])
@@ -237,11 +244,12 @@ def test_the_srdf_of_the_planner_is_read(tmp_path: Path) -> None:
 
 
 def test_the_clearance_of_the_planner_is_kept(arm: SpaceRobot) -> None:
-    # Links are 0.25 m apart at the start.
-    goal = Goal.from_rotvec(np.zeros(3), (0.1, 0.0, 0.0))
-    problem = PlanningProblem("near", arm, InitialState(), goal, PlannerConfig(clearance=0.6))
+    # Links are nearer than that in the shape of the goal.
+    shape = np.array([0.0, -0.1, 2.04])
+    goal = replace(Goal.from_rotvec(np.zeros(3), (0.1, 0.0, 0.0)), joint_positions=shape)
+    problem = PlanningProblem("near", arm, InitialState(), goal, PlannerConfig(clearance=0.2))
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    with pytest.raises(PlanningError, match=r"planner\.clearance = 0\.6 m"):
+    with pytest.raises(PlanningError, match=r"in collision: .*; planner\.clearance is 0\.2 m"):
         problem.method("optimal").plan(PlanRequest(state, goal, TOLERANCE))
 
 

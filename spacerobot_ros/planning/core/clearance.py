@@ -37,16 +37,15 @@ DEFAULT_CLEARANCE = 0.01
 _CLEARANCE_OF_OBSTACLES = 0.01
 """Smallest distance if there are obstacles and none is requested, m."""
 
-_SRDF_REMEDY = ", or disable the pair in an SRDF (planner.srdf)"
-
 _DISTANCE_ERROR = 1e-6
 """Numerical error of a computed distance, m."""
 
 _CLEARANCE_FACTOR_FOR_LOOPS = 5.0
 
 _MIN_START_SHARE = 0.5
-"""Fraction of the clearance below which a start is rejected: a flight that ended at the clearance
-may be slightly closer."""
+"""Fraction of the clearance below which a start near an obstacle is rejected, since a flight that
+ended at the clearance may be slightly closer, and fraction of their distance that links keep if
+they are that close: fingers, for instance, are by design."""
 
 
 class Clearance:
@@ -146,25 +145,26 @@ class Clearance:
         poses = geometry.poses(start[np.newaxis], base)
         for pair in np.flatnonzero(geometry.lower_bounds(poses)[0] <= self.distance).tolist():
             distance = float(geometry.distances(pair, poses)[0])
-            if distance <= 0:
-                links = geometry.links_of(pair)
-                if isinstance(links, ObstaclePair):
+            links = geometry.links_of(pair)
+            near = f"are {distance:.3g} m apart at the start"
+            limit = f"closer than {self._parameter} = {self.distance:g} m"
+            if distance >= _MIN_START_SHARE * self.distance:
+                required[pair] = min(self.distance, distance)
+            elif isinstance(links, ObstaclePair):
+                if distance <= 0:
                     raise PlanningError(
                         f"{sentence_case(links.subject)} touch at the start: move the robot away "
                         f"first, or set {self._parameter} to 0."
                     )
-                required[pair] = -np.inf
-                self._warn_of_contact(links)
-            elif distance < _MIN_START_SHARE * self.distance:
-                links = geometry.links_of(pair)
-                remedy = "" if isinstance(links, ObstaclePair) else _SRDF_REMEDY
                 raise PlanningError(
-                    f"{sentence_case(links.subject)} are {distance:.3g} m apart at the start, "
-                    f"closer than {self._parameter} = {self.distance:g} m: reduce this "
-                    f"value{remedy}."
+                    f"{sentence_case(links.subject)} {near}, {limit}: reduce this value."
                 )
+            elif distance <= 0:
+                required[pair] = -np.inf
+                self._warn(links, "are in contact at the start: their contact is ignored")
             else:
-                required[pair] = min(self.distance, distance)
+                required[pair] = _MIN_START_SHARE * distance
+                self._warn(links, f"{near}, {limit}: they are kept half as far apart")
         return required - _DISTANCE_ERROR
 
     def _require_declared_meshes(self) -> None:
@@ -186,16 +186,13 @@ class Clearance:
                 )
             warn_once(each.note)
 
-    def _warn_of_contact(self, links: LinkPair) -> None:
+    def _warn(self, links: LinkPair, text: str) -> None:
         if links.subject not in self._warned:
             self._warned.add(links.subject)
-            remedy = ""
-            if not isinstance(links, ObstaclePair):
-                remedy = " If the contact is not real, disable the pair in an SRDF (planner.srdf)."
             _LOG.warning(
-                "%s are in contact at the start: their contact is ignored.%s",
+                "%s %s. If this is by design, disable the pair in an SRDF (planner.srdf).",
                 sentence_case(links.subject),
-                remedy,
+                text,
             )
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
