@@ -100,6 +100,17 @@ class ApproachOptions:
         minimum=0.0,
         maximum=100.0,
     )
+    corridor_length: float = parameter(
+        0.0,
+        "distance from the grapple frame within which a planned approach (profile: planned) keeps "
+        "the end-effector in a cone about the direction of the standoff; 0: none",
+        unit="m",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    corridor_angle: float = parameter(
+        0.3, "half-angle of this cone", unit="rad", minimum=0.0, maximum=1.5
+    )
     detumble: str = parameter(
         "after",
         "when the angular momentum of the robot and the target is removed: before the capture, by "

@@ -298,6 +298,8 @@ class ApproachTask:
                 options.horizon,
                 options.detumble == "before",
                 options.standoff,
+                options.corridor_angle,
+                options.corridor_length,
             )
             lead = self._lead if in_background else 0.0
             self._job = controller.plan_grapple(time, state.copied(), grapple, lead)

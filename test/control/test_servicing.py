@@ -234,6 +234,17 @@ def test_a_target_that_cannot_be_met_is_refused_with_the_sentence_of_the_plan() 
     assert_one_sentence(refused.message, "The approach is refused: the target is out of reach")
 
 
+def test_a_start_beside_the_corridor_of_a_target_is_refused() -> None:
+    planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
+    loop = Meeting(**planned, **{"target.corridor_length": 3.0, "target.corridor_angle": 0.2})
+    loop.executive.plan_at_once()
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer()
+    (refused,) = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
+    values = "corridor_angle = 0.2 rad", "corridor_length = 3 m"
+    assert_one_sentence(refused.message, "The approach is refused: at the start", *values)
+
+
 def test_a_law_without_an_end_effector_approaches_nothing() -> None:
     loop = Meeting(base_outputs="x y rz")
     loop.aim(base=goal_at(AIM, "5"))

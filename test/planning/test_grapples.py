@@ -16,11 +16,13 @@ from support.thrust_flights import distance_from_target, tumbled
 from spacerobot_ros import fly
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, TargetBody
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning.methods.thrust.goals import Grapple
+from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file, share_directory
@@ -78,6 +80,36 @@ def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> Non
     assert distance_from_target(robot, target, motion, free) > 0.0199
     careless = planner.plan(start, meeting(free, 0.0))
     assert distance_from_target(robot, target, careless, free) < 0
+
+
+def test_an_approach_stays_in_its_corridor_or_is_refused() -> None:
+    planner, free, angle = boomed(), slab((2.5, 0.2, -0.1), (0.004, -0.003, 0.0)), 0.25
+    start, target = RobotMotion.at_rest(HERE, np.zeros(1)), parse_robot(SLAB)
+    clear = replace(meeting(free), standoff=(-0.4, 0.0, 0.0))
+    outside = []
+    for length in (0.0, 0.6):
+        asked = replace(clear, corridor_angle=angle, corridor_length=length)
+        motion = planner.plan(start, asked)
+        times = np.linspace(0, motion.duration, 400)
+        hand = np.array([planner_hand(motion, time) for time in times])
+        X, r = tumbled(target, free, times)
+        p = Rotation.from_quat(X).inv().apply(hand - r) - [-0.32, 0.1, 0.0]
+        beyond = np.hypot(p[:, 1], p[:, 2]) - (0.02 - p[:, 0] * np.tan(angle))
+        outside.append(beyond[np.linalg.norm(p, axis=1) < 0.59].max())
+    assert outside[0] > 0.1, "the test is sharp"
+    assert outside[1] < 1e-3
+    near = replace(clear, corridor_angle=angle, corridor_length=4.0)
+    with pytest.raises(PlanningError) as refused:
+        planner.plan(start, near)
+    assert_one_sentence(
+        str(refused.value), "m outside its corridor", "corridor_angle = 0.25", "move the robot"
+    )
+
+
+def planner_hand(motion: ThrustMotion, time: float) -> Array:
+    hand = motion.at(time).end_effector
+    assert hand is not None
+    return hand.position
 
 
 @cache

@@ -1,9 +1,9 @@
 """Bodies that may come too close in a motion under thrust: links, obstacles, and a tumbling target.
 
 Relative to a target frame, the target body is an obstacle at rest. So the exact check for obstacles
-is used,
-with the base pose relative to the target; a plane between a link and the target is transformed to W
-by the target pose at that time.
+is used, with the base pose relative to the target; a plane between a link and the target is
+transformed to W by the target pose at that time. The corridor of an approach is one more pair: the
+end-effector and a cone that moves with the target.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.collision import Approach, BasePoses
-from spacerobot_ros.collision.geometry import Poses
-from spacerobot_ros.collision.planes import support_distance
+from spacerobot_ros.collision.geometry import LinkPair, Poses
+from spacerobot_ros.collision.planes import PLANE_SIZE, support_distance
+from spacerobot_ros.errors import PlanningError, quantity
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import RobotMotion
@@ -27,8 +29,10 @@ from spacerobot_ros.model.rotations import (
     quaternion_inverse,
     quaternion_multiply,
 )
+from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.core.goal import end_effector_pose
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, base_for_hand
 from spacerobot_ros.planning.methods.thrust.motion import EXACT_STEPS, ThrustMotion, base_poses
@@ -46,6 +50,10 @@ instants."""
 
 _NO_DISTANCE = 1e3
 """m; rows for a plane this far away are always satisfied."""
+
+_CORRIDOR_RADIUS, _CORRIDOR_ROOM, _CORRIDOR_ROUNDING = 0.02, 0.01, 1e-3
+"""Radius of a corridor at its fixture, distance from its surface at these instants, and length over
+which its axis is smoothed, m."""
 
 
 class _Samples(NamedTuple):
@@ -82,6 +90,38 @@ class _Surroundings:
     def poses(self, path: _Samples) -> Poses:
         return self.geometry.poses(path.shapes, self.base(path))
 
+    def distance_function(self, pair: int, center_of_mass: ca.Function) -> ca.Function:
+        """Return the distance of a pair as a function of a plane."""
+        return support_distance(self.geometry, pair, center_of_mass)
+
+    def distances(self, pair: int, path: _Samples) -> Array:
+        """Return the distances (K,) of a pair along a path, m."""
+        return self.geometry.distances(pair, self.poses(path))
+
+    def is_near(self, pair: int, path: _Samples) -> npt.NDArray[np.bool_]:
+        """Return where a pair on a path (K,) is closer than the size of its first solid."""
+        first = self.geometry.solids[self.geometry.pairs[pair][0]]
+        reach = self.required[pair] + first.enclosure.bounding_radius
+        return np.asarray(self.distances(pair, path) < reach)
+
+    def room(self, path: _Samples, pairs: Collection[int] | None) -> float:
+        """Return the least room along a path, m; see :meth:`Bodies.room`."""
+        required = self.required.copy()
+        if pairs is not None:
+            numbers = self.first + np.arange(len(required))
+            counted = self.geometry.with_obstacles | np.isin(numbers, list(pairs))
+            required[~counted] = -np.inf
+        found, _ = self.geometry.nearest_along(path.shapes, self.base(path), required)
+        return float(found.min())
+
+    def approaches(self, path: _Samples) -> list[Approach]:
+        """Return the pairs that come too close on a path."""
+        found = self.clearance.approaches(path.shapes, self.required, self.base(path))
+        return found if self.target is None else [replace(e, place_on_obstacle=None) for e in found]
+
+    def clause(self, approach: Approach) -> str:
+        return self.clearance.clause(approach, None)
+
     def planes(self, pair: int, path: _Samples, at: npt.NDArray[np.int64]) -> Array:
         """Return planes (K, 7) of a pair at instants (K,) of a path; obstacle planes are in W."""
         R, r = self.poses(path)
@@ -92,6 +132,104 @@ class _Surroundings:
             planes[:, 3] += np.sum(normal * r_WT, axis=1)
             planes[:, :3] = normal
         return planes
+
+
+class _Corridor:
+    """The cone through which an end-effector approaches the grapple frame of a target, within some
+    distance of it.
+
+    Its axis is the direction of the standoff. It is one pair, number ``first``, whose distance is
+    that of the end-effector origin from the surface of the cone or, if that is more, from the
+    sphere in which the cone counts; negative: it is beside the cone.
+    """
+
+    def __init__(self, robot: SpaceRobot, link: str, grapple: Grapple, first: int) -> None:
+        self._robot, self._link, self._grapple, self.first = robot, link, grapple, first
+        self._slope, self._length = float(np.sin(grapple.corridor_angle)), grapple.corridor_length
+        self.required, self.of_hand = np.zeros(1), np.zeros(1, dtype=bool)
+
+    def require_start(self, start: RobotMotion) -> None:
+        """Refuse a start far beside the corridor; one a little beside it need not come nearer."""
+        path = _Samples(start.q[np.newaxis], _poses(start.pose), np.zeros(1))
+        self.required[:] = min(float(self.distances(0, path)[0]), 0.0)
+        if self.required[0] < -_CORRIDOR_RADIUS:
+            raise PlanningError(
+                f"At the start, {self._beside(self.required[0])}: move the robot away from the "
+                "target first."
+            )
+
+    def distance_function(self, _pair: int, center_of_mass: ca.Function) -> ca.Function:
+        """Return ``([q; X; r], [s; wanted; apex]) -> d``, m, of the base rotation and the centre of
+        mass: as :func:`.support_distance`, with a cone in place of a plane. The length of its axis
+        s is the sine of its half-angle; a half-angle of 90 deg is a plane.
+        """
+        n = self._robot.n
+        y, cone = ca.SX.sym("y", n + 7), ca.SX.sym("cone", PLANE_SIZE)
+        (q, X, r), axis = ca.vertsplit(y, [0, n, n + 4, n + 7]), cone[:3]
+        at = self._robot.link_names.index(self._link)
+        e = self._robot.function("link_poses", compile=False)(q)[1][:, at] - center_of_mass(q)
+        from_apex = r + matrix_from_quaternion(X / ca.norm_2(X)) @ e - cone[4:]
+        square = ca.sumsqr(axis)
+        beside = ca.sumsqr(from_apex - ca.dot(axis, from_apex) / square * axis)
+        room = _CORRIDOR_RADIUS - _CORRIDOR_ROOM - ca.sqrt(beside + _CORRIDOR_ROUNDING**2)
+        d = ca.dot(axis, from_apex) + ca.sqrt(ca.fmax(1 - square, 0)) * room - cone[3]
+        return ca.Function("corridor", [y, cone], [d])
+
+    def _places(self, path: _Samples) -> tuple[Array, Array, Array, Array, Array]:
+        """Return positions of the end-effector from the fixture, the fixture, and axes of the cone
+        (K, 3); distances (K,) from the surface of the cone and from the sphere.
+        """
+        frame = self._grapple.motion.grapple(path.times)
+        samples = zip(*path.base, path.shapes, strict=True)
+        hand = [end_effector_pose(self._robot, self._link, r, X, q)[0] for r, X, q in samples]
+        p, axis = np.array(hand) - frame.r, frame.R @ self._grapple.standoff
+        axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
+        along = np.sum(p * axis, axis=1, keepdims=True)
+        beside = np.hypot(np.linalg.norm(p - along * axis, axis=1), _CORRIDOR_ROUNDING)
+        inside = self._slope * along[:, 0]
+        inside += np.sqrt(1 - self._slope**2) * (_CORRIDOR_RADIUS - beside)
+        return p, frame.r, axis, inside, np.linalg.norm(p, axis=1) - self._length
+
+    def planes(self, _pair: int, path: _Samples, at: npt.NDArray[np.int64]) -> Array:
+        """Return cones (K, 7) at instants (K,) of a path or, where it is nearer to the outside of
+        the sphere, planes that touch the sphere."""
+        p, apex, axis, inside, outside = self._places(path)
+        within = inside >= outside
+        # From the instant before: between the two, the edge of the sphere is crossed in the cone.
+        within |= np.append(within[1:], True)
+        normal = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-9)
+        chosen = within[:, np.newaxis]
+        offset = np.where(chosen, 0.0, self._length + _CORRIDOR_ROOM)
+        return np.hstack([np.where(chosen, self._slope * axis, normal), offset, apex])[at]
+
+    def distances(self, _pair: int, path: _Samples) -> Array:
+        """Return the distances (K,) along a path, m."""
+        *_, inside, outside = self._places(path)
+        return np.maximum(inside, outside)
+
+    def is_near(self, _pair: int, path: _Samples) -> npt.NDArray[np.bool_]:
+        """Return where an end-effector on a path (K,) is near the sphere or in it."""
+        *_, outside = self._places(path)
+        return np.asarray(outside < 0.1 * self._length)
+
+    def approaches(self, path: _Samples) -> list[Approach]:
+        """Return where the end-effector is farthest outside, if it is."""
+        distances = self.distances(0, path)
+        k = int(np.argmin(distances))
+        if distances[k] >= self.required[0]:
+            return []
+        links = LinkPair(self._link, self._link)
+        return [Approach(links, 0, float(distances[k]), float(k), path.shapes[k])]
+
+    def clause(self, approach: Approach) -> str:
+        return self._beside(approach.distance)
+
+    def _beside(self, distance: float) -> str:
+        angle, length = self._grapple.corridor_angle, self._grapple.corridor_length
+        return (
+            f"'{self._link}' is {quantity(-distance, 'm')} outside its corridor, with "
+            f"target.corridor_angle = {angle:g} rad and target.corridor_length = {length:g} m"
+        )
 
 
 class Bodies:
@@ -124,21 +262,27 @@ class Bodies:
         grapple: Grapple | None,
     ) -> None:
         self._robot = robot
-        self._around = [] if clearance is None else [_Surroundings(clearance, 0, None)]
+        solid = [] if clearance is None else [_Surroundings(clearance, 0, None)]
         if grapple is not None and grapple.description is not None and grapple.clearance > 0:
             among = replace(robot.description, world=grapple.description)
             distance, name = grapple.clearance, "target.clearance"
             kept = Clearance(among, distance, name, obstacles_alone=True)
-            first = sum(len(each.geometry.pairs) for each in self._around)
-            self._around.append(_Surroundings(kept, first, grapple.motion))
+            first = sum(len(each.geometry.pairs) for each in solid)
+            solid.append(_Surroundings(kept, first, grapple.motion))
+        self._solid, self._around = solid, list[_Surroundings | _Corridor](solid)
+        if grapple is not None and grapple.corridor_length > 0:
+            first = sum(len(each.geometry.pairs) for each in solid)
+            corridor = _Corridor(robot, link, grapple, first)
+            corridor.require_start(start)
+            self._around.append(corridor)
         self.rows = cache(self._derived_rows)
         """Returns the rows of a pair with a given number."""
-        self._kept: dict[int, tuple[float, Array]] = {}
+        self._kept: dict[int, tuple[float, npt.NDArray[np.bool_]]] = {}
         """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
         (N K,)."""
         shape = start.q[np.newaxis]
         begin = _Samples(shape, _poses(start.pose), np.zeros(1))
-        for each in self._around:
+        for each in solid:
             each.required = each.clearance.required(start.q, each.base(begin))
             if each.target is not None:
                 # The body that grasps comes as near as the grasp has it.
@@ -153,10 +297,10 @@ class Bodies:
     def require_end(self, shape: Array, pose: Array) -> None:
         """Reject a goal, given by a shape (n,) and a base pose (7,), at which links are too
         close."""
-        for each in self._around:
+        for each in self._solid:
             each.clearance.require_shape(shape, each.required, _poses(pose))
 
-    def _pair(self, number: int) -> tuple[_Surroundings, int]:
+    def _pair(self, number: int) -> tuple[_Surroundings | _Corridor, int]:
         """Return the surroundings of a pair, and its number there."""
         around = next(each for each in reversed(self._around) if each.first <= number)
         return around, number - around.first
@@ -166,8 +310,7 @@ class Bodies:
     def _derived_rows(self, number: int) -> ConstraintBlock:
         around, pair = self._pair(number)
         center_of_mass = self._robot.function("center_of_mass", compile=False)
-        distance = support_distance(around.geometry, pair, center_of_mass)
-        return pair_block(self._robot.n, distance)
+        return pair_block(self._robot.n, around.distance_function(pair, center_of_mass))
 
     def _along(self, knots: ThrustKnots) -> _Samples:
         """Return a path at the instants (N K,) at which pairs are kept apart."""
@@ -186,38 +329,32 @@ class Bodies:
     def distances(self, number: int, knots: ThrustKnots) -> Array:
         """Return the distances (N K,) of a pair at these instants, m."""
         around, pair = self._pair(number)
-        return around.geometry.distances(pair, around.poses(self._along(knots)))
+        return around.distances(pair, self._along(knots))
 
     def room(self, knots: ThrustKnots, pairs: Collection[int] | None = None) -> float:
         """Return the smallest difference between actual and required distance along a path, m, for
         obstacles, the target and some other pairs (None: all).
         """
-        path, least = self._along(knots), np.inf
-        for around in self._around:
-            required = around.required.copy()
-            if pairs is not None:
-                numbers = around.first + np.arange(len(required))
-                counted = around.geometry.with_obstacles | np.isin(numbers, list(pairs))
-                required[~counted] = -np.inf
-            found, _ = around.geometry.nearest_along(path.shapes, around.base(path), required)
-            least = min(least, float(found.min()))
-        return least
+        path = self._along(knots)
+        return min((each.room(path, pairs) for each in self._solid), default=np.inf)
 
     def keep(self, near: Sequence[Approach], knots: ThrustKnots) -> None:
         """Keep more pairs apart: at the instants of a path at which they are closer than the size
         of the first solid, and around their approaches in an exactly integrated motion. Pairs that
         are already kept apart are given the missing room.
         """
+        path = self._along(knots)
         for approach in near:
             around, pair = self._pair(approach.pair)
-            first = around.geometry.solids[around.geometry.pairs[pair][0]]
-            reach = around.required[pair] + first.enclosure.bounding_radius
-            places = self.distances(approach.pair, knots) < reach
+            places = around.is_near(pair, path)
             place = int(approach.tick / EXACT_STEPS * INSTANTS) - 1
             places[max(place, 0) : place + 2] = True
             room, known = self._kept.get(approach.pair, (None, False))
             lack = float(around.required[pair]) - approach.distance
             more = _ROOM if room is None else room + lack + _ROOM
+            if isinstance(around, _Corridor):
+                # Its rows have room; what a path misses says where to make others, not how far.
+                more = 0.0 if room is None else room + _ROOM
             self._kept[approach.pair] = more, places | known
 
     def keep_none(self) -> None:
@@ -255,20 +392,27 @@ class Bodies:
         path = _Samples(shapes, base, np.linspace(0.0, motion.duration, len(shapes)))
         found: list[Approach] = []
         for around in self._around:
-            for each in around.clearance.approaches(shapes, around.required, around.base(path)):
-                place = each.place_on_obstacle if around.target is None else None
-                found.append(replace(each, pair=each.pair + around.first, place_on_obstacle=place))
+            for each in around.approaches(path):
+                found.append(replace(each, pair=each.pair + around.first))
         return sorted(found, key=lambda each: each.distance)
 
     def is_in_the_way(self, near: Sequence[Approach]) -> bool:
         """Whether an obstacle or the target is among the pairs."""
         pairs = [self._pair(each.pair) for each in near]
-        return any(around.geometry.with_obstacles[pair] for around, pair in pairs)
+        return any(
+            isinstance(around, _Surroundings) and around.geometry.with_obstacles[pair]
+            for around, pair in pairs
+        )
+
+    def depth(self, near: Sequence[Approach]) -> float:
+        """Return how deep solids are in each other, m."""
+        pairs = ((self._pair(each.pair)[0], each.distance) for each in near)
+        return max((-d for around, d in pairs if isinstance(around, _Surroundings)), default=0.0)
 
     def reason(self, approach: Approach) -> str:
         """Return a clause that describes a motion that is not clear."""
         around, _ = self._pair(approach.pair)
-        return f"no clear motion was found: {around.clearance.clause(approach, None)}"
+        return f"no clear motion was found: {around.clause(approach)}"
 
 
 def _poses(pose: Array) -> BasePoses:

@@ -34,6 +34,9 @@ class Grapple:
     standoff
         (3,) position in the grapple frame, m, from which the end-effector would approach in a
         straight line.
+    corridor_angle, corridor_length
+        Half-angle, rad, of the cone about the direction of the standoff that the end-effector does
+        not leave within a distance from the grapple frame, m; length 0: none.
     """
 
     motion: TorqueFreeMotion
@@ -42,6 +45,8 @@ class Grapple:
     horizon: float = 120.0
     detumbles: bool = False
     standoff: tuple[float, ...] = (-0.3, 0.0, 0.0)
+    corridor_angle: float = 0.0
+    corridor_length: float = 0.0
 
 
 @dataclass(frozen=True)

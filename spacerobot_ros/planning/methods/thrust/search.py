@@ -671,7 +671,7 @@ class _Search:
         if self.grapple is None:
             guesses = itertools.chain(self._bows(path, near), [path])
         else:
-            shallow = [path] if near[0].distance > -_SHALLOW else []
+            shallow = [path] if self.bodies.depth(near) < _SHALLOW else []
             guesses = itertools.chain(shallow, self._meetings(path.duration))
         for guess in guesses:
             self.bodies.keep_none()
