@@ -176,6 +176,8 @@ class ApproachTask:
         self._job: PlanningJob[GrappleReference] | None = None
         """The job that plans an approach."""
         self._lead = PLANNING_TIME
+        self._looks_ahead, self._off_later = True, False
+        """Whether deviations at contact count, and whether only such a one was found."""
 
     def step(
         self,
@@ -270,12 +272,15 @@ class ApproachTask:
         expected = self._predicted.grapple([elapsed]).body_motion()
         if _is_off(expected, measured.at(self.target.body.grapple)):
             self.target.forget_momenta()
+            self._off_later = False
             return True
-        if not self.target.has_new_average or self._contact <= elapsed:
+        ahead = self._looks_ahead and self.target.has_new_average
+        if not ahead or self._contact <= elapsed:
             return False
         expected = self._predicted.grapple([self._contact]).body_motion()
         later = self.target.free_motion().grapple([self._contact - elapsed])
-        return _is_off(expected, later.body_motion())
+        self._off_later = _is_off(expected, later.body_motion())
+        return self._off_later
 
     def _plan_motion(
         self,
@@ -308,7 +313,15 @@ class ApproachTask:
         if job is None or not job.done or time < job.begins:
             return
         self._job = None
-        planned = job.result()
+        try:
+            planned = job.result()
+        except PlanningError:
+            if self._plan is None or not self._off_later:
+                raise
+            # The target is where it was predicted to be: the robot goes on with the present plan.
+            self._looks_ahead = False
+            return
+        self._looks_ahead = True
         if time - job.begins > _LATEST_BEGIN and in_background:
             # Robot and target have gone on.
             self._lead *= 2
