@@ -28,7 +28,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -122,9 +122,10 @@ _MAX_CLEARING_ITERATIONS = 80
 """Largest number of solver steps between paths for which planes are computed: more steps
 diverge."""
 
-_MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 10
-"""Largest number of paths on the way to a clear path, and from there to a fast one: most searches
-take a few, but one plan for a servicer is not found with seven paths."""
+_MAX_CLEARING_ROUNDS, _RECLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 15, 3, 10
+"""Largest number of paths on the way to a clear path, of those near a fast path that is clear on
+the coarse grid, and on the way to a fast one: most searches take a few, but one plan for a servicer
+is not found with seven paths."""
 
 _LARGEST_LACK = 0.15
 """Distance by which links on the way to a clear path may be closer than required, m. With 0.3, a
@@ -624,8 +625,8 @@ class _Search:
         self, kept: KeptDistances, known: Trajectory
     ) -> Iterator[tuple[Trajectory, float]]:
         """Yield other paths with the share of the largest reach in which clear ones are looked for,
-        by turns: guesses that keep clear, but do not end at the goal, and solutions that need not
-        keep clear, from guesses on a coarse grid.
+        by turns: solutions that need not keep clear, from guesses on a coarse grid, and guesses
+        that keep clear, but do not end at the goal.
         """
         problem = self._problem
         if problem.boundary.drifts and problem.motion is None:
@@ -636,8 +637,8 @@ class _Search:
         starts = min(problem.options.starts, most)
         guesses = itertools.islice(self._guesses(self._coarse, kept.is_clear), starts)
         clear = (each for each in guesses if kept.is_clear(each))
-        for pair in itertools.zip_longest(clear, self._other_solutions(known, starts)):
-            for path, reach in zip(pair, (_REACH_FROM_GUESS, 1.0), strict=True):
+        for pair in itertools.zip_longest(self._other_solutions(known, starts), clear):
+            for path, reach in zip(pair, (1.0, _REACH_FROM_GUESS), strict=True):
                 if self._is_over(found=False):
                     return
                 if path is not None:
@@ -674,8 +675,14 @@ class _Search:
             # A path that is clear on the coarse grid mostly is on the full one, as fast.
             path, reach = path.stretched(_RESAMPLED_TIME_FACTOR), 1.0
             duration = path.duration
-            path, made = self._shorten(kept, grid, path, None)
-            duration = _RECLEARED_TIME_FACTOR * path.duration
+            faster, made = self._shorten(kept, grid, path, None)
+            if made is not None:
+                path = faster
+            elif faster is not path:
+                with suppress(UnusableCandidateError):
+                    T = _RECLEARED_TIME_FACTOR * faster.duration
+                    path, made = self._clear(kept, grid, faster, T, reach, _RECLEARING_ROUNDS)
+                    path, made = self._shorten(kept, grid, path, made)
         if made is None:
             path, made = self._clear(kept, grid, path, duration, reach)
             if options.duration == 0:
@@ -687,7 +694,13 @@ class _Search:
         return made
 
     def _clear(
-        self, kept: KeptDistances, grid: _Grid, path: Trajectory, duration: float, reach: float
+        self,
+        kept: KeptDistances,
+        grid: _Grid,
+        path: Trajectory,
+        duration: float,
+        reach: float,
+        rounds: int = _MAX_CLEARING_ROUNDS,
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a clear path near to one, in a given duration (s), and its held commands; by
         steps of a share of the largest reach. UnusableCandidateError if none was found.
@@ -697,19 +710,20 @@ class _Search:
         near = kept.approaches_of(path)
         kept.add(near)
         least, stalled = math.inf, 0
-        for _ in range(_MAX_CLEARING_ROUNDS):
+        for _ in range(rounds):
             path = self._solve_apart(kept, grid, path, duration, around)
             lack = self._lack
             near, made = self._approaches(kept, grid, path)
             if not near:
                 return path, made
             stalled = stalled + 1 if lack > max(_STALLED_SHARE * least, _NO_LACK) else 0
-            least = min(least, lack)
-            if stalled >= _MAX_STALLED_ROUNDS:
-                break
-            if grid != self._full and self._is_over(found=False):
-                break
+            least, before = min(least, lack), kept.pairs
             (kept.widen if lack < _NO_LACK else kept.add)(near)
+            if kept.pairs != before:
+                least, stalled = math.inf, 0
+            is_over = grid != self._full and self._is_over(found=False)
+            if is_over or stalled >= _MAX_STALLED_ROUNDS:
+                break
         period = None if made is None else self._period
         raise UnusableCandidateError(kept.message(near[0], period))
 
