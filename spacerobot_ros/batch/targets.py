@@ -104,8 +104,9 @@ class Target:
 
         Parameters
         ----------
-        functions CasADi functions by driver name: ``FLIGHT`` and ``REPORT``, the tick without and
-            with report results; ``CONTROL``, the command for a state; ``HOLDING_STEP`` and
+        functions
+            CasADi functions by driver name: ``FLIGHT`` and ``REPORT``, the tick without and with
+            report results; ``CONTROL``, the command for a state; ``HOLDING_STEP`` and
             ``SHAPE_EQUATIONS``, for joints on their stops.
         declarations
             Declarations from :mod:`.native`.

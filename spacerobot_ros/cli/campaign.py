@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from spacerobot_ros.campaign.workers import Cluster
 
 
+_ENGINES = ("auto", "lanes", "flights", "cuda")
+
+
 def _checked_engine(context: click.Context, parameter: click.Parameter, name: str) -> str:
     from spacerobot_ros.campaign.config import require_engine
 
@@ -53,6 +56,9 @@ def campaign_command() -> None:
     show_default=True,
     metavar="NAME",
     callback=_checked_engine,
+    shell_complete=lambda _context, _parameter, begun: [
+        name for name in _ENGINES if name.startswith(begun)
+    ],
     help="Flight engine: auto, lanes, flights or cuda (cuda:1, cuda:single; see the docs).",
 )
 @click.option(
