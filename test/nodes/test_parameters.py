@@ -237,7 +237,7 @@ def test_a_refused_list_is_shown_as_a_list_and_not_to_its_end(harness: Harness) 
     planner = harness.make(KINDS["planner"], {"robot": "planar_manipulator"})
     (result,) = planner.set_parameters([Parameter("max_corrections", value=[2.5] * 50)])
     assert not result.successful
-    assert "is [2.5, 2.5, 2.5, 2.5, 2.5, 2.5, ...]; it must be a whole number" in result.reason
+    assert "is [2.5, 2.5, 2.5, 2.5, 2.5, 2.5, ...]; it must be a number." in result.reason
 
 
 def test_given_values_and_defaults_are_declared(harness: Harness) -> None:

@@ -135,7 +135,7 @@ def test_a_method_whose_options_do_not_suit_the_robot_is_left_out() -> None:
     urdf = (FOLDER / "planar_chain.urdf").read_text("utf-8")
     unlimited = re.sub(r' velocity="[^"]*"', ' velocity="0"', urdf, count=1)
     robot = SpaceRobot.from_urdf(unlimited)
-    with pytest.raises(PlanningError, match=r"optimal: Joint 'pin_1' is limited to 0 per second"):
+    with pytest.raises(PlanningError, match=r"optimal: Joint 'pin_1' has a velocity limit of 0"):
         auto(robot).plan(at(START["planar_chain"]), goal_of([0.0, 0.0, 0.2]))
 
 
