@@ -145,24 +145,19 @@ def momentum_change(momenta: Array, reference: Array) -> Array:
     return np.asarray(np.linalg.norm(difference.reshape(*difference.shape[:-1], 2, 3), axis=-1))
 
 
-def momentum_drift(momenta: Array, expected: Array | None = None) -> Array:
-    """Return the largest change (..., 2) in linear and angular momentum not explained by thrust.
+def momentum_drift(momenta: Array) -> Array:
+    """Return the largest change (..., 2) in linear and angular momentum.
 
-    The change is ``max |m(t) - m(0)|`` over each flight, where ``m`` are the momenta
-    without the contribution of the thrusters.
+    The change is ``max |m(t) - m(0)|`` over each flight, where ``m`` are the momenta without the
+    contribution of the thrusters.
 
     Parameters
     ----------
     momenta
         (..., N, 6) or more columns, the momenta first: kg m/s and kg m^2/s. Rows that are not
         finite are ignored.
-    expected
-        (N, 6) initial momenta plus the momenta produced by thrusters; if None, or if the number of
-        rows differs, no thrust is assumed.
     """
     m = momenta[..., :6]
-    if expected is not None and len(expected) == len(m):
-        m = m - expected
     finite = np.asarray(np.isfinite(m).all(axis=-1, keepdims=True))
     if not finite.any():
         return np.full((*m.shape[:-2], 2), np.nan)

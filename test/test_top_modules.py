@@ -201,6 +201,7 @@ def test_the_time_of_a_session_with_several_goals_is_that_of_the_last_one() -> N
         (5.0, status(reached, "first")),
         (20.0, status(tracking, "second")),
         (23.5, status(failed, "second")),
+        (24.5, status(failed, "second")),  # Nodes repeat their status.
         (25.0, status(ControllerState.REFUSED, "third")),
     ]
     assert measures.flown_time(session, 30.0) == 3.5
@@ -215,10 +216,6 @@ def test_momenta_of_a_flight() -> None:
     momenta[:, 0], momenta[:, 1], momenta[:, 5] = [1, 4, 1, 1], [1, 5, 1, 1], [0, 0, -2, 1]
     momenta[:, 6] = 99.0
     np.testing.assert_allclose(measures.momentum_drift(momenta), [5.0, 2.0])
-    expected = np.zeros((4, 6))
-    expected[:, 0] = [7, 10, 7, 7]
-    np.testing.assert_allclose(measures.momentum_drift(momenta, expected), [4.0, 2.0])
-    np.testing.assert_allclose(measures.momentum_drift(momenta, expected[:3]), [5.0, 2.0])
     momenta[0, 3] = math.nan
     np.testing.assert_allclose(measures.momentum_drift(momenta), [5.0, 2.0])
     assert np.isnan(measures.momentum_drift(momenta[:1])).tolist() == [True, True]

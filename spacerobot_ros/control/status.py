@@ -183,7 +183,8 @@ _COMMAND_FORMAT = KeyValueFormat(
 
 
 def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | None:
-    """Return the time from the first tracked state to the last goal decision, s.
+    """Return the time from the first tracked state to the last goal decision, s, which later
+    statuses repeat.
 
     Parameters
     ----------
@@ -191,11 +192,14 @@ def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | No
         Times (s) and states of the controller statuses; without a tracked state or a decision, the
         result is None.
     """
-    given = list(states)
-    began = [time for time, state in given if state is ControllerState.TRACKING]
-    ended = [
-        time
-        for time, state in given
-        if state.decided and state is not ControllerState.REFUSED and began and time >= began[0]
-    ]
-    return ended[-1] - began[0] if ended else None
+    began = ended = None
+    decided = False
+    for time, state in states:
+        if began is None and state is ControllerState.TRACKING:
+            began = time
+        if began is None or state is ControllerState.REFUSED:
+            continue
+        if state.decided and not decided:
+            ended = time
+        decided = state.decided
+    return None if began is None or ended is None else ended - began

@@ -69,6 +69,9 @@ _QUANTITY_SIZES = {
 }
 """Number of values per sample, by quantity; other quantities have one value per joint."""
 
+_SAME_TICK_SHARE = 0.4
+"""Largest difference, as a fraction of a tick, between log times of messages of the same tick."""
+
 _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 
 _PARTS: frozenset[Controlled] = frozenset(("position", "attitude", "shape", "end_effectors"))
@@ -501,11 +504,26 @@ class FlightData:
         return float(found[-1]) if found else None
 
     @cached_property
+    def unexplained_momentum(self) -> Signal:
+        """Momenta and energy (N, 7) without the change in momenta due to thrusters, at the times
+        for which this change is known; if it is for none, no thrust is assumed."""
+        balance, expected = self.signal("momentum"), self.signal("expected_momenta")
+        if not len(balance) or not len(expected):
+            return balance
+        # Recordings may begin or end between the two, and log them at slightly different times.
+        gaps = np.diff(balance.time)
+        near = _SAME_TICK_SHARE * float(np.median(gaps)) if len(gaps) else 0.0
+        of = np.searchsorted(expected.time, balance.time - near).clip(max=len(expected) - 1)
+        at = np.flatnonzero(np.abs(expected.time[of] - balance.time) <= near)
+        values = balance.values[at]
+        values[:, :6] -= expected.values[of[at]]
+        return Signal(balance.time[at], values)
+
+    @cached_property
     def momentum_drift(self) -> Array:
         """(2,) drift of the linear and angular momentum, kg m/s and kg m^2/s; see
         :func:`~spacerobot_ros.measures.momentum_drift`."""
-        expected = self.series.get("expected_momenta")
-        return momentum_drift(self.momentum, None if expected is None else expected.values)
+        return momentum_drift(self.unexplained_momentum.values)
 
     @cached_property
     def clearance(self) -> FlightClearance | None:

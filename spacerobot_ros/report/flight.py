@@ -103,16 +103,6 @@ class FlightReport(Flight):
         revolutions."""
         return Signal(self.time, rotvecs(self.pose[:, 3:]))
 
-    @cached_property
-    def unexplained_momentum(self) -> Signal:
-        """Momenta and energy (N, 7), without the momenta produced by thrusters."""
-        balance, expected = self.signal("momentum"), self.signal("expected_momenta")
-        if len(expected) != len(balance) or not len(balance):
-            return balance
-        values = balance.values.copy()
-        values[:, :6] -= expected.values - expected.values[0]
-        return Signal(balance.time, values)
-
     @property
     def tool(self) -> Signal:
         """End-effector pose in the world (N, 7)."""

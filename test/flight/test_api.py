@@ -227,6 +227,21 @@ class _HalfLaw(TransposedJacobianLaw):
         self.thresholds.append(self.singular_value_threshold)
 
 
+@pytest.mark.parametrize("lacking", [slice(6, None), slice(-6), slice(None)])
+@pytest.mark.parametrize("late", [0.0, 2e-5])
+def test_thrust_explains_the_momentum_in_a_recording_that_lacks_some(
+    lacking: slice, late: float
+) -> None:
+    """A controller starts after the plant, or a recording ends; wall times differ a little."""
+    flight = fly("coordinated_control", parameters={"coordinated_control.time_limit": 2.0})
+    given = flight.signal("expected_momenta")
+    recorded = Signal(given.time[lacking] + late, given.values[lacking])
+    found = replace(flight, series={**flight.series, "expected_momenta": recorded})
+    moved = np.linalg.norm(flight.momentum[:, :3] - flight.momentum[0, :3], axis=1).max()
+    assert moved > 0.1
+    assert np.all(found.momentum_drift < 1e-9)
+
+
 @pytest.fixture
 def _laws() -> Iterator[None]:
     """Leave the registry as it was."""
