@@ -62,7 +62,8 @@ class Recording:
     writer
         The bag, which is closed together with the recording.
     clock_wait
-        Longest time that the first message waits for a clock, wall time in s.
+        Longest time that the first message waits for a clock, wall time in s; messages on
+        preliminary channels wait with it.
     on_failure
         Called once, with the reason, if writing fails.
     wall_time
@@ -89,6 +90,9 @@ class Recording:
         """Number of messages on each topic that were published but never received."""
         self.attached: set[str] = set()
         """Names of the files attached to the bag."""
+        self.preliminary: set[int] = set()
+        """Channels of messages that other nodes publish before a plant starts: they do not start
+        the wait for its clock."""
         self.latched: dict[int, _EarlyMessage | None] = {}
         """Last message of each latched topic received during a pause, by channel."""
         self.failure: RecordingError | None = None
@@ -157,10 +161,10 @@ class Recording:
 
     def flush(self, clock_is_published: bool) -> None:
         """Write buffered data to the file once per flush period (wall time)."""
-        if self.early_messages and not clock_is_published:
-            waited_ns = self._wall_time() - self.early_messages[0].arrival_ns
-            if waited_ns > self._clock_wait_ns:
-                self._choose_time_base(RecordingState.ON_WALL_TIME)
+        first = next((x for x in self.early_messages if x.channel not in self.preliminary), None)
+        waited_ns = self._wall_time() - first.arrival_ns if first is not None else 0
+        if waited_ns > self._clock_wait_ns and not clock_is_published:
+            self._choose_time_base(RecordingState.ON_WALL_TIME)
         self._fail_on_error(self.writer.flush)
 
     def check(self) -> None:

@@ -26,6 +26,7 @@ from spacerobot_ros.bag import (
     RecordingState,
 )
 from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS
 from spacerobot_ros.errors import (
     CommandError,
     ParameterError,
@@ -58,8 +59,18 @@ from spacerobot_ros.version import __version__
 RawCallback = Callable[[bytes], None]
 
 _CLOCK_TOPIC = "/clock"
+
 _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
 _DESCRIPTION_TOPIC = "robot_description"
+
+_PRELIMINARY_TOPICS = tuple(
+    f"/{name}"
+    for name in (
+        *(status for status, _ in STATUS_TOPICS.values()),
+        *("events", "diagnostics", "heartbeat", "goal_pose", "goal_path", _DESCRIPTION_TOPIC),
+    )
+)
+"""Ends of topics on which commanders and clients publish before a plant starts."""
 
 _TEXT_TYPE = "std_msgs/msg/String"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -334,6 +345,8 @@ class RecorderNode(FlightNode):
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
         self.topics.add(topic)
+        if topic.endswith(_PRELIMINARY_TOPICS):
+            recording.preliminary.add(channel)
         self._request_parameters(topic, publishers[0])
         listener = None
         if self._transforms is not None:

@@ -127,6 +127,24 @@ def test_without_a_clock_messages_carry_the_wall_time_of_their_arrival(bench: Be
     ]
 
 
+def test_messages_from_before_the_plant_wait_for_its_clock(bench: Bench) -> None:
+    recording = bench.recording
+    recording.preliminary.add(bench.a)
+    recording.start()
+    recording.record(bench.a, b"waits for a robot")
+    bench.wall_ns += 60 * S
+    recording.flush(clock_is_published=False)
+    assert recording.state.value == "waiting"
+    recording.record(bench.b, b"pose", 7)
+    bench.wall_ns += S
+    recording.flush(clock_is_published=False)
+    recording.set_clock(4 * S)
+    assert bench.written() == [
+        ("/a", "waits for a robot", 4 * S, 4 * S),
+        ("/b", "pose", 4 * S, 7),
+    ]
+
+
 def test_a_pause_keeps_what_was_decided(bench: Bench) -> None:
     recording = bench.recording
     recording.start()
