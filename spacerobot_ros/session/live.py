@@ -121,6 +121,9 @@ _LONGEST_DISCOVERY = 10.0  # wall s
 _LONGEST_STATUS_WAIT = 1.0
 """Wall time, s, to wait for the status of earlier goals before a new goal is sent."""
 
+_LONGEST_RECORDER_WAIT = 1.0
+"""Wall time, s, to wait until recorders have subscribed to the goal topics."""
+
 _CHECK_PERIOD = 0.1
 
 
@@ -261,6 +264,9 @@ def _find_goal_commander(
                     executor.spin_once(timeout_sec=0.05)
                 # Other subscribers may have been discovered in the meantime.
                 while not client.is_connected() and time.monotonic() < deadline:
+                    executor.spin_once(timeout_sec=0.05)
+                latest = time.monotonic() + _LONGEST_RECORDER_WAIT
+                while client.has_late_recorder() and time.monotonic() < latest:
                     executor.spin_once(timeout_sec=0.05)
                 _await_active(client, executor, deadline)
                 return client

@@ -14,6 +14,7 @@ from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
@@ -156,14 +157,18 @@ class MissionClient:
         """
         if not self._status_topic.get_publisher_count():
             return False
-        deciders, readers = (
-            {(each.node_namespace, each.node_name) for each in endpoints}
-            for endpoints in (
-                self.node.get_publishers_info_by_topic(self._status_topic.topic_name),
-                self.node.get_subscriptions_info_by_topic(self._goal_topic.topic_name),
-            )
-        )
-        return bool(deciders & readers)
+        deciders = self.node.get_publishers_info_by_topic(self._status_topic.topic_name)
+        return bool(_names_of(deciders) & self._readers(self._goal_topic.topic_name))
+
+    def has_late_recorder(self) -> bool:
+        """Whether a node that follows events and states does not subscribe to goals yet: a
+        recorder does once it has discovered this client.
+        """
+        followers = self._readers("events") & self._readers("odom")
+        return bool(followers - self._readers(self._goal_topic.topic_name))
+
+    def _readers(self, topic: str) -> set[tuple[str, str]]:
+        return _names_of(self.node.get_subscriptions_info_by_topic(topic))
 
     def send(self, goal: Goal, end_effector: Goal | None = None) -> None:
         """Publish base and end-effector goal poses, if any.
@@ -259,3 +264,8 @@ class MissionClient:
         if self.goal_id is None or self._follower.is_about_goal(status):
             return False
         return bool(status.goal_id) or status.state.decided
+
+
+def _names_of(endpoints: Sequence[TopicEndpointInfo]) -> set[tuple[str, str]]:
+    """Return the namespaces and names of the nodes of endpoints."""
+    return {(each.node_namespace, each.node_name) for each in endpoints}
