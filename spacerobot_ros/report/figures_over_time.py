@@ -61,10 +61,6 @@ _LABEL_HEIGHT = 0.17
 _DUTY_ROW_HEIGHT = 0.8
 """Height of a duty cycle of 1, relative to the row height."""
 
-_EVENTS_CAPTION = (
-    " Events below the time axis: goals and plans in the upper row, robot and faults below."
-)
-
 
 def draw_group(axes: Axes, group: TraceGroup, end: float, later: Sequence[float] = ()) -> None:
     """Draw traces from zero to an end time, s, and marks at the start times ``later`` of further
@@ -170,10 +166,7 @@ def time_figure(
         caption += "; dashed: goal"
     if any(group.limits and group.limit_name == LIMIT for group in groups):
         caption += "; dotted: URDF limits, if in range"
-    caption += "."
-    if flight.timed_events:
-        caption += _EVENTS_CAPTION
-    return ReportFigure(name, heading, caption, figure, groups)
+    return ReportFigure(name, heading, f"{caption}.", figure, groups)
 
 
 def figure_of_flights(

@@ -49,6 +49,14 @@ _CHART_SLICES = 500
 
 _MAX_CHART_EVENTS = 500
 
+_IDLE = ("waiting", "idle", "holding")
+"""States without a goal."""
+
+_EVENTS_CAPTION = (
+    " Events below the time axis: goals and plans in the upper row, robot and faults below."
+)
+"""Caption of the strip below the first chart."""
+
 _FOLDED = ("velocities", "efforts", "twist")
 """Names of the collapsed figures."""
 
@@ -83,10 +91,10 @@ def page(
         *_events_html(flight.timed_events),
         "<h2>Figures</h2>",
         _CHART_HELP if charts.data else "",
-        *_figures_html(figures),
+        *_figures_html(figures, has_events=bool(flight.timed_events)),
         *_parameters_html(flight),
     ]
-    return html_page(title, body, _footer_text(flight), (player, charts))
+    return html_page(title, body, _footer_text([flight, *beside]), (player, charts))
 
 
 def _facts_html(flight: FlightReport) -> str:
@@ -110,7 +118,10 @@ def _outcome_html(flight: FlightReport) -> str:
             '<p class="outcome">The bag contains no planner or controller status '
             "(planner/status, controller/status).</p>"
         )
-    (_, last), verdict = flight.timed_statuses[-1], flight.verdict
+    statuses, verdict = [each for _, each in flight.timed_statuses], flight.verdict
+    # A controller holds its pose after it has refused a goal.
+    of_goals = (x for x in reversed(statuses) if isinstance(x, str) or x.state.value not in _IDLE)
+    last = next(of_goals, statuses[-1])
     tone = "" if isinstance(last, str) else last.state.value
     word, sentence = tone.capitalize(), last if isinstance(last, str) else last.message
     if tone == "executing":
@@ -165,17 +176,19 @@ def _table_html(identity: str, given: Table) -> str:
     return table(identity, given.head, given.rows, given.numeric)
 
 
-def _figures_html(figures: Figures) -> list[str]:
+def _figures_html(figures: Figures, *, has_events: bool) -> list[str]:
     parts, first_chart = [], 0
     for sentence in dict.fromkeys(each for each in figures if isinstance(each, str)):
         parts.append(f'<p class="missing">{escape(sentence)}</p>')
     drawn = [each for each in figures if isinstance(each, ReportFigure)]
     for number, each in enumerate(drawn, start=1):
         numbers = " ".join(str(first_chart + k) for k in range(len(each.groups)))
-        first_chart += len(each.groups)
         charts = f' data-charts="{numbers}"' if numbers else ""
         heading = escape(each.heading)
         caption = f"<b>Figure {number}. {heading}.</b> {escape(each.caption)}"
+        if has_events and each.groups and first_chart == 0:
+            caption += _EVENTS_CAPTION
+        first_chart += len(each.groups)
         shown = figure(each.name, each.svg, each.heading, caption, charts)
         if each.name in _FOLDED:
             shown = f"<details><summary>{heading}</summary>{shown}</details>"
@@ -212,13 +225,12 @@ def _parameters_html(flight: FlightReport) -> list[str]:
     return parts
 
 
-def _footer_text(flight: FlightReport) -> str:
-    version = flight.bag.metadata.get("spacerobot", {}).get("version", "")
+def _footer_text(flights: Sequence[FlightReport]) -> str:
+    bag = flights[0].bag
+    version = bag.metadata.get("spacerobot", {}).get("version", "")
     by = f", recorded by spacerobot_ros {version}" if version else ""
-    return (
-        f"Created from the bag {flight.bag.path.name} alone: "
-        f"{flight.bag.message_count} messages{by}."
-    )
+    names = " and ".join(each.bag.path.name for each in flights)
+    return f"Created from {names} alone; {bag.path.name} has {bag.message_count} messages{by}."
 
 
 # -- charts -------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from html import escape
@@ -437,14 +438,28 @@ def test_goals_and_flights_that_are_refused(words: list[str], sentence: str) -> 
     assert sentence in " ".join(result.stderr.split())
 
 
-def test_a_refused_goal_has_its_report_if_asked(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("sliding_masses", "--goal", "50", "0", "0", "0", "0", "0", "1"),
+        # The controller then holds its pose, which is no outcome.
+        ("coordinated_control", "--method", "computed_torque"),
+    ],
+)
+def test_a_refused_goal_has_its_report_if_asked(words: tuple[str, ...], tmp_path: Path) -> None:
     bag, html = tmp_path / "a.mcap", tmp_path / "a.html"
-    goal = ("--goal", "50", "0", "0", "0", "0", "0", "1")
-    words = ["run", "sliding_masses", *goal, "--bag", str(bag), "--report", str(html)]
-    result = CliRunner().invoke(main, words)
+    files = ["--bag", str(bag), "--report", str(html)]
+    result = CliRunner().invoke(main, ["run", *words, *files])
     assert result.exit_code == 1
     assert result.stdout == f"report      {html}\n"
-    assert escape(result.stderr.strip()) in html.read_text("utf-8")
+    page = html.read_text("utf-8")
+    outcome = re.search(r'<p class="outcome refused">(.*?)</p>', page)
+    assert outcome is not None
+    # The strip of events is below the first chart alone; the first page has no charts.
+    assert page.count("Events below the time axis") == ("computed_torque" in words)
+    # The base and the end-effector each have a reason.
+    reason = "computed_torque" if "computed_torque" in words else escape(result.stderr.strip())
+    assert reason in outcome[1]
 
 
 @pytest.mark.parametrize(

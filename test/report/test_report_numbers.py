@@ -542,7 +542,7 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
         "Attitude error0.3 rad17.2°",
         "Figure 1. Heading. Caption.",
         "tick_rate20.0",
-        f"Created from the bag flight.mcap alone: {found.bag.message_count} messages, "
+        f"Created from flight.mcap alone; flight.mcap has {found.bag.message_count} messages, "
         "recorded by spacerobot_ros 1.2.3.",
     ):
         assert words in content.text, words
