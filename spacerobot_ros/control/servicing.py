@@ -156,6 +156,16 @@ _LATEST_BEGIN = 0.1
 """Longest start delay of a motion, s."""
 
 
+class _Deviation(Enum):
+    """Where a target deviates from the motion that was predicted for the present plan."""
+
+    NONE = "none"
+    NOW = "now"
+    """It does at present, or there is no plan yet."""
+    AT_CONTACT = "at contact"
+    """It would at contact, according to the average of its momenta, but does not at present."""
+
+
 class ApproachTask:
     """An approach, planned at its first state and replanned if the target deviates from its
     predicted motion.
@@ -176,8 +186,10 @@ class ApproachTask:
         self._job: PlanningJob[GrappleReference] | None = None
         """The job that plans an approach."""
         self._lead = PLANNING_TIME
-        self._looks_ahead, self._off_later = True, False
-        """Whether deviations at contact count, and whether only such a one was found."""
+        self._reason = _Deviation.NOW
+        """Why the latest plan was asked for."""
+        self._looks_ahead = True
+        """Whether deviations at contact count: not after a plan for one was not found."""
 
     def step(
         self,
@@ -203,15 +215,23 @@ class ApproachTask:
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
-        off = self._plan is None or self._is_off_prediction(target.motion)
+        deviation = self._deviation(target.motion) if self._job is None else _Deviation.NONE
+        if deviation is not _Deviation.NONE:
+            self._reason = deviation
         try:
-            if controller.planner is not None:
-                self._plan_motion(time, state, controller, off=off, in_background=in_background)
-            elif off:
-                self._make_plan(time, state, controller, target.body)
+            if controller.planner is None:
+                if deviation is not _Deviation.NONE:
+                    self._make_plan(time, state, controller, target.body)
+            else:
+                if deviation is not _Deviation.NONE:
+                    self._start_job(time, state, controller, in_background=in_background)
+                self._take_plan(time, controller, in_background=in_background)
         except PlanningError as error:
-            why = str(error).rstrip(".")
-            return self._ended(f"{why[0].lower()}{why[1:]}")
+            if self._reason is not _Deviation.AT_CONTACT:
+                why = str(error).rstrip(".")
+                return self._ended(f"{why[0].lower()}{why[1:]}")
+            # The target is where it was predicted to be: the robot goes on with the present plan.
+            self._looks_ahead = False
         if self._plan is None:
             return _ACTIVE
         plan, now = self._plan, time - self._planned_at
@@ -264,63 +284,58 @@ class ApproachTask:
             return TaskProgress(TaskState.REFUSED, f"The approach is refused: {why}.")
         return TaskProgress(TaskState.FAILED, f"The approach is aborted: {why}.")
 
-    def _is_off_prediction(self, measured: BodyMotion) -> bool:
-        """Whether the target deviates from its prediction now, or would at contact."""
-        assert self._predicted is not None
+    def _deviation(self, measured: BodyMotion) -> _Deviation:
+        if self._predicted is None:
+            return _Deviation.NOW
         assert self.target.body is not None
         elapsed = max(self.target.time - self._planned_at, 0.0)
         expected = self._predicted.grapple([elapsed]).body_motion()
         if _is_off(expected, measured.at(self.target.body.grapple)):
             self.target.forget_momenta()
-            self._off_later = False
-            return True
+            return _Deviation.NOW
         ahead = self._looks_ahead and self.target.has_new_average
         if not ahead or self._contact <= elapsed:
-            return False
+            return _Deviation.NONE
         expected = self._predicted.grapple([self._contact]).body_motion()
         later = self.target.free_motion().grapple([self._contact - elapsed])
-        self._off_later = _is_off(expected, later.body_motion())
-        return self._off_later
+        is_off = _is_off(expected, later.body_motion())
+        return _Deviation.AT_CONTACT if is_off else _Deviation.NONE
 
-    def _plan_motion(
+    def _start_job(
         self,
         time: float,
         state: ControlState,
         controller: CoordinatedController,
         *,
-        off: bool,
         in_background: bool,
     ) -> None:
-        """Have base and arm planned together, anew where the target is off its prediction, and
-        begin with a plan that is ready; until then the robot goes on with an earlier one.
-        """
+        """Have base and arm planned together."""
         options, target = self.config.target, self.target
-        if self._job is None and off:
-            grapple = Grapple(
-                target.free_motion().later(max(time - target.time, 0.0)),
-                target.description,
-                options.clearance,
-                options.horizon,
-                options.detumble == "before",
-                options.standoff,
-                options.corridor_angle,
-                options.corridor_length,
-            )
-            lead = self._lead if in_background else 0.0
-            self._job = controller.plan_grapple(time, state.copied(), grapple, lead)
-            self._job.start(in_background=in_background)
-        job = self._job
+        grapple = Grapple(
+            target.free_motion().later(max(time - target.time, 0.0)),
+            target.description,
+            options.clearance,
+            options.horizon,
+            options.detumble == "before",
+            options.standoff,
+            options.corridor_angle,
+            options.corridor_length,
+        )
+        lead = self._lead if in_background else 0.0
+        self._job = controller.plan_grapple(time, state.copied(), grapple, lead)
+        self._job.start(in_background=in_background)
+
+    def _take_plan(
+        self, time: float, controller: CoordinatedController, *, in_background: bool
+    ) -> None:
+        """Begin with a plan of base and arm that is ready; until then the robot goes on with an
+        earlier one.
+        """
+        options, job = self.config.target, self._job
         if job is None or not job.done or time < job.begins:
             return
         self._job = None
-        try:
-            planned = job.result()
-        except PlanningError:
-            if self._plan is None or not self._off_later:
-                raise
-            # The target is where it was predicted to be: the robot goes on with the present plan.
-            self._looks_ahead = False
-            return
+        planned = job.result()
         self._looks_ahead = True
         if time - job.begins > _LATEST_BEGIN and in_background:
             # Robot and target have gone on.
@@ -368,7 +383,7 @@ class ApproachTask:
         reach = ArmReach(law.robot, outputs.end_effector_link, axes, state, rates)
         plan = plan_approach(target, held, options, self.config.motion, reach, axes, clearance)
         self._plan, self._start, self._contact = plan, plan.start, plan.contact
-        self._predicted, self._planned_at = target, time
+        self._predicted, self._planned_at, self._looks_ahead = target, time, True
         starts, closes, contact = (
             time + each for each in (plan.start, plan.closing_time, plan.contact)
         )

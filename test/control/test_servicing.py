@@ -281,6 +281,21 @@ def test_a_target_that_strays_is_approached_anew_and_one_that_leaves_is_given_up
     assert_one_sentence(loop.status.message, "aborted: the target is out of reach")
 
 
+def test_an_approach_goes_on_if_no_plan_for_a_deviation_at_contact_is_found() -> None:
+    """According to its rates the target leaves, but it is where it was predicted to be."""
+    loop = Meeting()
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer(3)
+    loop.seen = False
+    pose, rates = np.concatenate([loop.block, UPRIGHT]), np.array([9.0, 0, 0, 0, 0, 0])
+    while (loop.tick + 1) * PERIOD < loop.contact - 0.1:
+        loop.executive.servicing.target.measure((loop.tick + 1) * PERIOD, pose, rates)
+        loop.answer()
+        assert loop.state == "tracking"
+    assert loop.tick > 110, "the rates are averaged over 100 measurements"
+    assert loop.kinds().count("approach_started") == 1
+
+
 def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
     # The robot of the test stays where it is.
     any_error = {"error_margin.position": 0.0, "error_margin.attitude": 0.0}
