@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
-import time
+from threading import Condition
 
 import numpy as np
 import numpy.typing as npt
@@ -238,10 +238,26 @@ _LOG = logging.getLogger("spacerobot_ros.planning.somewhere")
 
 
 class Terminal(io.StringIO):
-    """What is written to a terminal."""
+    """What is written to a terminal, or to a file."""
+
+    def __init__(self, *, is_terminal: bool = True) -> None:
+        super().__init__()
+        self._is_terminal, self._written = is_terminal, Condition()
 
     def isatty(self) -> bool:
-        return True
+        return self._is_terminal
+
+    def write(self, text: str) -> int:
+        with self._written:
+            count = super().write(text)
+            self._written.notify_all()
+        return count
+
+    def await_words(self, words: str, times: int = 1) -> None:
+        """Wait until words have been written some times."""
+        with self._written:
+            came = self._written.wait_for(lambda: self.getvalue().count(words) >= times, 20.0)
+        assert came, (words, self.getvalue())
 
 
 def test_a_search_reports_every_start_and_the_best_so_far() -> None:
@@ -273,12 +289,7 @@ def test_a_long_search_and_flight_are_shown_by_a_line_that_stays_true(
     monkeypatch.setenv("COLUMNS", "60")
     shown = Display("arm", period=0.01)
 
-    def await_line(words: str) -> None:
-        end = time.monotonic() + 20.0
-        while words not in terminal.getvalue():
-            assert time.monotonic() < end, (words, terminal.getvalue())
-            time.sleep(0.01)
-
+    await_line = terminal.await_words
     await_line("preparing arm for 0 s")
     shown.show_line("Compiling.")
     shown.search(SearchProgress(1, 8))
@@ -305,13 +316,10 @@ def test_short_work_is_not_shown_and_without_a_terminal_there_are_lines(
         shown.show_line("Compiling.")
         shown.fly(1.0, 2.0)
     assert capsys.readouterr() == ("", "")
-    lines = io.StringIO()
+    lines = Terminal(is_terminal=False)
     monkeypatch.setattr("sys.stderr", lines)
     shown = Display("arm", period=0.01)
     shown.fly(1.0, 2.0)
-    end = time.monotonic() + 20.0
-    while lines.getvalue().count("flying arm for 0 s: 1.0 of 2.0 s\n") < 2:
-        assert time.monotonic() < end, lines.getvalue()
-        time.sleep(0.01)
+    lines.await_words("flying arm for 0 s: 1.0 of 2.0 s\n", times=2)
     shown.close()
     assert "\r" not in lines.getvalue()
