@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from spacerobot_ros.errors import sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.events import event_style, event_text
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
@@ -130,6 +131,7 @@ def _outcome_html(flight: FlightReport) -> str:
         word, sentence = verdict.word, verdict.sentence
     if tone.startswith("reached"):
         tone = "reached" if verdict.complete else "reached partly"
+    sentence = sentence_case(sentence.removeprefix(f"{word}: "))  # Aborted goals say so, too.
     state = f"<b>{escape(word)}</b>" if word else ""
     return f'<p class="outcome {escape(tone)}">{state}{unbroken(sentence)}</p>'
 

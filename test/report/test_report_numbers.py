@@ -549,6 +549,9 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
     assert found.bag.message_count == 1 + 3 + 4 * 3
     assert "nobody" not in content.text
     assert "<title>a_scenario, lie_bracket, tester</title>" in text
+    stopped = planner(PlannerState.ABORTED, 6.5, "Aborted: this node was deactivated.")
+    ended = flight(tmp_path, (FLOWN[0], stopped), name="ended.mcap")
+    assert "<b>Aborted</b>This node was deactivated." in page(ended, PagePart(""), [])
     cut = flight(tmp_path, FLOWN[:2], name="cut.mcap")
     assert "The recording ends before the outcome is known." in page(cut, PagePart(""), [])
 
