@@ -730,7 +730,11 @@ class _Search:
     def _shorten(
         self, kept: KeptDistances, grid: _Grid, path: Trajectory, made: Manoeuvre | None
     ) -> tuple[Trajectory, Manoeuvre | None]:
-        """Return a faster path near to a clear one, and its held commands; else that one itself."""
+        """Return a faster path near to a clear one, and its held commands; else that one itself.
+
+        On the full grid, a path without held commands may be replaced by a faster one that is not
+        clear.
+        """
         self._begin(SearchPhase.SHORTENING)
         reach, limits = 1.0, self._problem.limits
         for number in range(_MAX_SHORTENING_ROUNDS):
