@@ -27,7 +27,7 @@ from spacerobot_ros.cli.options import (
     write_json,
 )
 from spacerobot_ros.cli.terminal import display, fail
-from spacerobot_ros.errors import ParameterError, SpaceRobotError, quantity
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
@@ -83,7 +83,9 @@ def plan_command(
         fastest,
         try_method,
     )
+    from spacerobot_ros.planning.core.goal import missed_parts, reached_message
     from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
+    from spacerobot_ros.planning.execution.status import describe_remaining_error
     from spacerobot_ros.scenario import parse_setting, scenario_or_robot
 
     for text in settings:
@@ -105,9 +107,10 @@ def plan_command(
     trial = fastest(plans) if comparing and method == "auto" else plans.get(method)
     if not isinstance(trial, PlanEvaluation):
         fail()
-    left = _distance_from(problem.goal, trial)
+    tolerance = problem.config.tolerance
+    left = describe_remaining_error(trial.error, trial.controls, tolerance, problem.goal)
     if not comparing:
-        click.echo(f"{scenario}, {method}: {trial.duration:.6g} s, ends {left}")
+        click.echo(f"{scenario}, {method}: {trial.duration:.6g} s; {left}")
         click.echo(f"planned in {trial.plan_time:.3f} s")
         if problem.config.clearance:
             click.echo(_clearance_line(problem, trial))
@@ -131,16 +134,10 @@ def plan_command(
         click.echo(f"picture     {picture}")
     if not trial.reached:
         stopped = trial.pieces[-1].notes.get("stopped", "")
-        fail(f"The goal is not reached within the planner's tolerance: {left}. {stopped}".rstrip())
-
-
-def _distance_from(goal: Goal, trial: PlanEvaluation) -> str:
-    if not goal.end_effectors:
-        angle, distance = quantity(trial.error.angle, "rad"), quantity(trial.error.distance, "m")
-        return f"{angle} and {distance} from the goal"
-    from spacerobot_ros.planning.execution.status import describe_remaining_error
-
-    return describe_remaining_error(trial.error, trial.controls - {"shape"})
+        fail(f"The goal is not reached: the plan ends {left}. {stopped}".rstrip())
+    missed = missed_parts(problem.goal, trial.error, trial.controls, tolerance)
+    if missed:
+        fail(reached_message(left, missed))
 
 
 def _clearance_line(problem: PlanningProblem, trial: PlanEvaluation) -> str:

@@ -392,7 +392,8 @@ def test_the_lines_of_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.stderr == ""
     # Three ticks at 50 Hz.
     assert result.stdout == (
-        "planar_chain, square_path: 0.06 s, ends 45.6 mrad and 12.3 mm from the goal\n"
+        "planar_chain, square_path: 0.06 s; 45.6 mrad from the goal "
+        "(tolerance 0.2 mrad; position not controlled)\n"
         "planned in 0.679 s\n"
         "clearance   no link pairs are checked (1 disabled by the SRDF)\n"
     )
@@ -419,8 +420,8 @@ def test_a_plan_that_misses_its_goal_is_exit_1_and_a_sentence(
     result = plan(monkeypatch, False, *PLANAR)
     assert result.exit_code == 1
     assert result.stderr == (
-        "The goal is not reached within the planner's tolerance: "
-        "45.6 mrad and 12.3 mm from the goal.\n"
+        "The goal is not reached: the plan ends 45.6 mrad from the goal "
+        "(tolerance 0.2 mrad; position not controlled).\n"
     )
 
 
@@ -431,7 +432,14 @@ def test_a_real_plan_that_misses_a_tight_tolerance_is_exit_1(
     words = (*PLANAR, "--set", "planner.attitude_tolerance=1e-17")
     result = CliRunner().invoke(main, ["plan", *words])
     assert result.exit_code == 1
-    assert "is not reached within the planner's tolerance" in result.stderr
+    assert "The goal is not reached: the plan ends < 1 µrad" in result.stderr
+
+
+def test_a_plan_that_leaves_a_requested_position_is_exit_1(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = plan(monkeypatch, True, *PLANAR, "--goal", "0.1", "0", "0")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("The goal is reached but for its position, which is 0.0123 m")
+    assert result.stdout.splitlines()[0].endswith("position not controlled)")
 
 
 def test_the_json_of_a_plan(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
