@@ -57,6 +57,12 @@ def numbers(values: Iterable[float], digits: int = 5) -> str:
     return ", ".join(f"{round(float(x), digits) + 0.0:.{digits}f}" for x in values)
 
 
+def enumeration(words: Iterable[str]) -> str:
+    """Return words as "a", "a and b" or "a, b and c"."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def shortened(name: str, length: int = 21) -> str:
     """Return a name, shortened in the middle if the name is too long for a label."""
     half = (length - 1) // 2

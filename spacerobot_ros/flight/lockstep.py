@@ -338,9 +338,7 @@ class LockstepFlight:
                 return self._interruption
             if time.perf_counter() - reported_at >= _PROGRESS_PERIOD:
                 reported_at = time.perf_counter()
-                status = self._status
-                end = status.ends_at_s if isinstance(status, PlannerStatus) else 0.0
-                if progress(self.time, end):
+                if progress(self.time, self._status.ends_at_s if self._status else 0.0):
                     return self._interruption
 
     @property

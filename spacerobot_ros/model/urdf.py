@@ -21,7 +21,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
-from spacerobot_ros.errors import RobotDescriptionError, reason
+from spacerobot_ros.errors import RobotDescriptionError, enumeration, reason
 from spacerobot_ros.files import read_regular, warn_once
 from spacerobot_ros.model import xacro_files
 from spacerobot_ros.model.description import (
@@ -368,7 +368,7 @@ def _name_limits_not_read(root: Element) -> None:
     ignored = [name for name in _LIMITS_NOT_READ if name in given]
     if ignored:
         warn_once(
-            f"The limits of {' and '.join(ignored)} in the URDF of '{root.get('name', '')}' are "
+            f"The limits of {enumeration(ignored)} in the URDF of '{root.get('name', '')}' are "
             "ignored; only position, velocity and effort limits are enforced."
         )
 
@@ -715,7 +715,7 @@ def _read_kind(joint: Element, where: str) -> JointKind:
     if kind not in kinds:
         raise RobotDescriptionError(
             f"The type of {where} is '{kind}'; a free-floating tree has "
-            f"{', '.join(kinds[:-1])} and {kinds[-1]} joints. The base floats "
+            f"{enumeration(kinds)} joints. The base floats "
             "freely: remove any joint that connects it to a world, and that world's link."
         )
     return JointKind(kind)

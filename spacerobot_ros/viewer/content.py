@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Generic, TypeVar
 
-from spacerobot_ros.errors import ParameterError, numbers, quantity, shortened
+from spacerobot_ros.errors import ParameterError, enumeration, numbers, quantity, shortened
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal, PoseError
@@ -366,7 +366,7 @@ def _errors_text(
         texts.append(quantity(error, unit) + " (not controlled)" * free)
         bounds += [] if free or tolerance is None else [quantity(limit, unit)]
     within = f" (tolerance {', '.join(bounds)})" if bounds else ""
-    return f"{' and '.join(texts)} from its goal{within}"
+    return f"{enumeration(texts)} from its goal{within}"
 
 
 def _task_before_goals(state: StackState) -> str:

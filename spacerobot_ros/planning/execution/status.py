@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any, Literal, NamedTuple
 
-from spacerobot_ros.errors import AT_JOINTS, quantity
+from spacerobot_ros.errors import AT_JOINTS, enumeration, quantity
 from spacerobot_ros.events import (
     INTEGER,
     KeyValueField,
@@ -463,7 +463,8 @@ def describe_remaining_error(
     hand = parts.pop("end_effectors", "") if "end_effectors" in controls else ""
     if hand:
         hand = f"end-effectors at most {hand}" if several else f"end-effector {hand}"
-    body = " and ".join(text for part, text in parts.items() if part in controls)
+    controlled = [text for part, text in parts.items() if part in controls]
+    body = enumeration(controlled) if controlled else ""
     remaining = f"{body or hand} from the goal"
     if body and hand:
         remaining += f", {hand} from {'theirs' if several else 'its goal'}"
