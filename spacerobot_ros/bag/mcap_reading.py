@@ -8,6 +8,7 @@ user message.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shlex
 import struct
@@ -227,11 +228,25 @@ def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
     length = file.seek(0, os.SEEK_END)
     file.seek(max(length - size, 0))
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
+        if _is_being_written(file):
+            raise RecordingError(f"The bag {path} is still being written: stop its recorder first.")
         raise RecordingError(
             f"The bag {path} was cut short, because its writer was killed or its disk was full: "
             f"'spacerobot salvage {shlex.quote(str(path))}' recovers its content."
         )
     file.seek(0)
+
+
+def _is_being_written(file: BinaryIO) -> bool:
+    """Whether a writer, which locks its bag, still has it open."""
+    try:
+        fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # Some network file systems have no locks.
+        return False
+    fcntl.flock(file.fileno(), fcntl.LOCK_UN)
+    return False
 
 
 def file_size(file: BinaryIO) -> int:

@@ -65,6 +65,16 @@ def test_a_dangling_link_is_a_name_that_is_taken(tmp_path: Path) -> None:
     assert free_name(path) == tmp_path / "a-1.mcap"
 
 
+def test_a_bag_is_read_after_its_recorder_has_stopped(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with BagWriter(path) as writer:
+        writer.write(writer.add_topic("/a", STRING), string("000001"), 1, 1)
+        writer.flush()
+        with pytest.raises(RecordingError, match="is still being written: stop its recorder"):
+            read_bag(path)
+    assert numbers(path) == [1]
+
+
 @pytest.mark.parametrize("limits", [{}, {"max_size": 10_000}])
 @pytest.mark.parametrize("overwrite", [True, False])
 def test_two_recorders_do_not_share_a_file(
