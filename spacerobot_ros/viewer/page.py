@@ -10,6 +10,8 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import islice
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
@@ -471,6 +473,19 @@ class _Plot:
         return *curves, *known, line
 
 
+_REPEATED_NOTICES, _REPEATED_NOTICE_S = 6, 1.0
+"""A line is a repetition if one of so many before it, at most this simulated time earlier, s, has
+the same text and node."""
+
+
+def _repeats(notice: Notice, earlier: Notice) -> bool:
+    (name, now), (earlier_name, then) = (
+        (each.source.replace(".", "/").strip("/"), each.time_s or 0.0) for each in (notice, earlier)
+    )
+    same = (notice.message, name) == (earlier.message, earlier_name)
+    return same and abs(now - then) < _REPEATED_NOTICE_S
+
+
 class LogPanel:
     """Events and warnings, newest first."""
 
@@ -479,10 +494,9 @@ class LogPanel:
         self._notices: deque[Notice] = deque(maxlen=_MAX_SHOWN_NOTICES)
 
     def add(self, notice: Notice) -> None:
-        """Add a line to the log."""
-        if self._notices and self._notices[0] == notice:
-            return  # An immediate repetition is shown once.
-        self._notices.appendleft(notice)
+        """Add a line to the log, unless it repeats one: nodes also log what they publish."""
+        if not any(_repeats(notice, each) for each in islice(self._notices, _REPEATED_NOTICES)):
+            self._notices.appendleft(notice)
 
     def draw(self) -> None:
         """Redraw the lines."""
@@ -749,8 +763,9 @@ class Page:
         self._tolerance = tolerance
 
     def note(self, notice: Notice) -> None:
-        """Add a line to the log."""
-        self._log.add(notice)
+        """Add a line to the log; without a time, it has the time of the last state."""
+        timed = replace(notice, time_s=self._time_s) if notice.time_s is None else notice
+        self._log.add(timed)
 
     def announce(self, notice: Notice, seconds: float = _ANSWER_TIME_S) -> None:
         """Add a line to the log, and show it at the top of the page for a wall time in s."""

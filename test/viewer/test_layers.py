@@ -367,6 +367,29 @@ def test_news_stay_ten_seconds_or_until_the_stack_has_ended(server: Server, page
     assert "It is restarted." not in page._status.content
 
 
+def test_what_a_node_publishes_and_logs_is_one_line_with_its_time(
+    server: Server, page: Page
+) -> None:
+    page.update(FLYING, 1.0)
+    assert FLYING.measured is not None
+    time_s = FLYING.measured.time_s
+    page.note(Notice("The plan is late.", 1, time_s, "/planner"))
+    page.note(Notice("No command.", 1, None, "plant"))
+    page.note(Notice("The plan is late.", 1, None, "planner"))
+    page.update(FLYING, 2.0)
+    log = next(
+        str(each.content) for each in server.gui.elements if "No command." in str(each.shown)
+    )
+    assert log.count("The plan is late.") == 1
+    assert log.count(f"{time_s:.2f} s") == 2
+    page.note(Notice("The plan is late.", 1, time_s + 5.0, "/planner"))
+    page.update(FLYING, 3.0)
+    log = next(
+        str(each.content) for each in server.gui.elements if "No command." in str(each.shown)
+    )
+    assert log.count("The plan is late.") == 2
+
+
 def test_nothing_has_ended_where_nothing_has_begun() -> None:
     assert not content.has_stack_ended(StackState(silent={"/recorder": 3.0}))
 
