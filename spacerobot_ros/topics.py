@@ -68,10 +68,10 @@ class Topic:
         Topic name, relative to the robot's namespace or absolute.
     type
         Name of the message type, such as ``nav_msgs/msg/Odometry``.
-    publishers
-        The nodes that publish the topic; ``user`` for topics from outside the stack.
     meaning
         Description of the content.
+    publishers
+        The nodes that publish the topic; ``user`` for topics from outside the stack.
     condition
         Condition under which the topic exists; empty: always.
     latched
@@ -88,8 +88,8 @@ class Topic:
 
     name: str
     type: str
-    publishers: tuple[str, ...]
     meaning: str
+    publishers: tuple[str, ...] = ("plant",)
     condition: str = ""
     latched: bool = False
     state: tuple[StateField, ...] = ()
@@ -118,7 +118,6 @@ def _odometry(prefix: str) -> tuple[StateField, ...]:
     )
 
 
-_PUBLISHED_BY_PLANT = ("plant",)
 _PUBLISHED_BY_USER = ("user",)
 _ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
 _JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
@@ -134,11 +133,10 @@ _WRENCH_STAMPED_TYPE = "geometry_msgs/msg/WrenchStamped"
 # The plant publishes its state in this order: the clock first, so that a subscriber that sees a
 # state has seen its time; odom and joint_states late, because they set the commanders off.
 _TOPIC_TABLE = (
-    Topic("/clock", "rosgraph_msgs/msg/Clock", _PUBLISHED_BY_PLANT, "simulated time"),
+    Topic("/clock", "rosgraph_msgs/msg/Clock", "simulated time"),
     Topic(
         "base_pose",
         _POSE_STAMPED_TYPE,
-        _PUBLISHED_BY_PLANT,
         "true base link pose in the world, every `base_pose_period`",
         state=(StateField("pose", "pose", _POSE_MEMBERS),),
         every_tick=False,
@@ -146,7 +144,6 @@ _TOPIC_TABLE = (
     Topic(
         "end_effector_pose",
         _POSE_STAMPED_TYPE,
-        _PUBLISHED_BY_PLANT,
         "true pose of the link `end_effector_frame` in the world",
         condition="the robot has a link with that name",
         state=(StateField("pose", "end_effector_pose", _POSE_MEMBERS),),
@@ -154,7 +151,6 @@ _TOPIC_TABLE = (
     Topic(
         "end_effector/pose",
         _POSE_STAMPED_TYPE,
-        _PUBLISHED_BY_PLANT,
         "measured pose of the link in the world, from `odom` and `joint_states`; also `NAME/pose` "
         "of every link in the plant's `end_effectors`",
         condition="the plant's `end_effectors` list the link",
@@ -163,7 +159,6 @@ _TOPIC_TABLE = (
     Topic(
         "momentum",
         _ARRAY_TYPE,
-        _PUBLISHED_BY_PLANT,
         "linear momentum (kg m/s), angular momentum about the centre of mass (kg m^2/s), both in "
         "the world, and kinetic energy (J), summed over the bodies",
         state=(
@@ -173,7 +168,6 @@ _TOPIC_TABLE = (
     Topic(
         "momentum_expected",
         _ARRAY_TYPE,
-        _PUBLISHED_BY_PLANT,
         "initial momenta plus the impulses of thrusters, disturbances and captures",
         condition="actuation is effort, a disturbance acts, or there is a target",
         state=(StateField("data", "expected_momenta", array_entry_names=_MOMENTUM_LABELS),),
@@ -181,7 +175,6 @@ _TOPIC_TABLE = (
     Topic(
         "target/odom",
         _ODOMETRY_TYPE,
-        _PUBLISHED_BY_PLANT,
         "measured pose of the target's root link in the world, and twist of this link in its own "
         "frame, whether the target is floating or held",
         condition="`target.robot` is set",
@@ -190,7 +183,6 @@ _TOPIC_TABLE = (
     Topic(
         "target/odom_true",
         _ODOMETRY_TYPE,
-        _PUBLISHED_BY_PLANT,
         "true target state",
         condition="`target.sensors` have errors",
         state=_odometry("true_target"),
@@ -198,7 +190,6 @@ _TOPIC_TABLE = (
     Topic(
         "odom_true",
         _ODOMETRY_TYPE,
-        _PUBLISHED_BY_PLANT,
         "true base state",
         condition="the sensors have errors",
         state=_odometry("true"),
@@ -206,7 +197,6 @@ _TOPIC_TABLE = (
     Topic(
         "joint_states_true",
         _JOINT_STATE_TYPE,
-        _PUBLISHED_BY_PLANT,
         "true joint states",
         condition="the sensors have errors",
         state=_joint_states("true"),
@@ -215,14 +205,12 @@ _TOPIC_TABLE = (
     Topic(
         "odom",
         _ODOMETRY_TYPE,
-        _PUBLISHED_BY_PLANT,
         "measured pose of the base link in the world, and twist of the base link in its own frame",
         state=_odometry("measured"),
     ),
     Topic(
         "joint_states",
         _JOINT_STATE_TYPE,
-        _PUBLISHED_BY_PLANT,
         "measured joint positions and velocities, and actuator efforts in the last tick",
         state=_joint_states("measured"),
         frame="base",
@@ -230,7 +218,6 @@ _TOPIC_TABLE = (
     Topic(
         "base_wrench_realised",
         _WRENCH_STAMPED_TYPE,
-        _PUBLISHED_BY_PLANT,
         "mean thruster wrench in the last tick",
         condition="`thrusters` is set",
         state=(StateField("wrench", "thruster_wrench", _WRENCH_MEMBERS),),
@@ -239,7 +226,6 @@ _TOPIC_TABLE = (
     Topic(
         "thrusters",
         _JOINT_STATE_TYPE,
-        _PUBLISHED_BY_PLANT,
         "by thruster name: total on-time (position, s), on-time as a fraction of the last tick "
         "(velocity), and mean force in that tick (effort, N)",
         condition="`thrusters` is set",
@@ -254,7 +240,6 @@ _TOPIC_TABLE = (
     Topic(
         "/tf",
         _TRANSFORMS_TYPE,
-        _PUBLISHED_BY_PLANT,
         "base link in the world and links in their parent frames, from odom and joint_states, "
         "every `tf_period`",
         condition="tf2_msgs is installed; always in bags",
@@ -262,22 +247,14 @@ _TOPIC_TABLE = (
     Topic(
         "/tf_static",
         _TRANSFORMS_TYPE,
-        _PUBLISHED_BY_PLANT,
         "links on fixed joints in their parent frames",
         condition="tf2_msgs is installed and the robot has such links; always in bags",
         latched=True,
     ),
-    Topic(
-        "robot_description",
-        _STRING_TYPE,
-        _PUBLISHED_BY_PLANT,
-        "the robot's URDF",
-        latched=True,
-    ),
+    Topic("robot_description", _STRING_TYPE, "the robot's URDF", latched=True),
     Topic(
         "target/robot_description",
         _STRING_TYPE,
-        _PUBLISHED_BY_PLANT,
         "the target's URDF",
         condition="`target.robot` is set",
         latched=True,
@@ -285,20 +262,19 @@ _TOPIC_TABLE = (
     Topic(
         "markers",
         "visualization_msgs/msg/MarkerArray",
-        ("plant", "planner"),
         "links, target, goal and planned path, for viewers",
+        ("plant", "planner"),
     ),
     Topic(
         "/diagnostics",
         "diagnostic_msgs/msg/DiagnosticArray",
-        ("plant", "planner", "coordinated_control", "recorder"),
         "rejected commands, limits, momentum, faults, deadlines; ignored states; silent nodes; "
         "recorded and lost messages",
+        ("plant", "planner", "coordinated_control", "recorder"),
     ),
     Topic(
         "clearance",
         _STATUS_TYPE,
-        _PUBLISHED_BY_PLANT,
         "smallest distance between two links, every `clearance_period`: `time` (s), `distance` "
         "(m; negative: penetration depth), and the links `first` and `second`; `second_is` is "
         "`obstacle` if `second` is an obstacle",
@@ -307,111 +283,110 @@ _TOPIC_TABLE = (
     Topic(
         "fault_injection",
         _STRING_TYPE,
-        _PUBLISHED_BY_USER,
         "faults for the plant, one per line, or `clear`",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "disturbance_injection",
         _STRING_TYPE,
-        _PUBLISHED_BY_USER,
         "disturbances for the plant, one per line, or `clear`",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "obstacles",
         _STRING_TYPE,
-        _PUBLISHED_BY_USER,
         "URDF of all fixed obstacles, for the planner, a controller that plans, the plant and "
         "viewers; each message replaces all previous obstacles; an empty string removes them",
+        _PUBLISHED_BY_USER,
         latched=True,
     ),
     Topic(
         "joint_commands",
         _JOINT_STATE_TYPE,
-        ("planner", "coordinated_control"),
         "velocities or efforts (by `actuation`) of all joints by name, with the stamp of the "
         "state to which they respond",
+        ("planner", "coordinated_control"),
     ),
     Topic(
         "base_wrench",
         _WRENCH_STAMPED_TYPE,
-        ("coordinated_control",),
         "commanded thruster force and torque at the base link origin, in the base link frame",
+        ("coordinated_control",),
     ),
     Topic(
         "goal_pose",
         _POSE_STAMPED_TYPE,
-        _PUBLISHED_BY_USER,
         "base goal pose in the world; NaN means any position or any attitude",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "goal_path",
         _PATH_TYPE,
-        _PUBLISHED_BY_USER,
         "base poses in the world for a controller with `profile: planned`, which brings the robot "
         "to rest at each of them; the last pose is the goal",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "goal_joint_states",
         _JOINT_STATE_TYPE,
-        _PUBLISHED_BY_USER,
         "final joint positions for later goals; a message without joints allows any positions",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "end_effector/goal_pose",
         _POSE_STAMPED_TYPE,
-        _PUBLISHED_BY_USER,
         "end-effector goal pose in the world; also `NAME/goal_pose` for links in the planner's "
         "`end_effectors`. For the planner, an all-zero orientation means any attitude, and poses "
         "with the same stamp, including the base pose, form one goal",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "end_effector/twist",
         _TWIST_STAMPED_TYPE,
-        _PUBLISHED_BY_USER,
         "commanded end-effector twist in the frame in its header: the world, the base link or the "
         "end-effector; also `NAME/twist` for links in the planner's `end_effectors`. The joints "
         "brake if no twist arrives for `twist_timeout`",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "end_effector/path",
         _PATH_TYPE,
-        _PUBLISHED_BY_USER,
         "end-effector path in the world, which is straight from pose to pose; the last pose is "
         "the goal, "
         "and the base is free; also `NAME/path` for links in the planner's `end_effectors`. "
         "If all orientations are zero, any attitude is accepted",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "joint_reference",
         _JOINT_STATE_TYPE,
-        ("planner",),
         "joint positions and velocities for coordinated control to track",
+        ("planner",),
         condition="`output` is reference",
     ),
     Topic(
         "base_reference",
         _ODOMETRY_TYPE,
-        _PUBLISHED_BY_USER,
         "moving base reference for coordinated control, one message per state",
+        _PUBLISHED_BY_USER,
     ),
     Topic(
         "gait_schedule",
         "trajectory_msgs/msg/JointTrajectory",
-        ("planner",),
         "the whole planned schedule",
+        ("planner",),
         latched=True,
     ),
     Topic(
         "planned_path",
         _PATH_TYPE,
-        ("planner", "coordinated_control"),
         "predicted base path",
+        ("planner", "coordinated_control"),
         latched=True,
     ),
     Topic(
         "plant/status",
         _STATUS_TYPE,
-        ("plant",),
         "plant state, reason, active injected faults, and the held `payload`, on every change; "
         "`state` is inactive, running, resting, paused, latched or failed",
         latched=True,
@@ -419,47 +394,47 @@ _TOPIC_TABLE = (
     Topic(
         "planner/status",
         _STATUS_TYPE,
-        ("planner",),
         "planner state, reason, goal and remaining error",
+        ("planner",),
         latched=True,
     ),
     Topic(
         "controller/status",
         _STATUS_TYPE,
-        ("coordinated_control",),
         "controller state, reason, goal, expected arrival (`ends_at_s`), errors, and saturation "
         "losses",
+        ("coordinated_control",),
         latched=True,
     ),
     Topic(
         "replay/status",
         _STATUS_TYPE,
-        ("replay",),
         "replay status: `state` (playing, paused or ended), `position_s` from the beginning, "
         "`duration_s` and `rate`; on every change, and five times per second",
+        ("replay",),
         condition="a bag is replayed",
         latched=True,
     ),
     Topic(
         "replay/seek",
         "std_msgs/msg/Float64",
-        _PUBLISHED_BY_USER,
         "time at which a replay continues, s after the beginning of the bag",
+        _PUBLISHED_BY_USER,
         condition="a bag is replayed",
     ),
     Topic(
         "events",
         _STATUS_TYPE,
-        ("plant", "planner", "coordinated_control", "recorder", "replay"),
         "one record per state change: `event` is the type of change, `time` is the simulated "
         "time (s), and `wall_time` the time since the epoch (s; not in flights without nodes)",
+        ("plant", "planner", "coordinated_control", "recorder", "replay"),
     ),
     Topic(
         "heartbeat",
         _STATUS_TYPE,
-        ("plant", "planner", "coordinated_control", "recorder", "replay"),
         "five times per second of wall time from every active node: `name`, `hardware_id` (its "
         "role), `message` (active, busy or inactive); recorded in bags only on request",
+        ("plant", "planner", "coordinated_control", "recorder", "replay"),
     ),
 )
 

@@ -513,7 +513,6 @@ def test_a_new_topic_is_an_entry_in_the_table_and_a_quantity(
     entry = Topic(
         "energy",
         "std_msgs/msg/Float64MultiArray",
-        ("plant",),
         "kinetic energy (J)",
         state=(StateField("data", "kinetic_energy", array_entry_names=("kinetic_energy",)),),
     )
