@@ -18,8 +18,8 @@ from rclpy.parameter import Parameter
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes import NODE_TYPES, FlightNode
+from spacerobot_ros.nodes.common.node import MatchedEndpoints, topics_without_all_matches
 from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
-from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import COMMANDERS, scenario_or_robot
 from spacerobot_ros.session.mission_client import MissionClient

@@ -9,9 +9,14 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
+from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import message_definition, type_hash
+from spacerobot_ros.times import SECOND
+
+_RECORDER_CHUNK_SIZE = 262_144
+"""Chunk size before compression, bytes; larger chunks have less overhead, but slow down seeking."""
 
 
 def free_name(path: Path) -> Path:
@@ -99,6 +104,26 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         except RecordingError:
             self._file.close()
             raise
+
+    @classmethod
+    def for_recorder(
+        cls,
+        path: str | os.PathLike[str],
+        config: RecorderConfig,
+        *,
+        overwrite: bool = False,
+        next_free: bool = False,
+    ) -> BagWriter:
+        """Return a new bag with a recorder's compression and file limits."""
+        return cls(
+            path,
+            compression=config.compression,
+            chunk_size=_RECORDER_CHUNK_SIZE,
+            overwrite=overwrite,
+            next_free=next_free,
+            max_size=round(config.max_size * 1e6),
+            max_duration_ns=round(config.max_duration * SECOND),
+        )
 
     @property
     def path(self) -> Path:

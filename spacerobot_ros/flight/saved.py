@@ -42,7 +42,6 @@ from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.execution.status import PlannerStatus
-from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import (
     TOPICS,
@@ -62,10 +61,6 @@ _GOAL_STAMP_NS = 1
 _BLOCK_NS = 60 * SECOND
 """Time span, in ns, of the messages created at once: all messages of a long flight would exhaust
 the memory."""
-
-_CHUNK_SIZE = 262_144
-"""Chunk size before compression, bytes: larger chunks have lower fixed costs, but make seeking
-slower."""
 
 _PUBLISHED_QOS = QosProfile(depth=100)
 """QoS offered by the nodes on topics that are not latched."""
@@ -107,29 +102,9 @@ def save_flight(
         installed.
     """
     flight.required_robot()
-    with open_bag(flight.scenario, path, overwrite=overwrite) as writer:
+    config = flight.scenario.config("recorder")
+    with BagWriter.for_recorder(path, config, overwrite=overwrite) as writer:
         write_flight(flight, writer)
-
-
-def open_bag(
-    scenario: Scenario, path: str | os.PathLike[str], *, overwrite: bool = False
-) -> BagWriter:
-    """Return a new bag, with the compression and the file size limit of the scenario's recorder.
-
-    Raises
-    ------
-    RecordingError
-        The file exists and may not be replaced, or cannot be created.
-    """
-    config = scenario.config("recorder")
-    return BagWriter(
-        path,
-        compression=config.compression,
-        overwrite=overwrite,
-        chunk_size=_CHUNK_SIZE,
-        max_size=round(config.max_size * 1e6),
-        max_duration_ns=round(config.max_duration * SECOND),
-    )
 
 
 def write_flight(flight: FlightData, writer: BagWriter) -> None:

@@ -21,16 +21,23 @@ from spacerobot_ros.flight.reading import (
     recorded_actuation,
     recorded_target,
 )
-from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
 from spacerobot_ros.messages.readers import CommandReader, UnreadableError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.grasp import RobotMotion
+from spacerobot_ros.model.rotations import attitude_error
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.simulation import InitialState
-from spacerobot_ros.simulation.actuators import build_plant
+from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.capture import capture_values, target_parameters
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.effort_plant import EffortPlant
+from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.mujoco_model import import_mujoco
+from spacerobot_ros.simulation.mujoco_plant import DEFAULT_INTEGRATION_STEP, MujocoPlant
+from spacerobot_ros.simulation.plant import Plant, WrappedPlant
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import Topic, state_topics
@@ -45,8 +52,6 @@ another source leave a larger gap."""
 
 _COMPARED_FIRST = {"joint_states": 0, "odom": 1}
 """Ranks of topics to compare first: their differences explain differences in other topics."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -168,7 +173,7 @@ def verify_bag(
 # -- the contents of the bag ------------------------------------------------------------------
 
 
-RecordedCommand = NDArray[np.float64] | CommandError
+RecordedCommand = Array | CommandError
 """The values of a command, or the reason why its message is malformed."""
 
 
@@ -305,7 +310,7 @@ class _PublishedTopic:
     topic: Topic
     name: str
     ticks: NDArray[np.int64]
-    values: Floats
+    values: Array
     labels: list[str]
 
     def after(self, tick: int) -> _PublishedTopic:
@@ -318,14 +323,14 @@ class _PublishedTopic:
             values[:, :count] -= self.values[~kept][-1, :count]
         return replace(self, ticks=self.ticks[kept], values=values)
 
-    def is_determined_by(self, states: dict[str, Floats]) -> bool:
+    def is_determined_by(self, states: dict[str, Array]) -> bool:
         """Whether a re-simulation contains all quantities of the topic, with the same sizes."""
         names = [each.quantity for each in self.topic.state]
         if not all(name in states for name in names):
             return False
         return sum(states[name].shape[1] for name in names) == self.values.shape[1]
 
-    def expected(self, states: dict[str, Floats], rows: NDArray[np.int64]) -> Floats:
+    def expected(self, states: dict[str, Array], rows: NDArray[np.int64]) -> Array:
         """Return the re-simulated values for each message, as an array of the same shape as the
         bag's values."""
         expected = np.hstack([states[each.quantity][rows] for each in self.topic.state])
@@ -401,7 +406,7 @@ def _parse_count(text: str | None) -> int:
 
 def _initial_state(
     first: int, published: list[_PublishedTopic], flight: _RecordedPlant
-) -> tuple[InitialState | None, Floats]:
+) -> tuple[InitialState | None, Array]:
     """Return the first state in the bag, and its joint velocities (n,).
 
     If it is the very first, the state is None, for the parameters, and the velocities are zero.
@@ -447,7 +452,7 @@ class _Resimulation:
 
     first: int
     end: int
-    states: dict[str, Floats]
+    states: dict[str, Array]
     commanded_ticks: frozenset[int]
     stopped: str = ""
     latched: int | None = None
@@ -458,7 +463,7 @@ class _Resimulation:
 def _resimulate(
     flight: _RecordedPlant,
     initial: InitialState | None,
-    rates: Floats,
+    rates: Array,
     first: int,
     last: int,
     *,
@@ -484,7 +489,7 @@ def _resimulate(
         joints = commands.sources[0]
         joints.command[joints.kept] = rates[joints.kept]
     recorded = [flight.commands(source) for source in commands.sources]
-    states: dict[str, Floats] = {}
+    states: dict[str, Array] = {}
     done = _Resimulation(first, last, states, frozenset(recorded[0]))
     if mujoco and plant.capturing is not None:
         raise SpaceRobotError(
@@ -599,7 +604,7 @@ class _Comparison:
             difference=difference,
         )
 
-    def _deviation(self, p: _PublishedTopic) -> tuple[Floats, Floats]:
+    def _deviation(self, p: _PublishedTopic) -> tuple[Array, Array]:
         """Return the expected values and the deviations, both in the shape of the bag's values."""
         rows = np.minimum(p.ticks, self._resimulation.end) - self._resimulation.first
         expected = p.expected(self._resimulation.states, rows)
@@ -626,7 +631,7 @@ class _Comparison:
         return found[1] if found else None
 
     def _difference_at(
-        self, p: _PublishedTopic, expected: Floats, row: int, column: int, remark: str = ""
+        self, p: _PublishedTopic, expected: Array, row: int, column: int, remark: str = ""
     ) -> Difference:
         return Difference(
             float(p.ticks[row] * self._period / SECOND),
@@ -657,3 +662,143 @@ class _Comparison:
 
     def _format_time(self, tick: int) -> str:
         return f"{tick * self._period / SECOND:.9g} s"
+
+
+# -- the second engine ------------------------------------------------------------------------
+
+AGREEMENT_TOLERANCE = 1e-8
+"""Maximum deviation at which an engine agrees with a flight, m or rad."""
+
+
+@dataclass(frozen=True)
+class EngineComparison:
+    """The largest differences between a flight and another engine under the same commands.
+
+    Attributes
+    ----------
+    engine
+        Name and version of the engine.
+    integrator
+        The engine's integrator, with its maximum step.
+    ticks
+        Number of compared ticks.
+    position, attitude, joints
+        Largest differences in base position, m, base attitude, rad, and joint positions, m or rad.
+    time
+        Simulated time of the largest difference, s.
+    stop_reason
+        Reason why the engine stopped early; empty if the replay was completed.
+    """
+
+    engine: str
+    integrator: str
+    ticks: int
+    position: float
+    attitude: float
+    joints: float
+    time: float
+    stop_reason: str = ""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all differences are at most :data:`AGREEMENT_TOLERANCE`."""
+        return max(self.position, self.attitude, self.joints) <= AGREEMENT_TOLERANCE
+
+
+class EngineFlight:
+    """Flies a robot in MuJoCo alongside a plant, tick by tick.
+
+    In each tick, the engine receives the external loads, and the joint rates (or efforts and
+    wrench) realised by the plant's actuators after limits and faults.
+
+    Parameters
+    ----------
+    plant
+        The plant in its initial state.
+    period
+        Duration of a tick, s.
+
+    Raises
+    ------
+    SpaceRobotError
+        MuJoCo is not installed, or does not support the robot.
+    """
+
+    def __init__(self, plant: PlantWithFaults, period: float) -> None:
+        self._plant, self._period = plant, period
+        dynamics: Plant = plant
+        while isinstance(dynamics, WrappedPlant):
+            dynamics = dynamics.plant
+        self._effort_plant = dynamics if isinstance(dynamics, EffortPlant) else None
+        actuation = "effort" if self._effort_plant is not None else "velocity"
+        self._engine = MujocoPlant(plant.robot, period, actuation=actuation, contacts=False)
+        self._engine.go_on(RobotMotion(plant.pose, plant.twist, plant.q, plant.qdot))
+        self._loads = PlantLoads(plant.robot)
+        self._engine.load(self._loads)
+        self._stopped = plant.limit_counts["stroke"].copy()
+        self._faults = plant.active
+        self._first = plant.tick
+        self._poses, self._shapes = [self._engine.pose.copy()], [self._engine.q.copy()]
+        self._until = ""
+
+    def fly_next_tick(self) -> None:
+        """Simulate the tick that the plant has just completed."""
+        if self._until:
+            return
+        plant, loads = self._effort_plant, self._plant.loads
+        if loads is not None:
+            self._loads.vector[:] = loads.last
+        if plant is None:
+            self._engine.step(self._plant.qdot)
+        elif reason := self._unknown_force():
+            self._until = f"{reason} at {self._plant.time:.9g} s, which the engine does not model"
+            return
+        else:
+            self._engine.step(plant.effort, plant.wrench)
+        self._poses.append(self._engine.pose.copy())
+        self._shapes.append(self._engine.q.copy())
+
+    def _unknown_force(self) -> str:
+        """Return a clause on a force in the last tick that the commands do not have; or none."""
+        plant, before = self._plant, self._faults
+        self._faults = plant.active
+        names = plant.robot.joint_names
+        stuck = [each.target for each in (*before, *plant.active) if each.kind == "joint_stuck"]
+        if stuck:
+            return f"joint '{stuck[0]}' is held"
+        stopped = np.flatnonzero(plant.limit_counts["stroke"] > self._stopped)
+        return f"joint '{names[int(stopped[0])]}' is at its stop" if stopped.size else ""
+
+    def comparison(self, ticks: NDArray[np.int64], poses: Array, shapes: Array) -> EngineComparison:
+        """Return the differences from the states in a bag.
+
+        Parameters
+        ----------
+        ticks
+            (N,) ticks of the states.
+        poses, shapes
+            (N, 7) poses of the base, and (N, n) joint positions.
+        """
+        rows = ticks - self._first
+        known = (rows >= 0) & (rows < len(self._poses))
+        rows = rows[known]
+        own = np.array(self._poses)[rows]
+        place = np.linalg.norm(own[:, :3] - poses[known, :3], axis=1)
+        turn = np.array(
+            [
+                np.linalg.norm(attitude_error(a, b))
+                for a, b in zip(own[:, 3:], poses[known, 3:], strict=True)
+            ]
+        )
+        bend = np.abs(np.array(self._shapes)[rows] - shapes[known]).max(axis=1, initial=0.0)
+        worst = int(np.argmax(np.maximum(np.maximum(place, turn), bend)))
+        return EngineComparison(
+            engine=f"MuJoCo {import_mujoco().__version__}",
+            integrator=f"Runge-Kutta 4 with steps of at most {DEFAULT_INTEGRATION_STEP:g} s",
+            ticks=len(rows) - 1,
+            position=float(place.max()),
+            attitude=float(turn.max()),
+            joints=float(bend.max()),
+            time=float(ticks[known][worst]) * self._period,
+            stop_reason=self._until,
+        )

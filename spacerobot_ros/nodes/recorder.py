@@ -90,11 +90,6 @@ _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 _QUEUE_DEPTH = 2000
 """Queue depth of subscriptions; above 5000 the events executor stops responding."""
 
-_CHUNK_SIZE = 262_144
-"""Chunk size before compression, in bytes; larger chunks have less overhead, but slow down
-seeking.
-"""
-
 _SCAN_PERIOD = 0.1  # wall s
 
 _CHECK_PERIOD = 0.4
@@ -138,14 +133,10 @@ class RecorderNode(FlightNode):
         self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
         self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
         self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
-        writer = BagWriter(
+        writer = BagWriter.for_recorder(
             config.bag or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap"),
-            compression=config.compression,
-            overwrite=False,
+            config,
             next_free=config.when_exists == "next",
-            chunk_size=_CHUNK_SIZE,
-            max_size=round(config.max_size * 1e6),
-            max_duration_ns=round(config.max_duration * SECOND),
         )
         self.recording = Recording(writer, config.clock_wait, self._on_failure)
         self._parameter_requests = {}

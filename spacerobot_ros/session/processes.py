@@ -34,9 +34,8 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.nodes.common.node import STREAM
+from spacerobot_ros.nodes.common.node import STREAM, MatchedEndpoints, topics_without_all_matches
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
-from spacerobot_ros.nodes.common.streams import MatchedEndpoints, topics_without_all_matches
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, TOPIC, HeartbeatState, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE

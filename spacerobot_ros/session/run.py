@@ -13,7 +13,7 @@ from typing import Any
 from spacerobot_ros.bag import BagWriter, free_name
 from spacerobot_ros.errors import SpaceRobotError, describe_exception
 from spacerobot_ros.flight.lockstep import LockstepFlight, Robots, require_flyable
-from spacerobot_ros.flight.saved import open_bag, write_flight
+from spacerobot_ros.flight.saved import write_flight
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.termination import graceful_shutdown
 
@@ -80,7 +80,7 @@ def run_scenario(
     flight = LockstepFlight(scenario, Robots.of(scenario))
     if scenario.parameters("recorder").get("when_exists") == "next":
         bag = free_name(bag)
-    writer = open_bag(scenario, bag)
+    writer = BagWriter.for_recorder(bag, scenario.config("recorder"))
     with graceful_shutdown(flight.interrupt) as stopped:
 
         def look(now: float, end: float) -> bool:

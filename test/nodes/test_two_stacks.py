@@ -23,7 +23,7 @@ from support.ros_harness import Harness, Probe, nanoseconds
 from spacerobot_ros.bag import RecordedRobot, read_bag
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
-from spacerobot_ros.nodes.common.streams import (
+from spacerobot_ros.nodes.common.node import (
     MatchedEndpoints,
     topics_without_all_matches,
 )
