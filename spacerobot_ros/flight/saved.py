@@ -21,7 +21,7 @@ from spacerobot_ros.bag.tables import (
     number_field,
     with_euler_angles,
 )
-from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, Status
+from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.messages.builders import (
@@ -220,15 +220,8 @@ def _clearance_streams(flight: FlightData) -> Iterator[_Stream]:
         return
     plant = flight.scenario.plant
     statuses = flight.clearance.statuses(max(1, plant.ticks_of(plant.clearance_period)))
-    yield _Stream.of(
-        TOPICS["clearance"],
-        (
-            (
-                round(each.time_s * SECOND),
-                StatusRecord("/plant", each.level, each.message, each.to_values()).encoded(),
-            )
-            for each in statuses
-        ),
+    yield _status_stream(
+        "clearance", [(round(each.time_s * SECOND), _record("/plant", each)) for each in statuses]
     )
 
 
@@ -372,43 +365,30 @@ def _plan_streams(flight: FlightData) -> Iterator[_Stream]:
 
 
 def _status_streams(flight: FlightData) -> Iterator[_Stream]:
-    yield _Stream.of(
-        TOPICS["plant/status"],
-        (
-            (time, StatusRecord("/plant", each.level, each.message, each.to_values()).encoded())
-            for time, each in flight.plant_statuses
-        ),
-    )
+    of_plant = [(time, _record("/plant", each)) for time, each in flight.plant_statuses]
+    yield _status_stream("plant/status", of_plant)
     for node, (name, _) in STATUS_TOPICS.items():
         kind = PlannerStatus if node == "planner" else ControllerStatus
-        yield _Stream.of(
-            TOPICS[name],
-            (
-                (time, StatusRecord(f"/{node}", *_status_fields(status)).encoded())
-                for time, status in flight.statuses
-                if isinstance(status, kind)
-            ),
-        )
-    yield _Stream.of(
-        TOPICS["events"],
-        (
-            (
-                round((each.time_s or 0.0) * SECOND),
-                StatusRecord(
-                    each.node and f"/{each.node}", each.level, each.message, each.to_values(None)
-                ).encoded(),
-            )
-            for each in flight.events
-        ),
-    )
-    yield _Stream.of(
-        TOPICS["/diagnostics"],
-        ((time, encode_diagnostics(records, time)) for time, records in flight.diagnostics),
-    )
+        sent = [each for each in flight.statuses if isinstance(each[1], kind)]
+        records = [(time, _record(f"/{node}", each, each.state.level)) for time, each in sent]
+        yield _status_stream(name, records)
+    events = []
+    for each in flight.events:
+        node, values = each.node and f"/{each.node}", each.to_values(None)
+        record = StatusRecord(node, each.level, each.message, values)
+        events.append((round((each.time_s or 0.0) * SECOND), record))
+    yield _status_stream("events", events)
+    diagnostics = ((time, encode_diagnostics(each, time)) for time, each in flight.diagnostics)
+    yield _Stream.of(TOPICS["/diagnostics"], diagnostics)
 
 
-def _status_fields(status: Status) -> tuple[int, str, dict[str, str]]:
-    return status.state.level, status.message, status.to_values()
+def _status_stream(topic: str, records: Iterable[tuple[int, StatusRecord]]) -> _Stream:
+    return _Stream.of(TOPICS[topic], ((time, each.encoded()) for time, each in records))
+
+
+def _record(node: str, status: Any, level: int | None = None) -> StatusRecord:
+    given = status.level if level is None else level
+    return StatusRecord(node, given, status.message, status.to_values())
 
 
 _MEASURED_STATE_TOPICS = ("odom", "joint_states")
