@@ -26,8 +26,7 @@ from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.messages.builders import (
     RobotTransforms,
-    given_path_message,
-    goal_message,
+    goal_messages,
     path_message,
     state_message,
     trajectory_message,
@@ -36,7 +35,7 @@ from spacerobot_ros.messages.diagnostics import encode_diagnostics
 from spacerobot_ros.messages.layout import encode, stamped_copies
 from spacerobot_ros.messages.markers import RobotMarkers, goal_markers
 from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.visuals import meshes_for_bag
@@ -46,8 +45,6 @@ from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import (
     TOPICS,
     Topic,
-    goal_topic,
-    path_topic,
     pose_topic,
     state_topics,
     topic_named,
@@ -310,22 +307,9 @@ def _goal_streams(flight: FlightData) -> Iterator[_Stream]:
         topic = TOPICS["goal_joint_states"]
         values = {"name": flight.joint_names, "position": goal.joint_positions}
         yield _Stream.of(topic, [(0, encode(topic.type, values))])
-    poses = {"goal_pose": goal if goal.base and goal.waypoints is None else None}
-    poses["end_effector/goal_pose"] = scenario.end_effector_goal
-    paths = {} if goal.waypoints is None else {"goal_path": goal.path_values}
-    for each in goal.end_effectors:
-        link = each.link or DEFAULT_END_EFFECTOR
-        if each.waypoints is None:
-            poses[goal_topic(link)] = each.as_goal()
-        else:
-            paths[path_topic(link)] = each.path_values
-    for name, path in paths.items():
-        message = given_path_message(path, world, _GOAL_STAMP_NS)
+    aims = goal_messages(goal, scenario.end_effector_goal, world, _GOAL_STAMP_NS)
+    for name, message in aims.items():
         yield _Stream.of(topic_named(name), [(0, message)], _GOAL_STAMP_NS)
-    for name, aim in poses.items():
-        if aim is not None:
-            message = goal_message(aim, world, _GOAL_STAMP_NS)
-            yield _Stream.of(topic_named(name), [(0, message)], _GOAL_STAMP_NS)
 
 
 def _command_streams(flight: FlightData) -> Iterator[_Stream]:

@@ -20,10 +20,10 @@ from spacerobot_ros.messages.readers import (
     MessageTemplate,
     TemplateReader,
 )
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, Frames
 from spacerobot_ros.times import LATEST_NS, SECOND, stamp_bytes
-from spacerobot_ros.topics import Topic
+from spacerobot_ros.topics import Topic, goal_topic, path_topic
 
 if TYPE_CHECKING:
     from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
@@ -227,6 +227,24 @@ def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
     header = {"header": {"stamp": min(stamp_ns, LATEST_NS), "frame_id": frame}}
     columns = {"pose.position.x": numbers}
     return encode_list("nav_msgs/msg/Path", header, "poses", header, columns)
+
+
+def goal_messages(
+    goal: Goal, end_effector: Goal | None, frame: str, stamp_ns: int
+) -> dict[str, bytes]:
+    """Return the messages of one goal by topic; ``end_effector`` is a controller's own, if any."""
+    paths = {} if goal.waypoints is None else {"goal_path": goal.path_values}
+    poses = {"goal_pose": goal} if goal.base and not paths else {}
+    if end_effector is not None:
+        poses[goal_topic(DEFAULT_END_EFFECTOR)] = end_effector
+    for each in goal.end_effectors:
+        link = each.link or DEFAULT_END_EFFECTOR
+        if each.waypoints is None:
+            poses[goal_topic(link)] = each.as_goal()
+        else:
+            paths[path_topic(link)] = each.path_values
+    messages = {name: given_path_message(path, frame, stamp_ns) for name, path in paths.items()}
+    return messages | {name: goal_message(aim, frame, stamp_ns) for name, aim in poses.items()}
 
 
 def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> bytes:

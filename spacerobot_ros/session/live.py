@@ -27,7 +27,6 @@ from spacerobot_ros.flight.reading import (
     with_propellant,
 )
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.process import start_ros, use_loopback_discovery
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import Scenario
@@ -35,7 +34,6 @@ from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.processes import MultiProcessStack, checked_namespace
 from spacerobot_ros.termination import graceful_shutdown
 from spacerobot_ros.times import SECOND, stamp_to_ns
-from spacerobot_ros.topics import goal_topic, path_topic
 
 
 @contextmanager
@@ -232,7 +230,7 @@ def send_goal(
             for each in clients:
                 executor.add_node(each.node)
             client = _find_goal_commander(
-                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), goal
+                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY)
             )
             with graceful_shutdown() as stopped:
                 client.on_message = _StatusPrinter(show)
@@ -251,7 +249,7 @@ def send_goal(
 
 
 def _find_goal_commander(
-    clients: list[MissionClient], executor: EventsExecutor, patience: float, goal: Goal
+    clients: list[MissionClient], executor: EventsExecutor, patience: float
 ) -> MissionClient:
     """Return the client that listens to the planner, or to the controller if there is none."""
     deadline = time.monotonic() + patience
@@ -270,14 +268,9 @@ def _find_goal_commander(
                     executor.spin_once(timeout_sec=0.05)
                 _await_active(client, executor, deadline)
                 return client
-    links = [
-        (path_topic if each.link in goal.links_with_paths else goal_topic)(
-            each.link or DEFAULT_END_EFFECTOR
-        )
-        for each in goal.end_effectors
-    ]
-    topics = " and ".join(f"'{topic}'" for topic in ("goal_pose", *links))
-    listed = "; the planner's parameter end_effectors lists other links" if links else ""
+    aims = clients[0].goal_topics
+    topics = " and ".join(f"'{topic}'" for topic in aims)
+    listed = "; the planner's parameter end_effectors lists other links" if aims[1:] else ""
     raise SpaceRobotError(
         f"No commander accepts goals on {topics} after {patience:g} s: start a planner or a "
         f"controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace{listed}."

@@ -21,7 +21,7 @@ from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower,
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.messages.builders import given_path_message, goal_message
+from spacerobot_ros.messages.builders import goal_messages
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.messages import shape_message
@@ -35,6 +35,8 @@ from spacerobot_ros.topics import goal_topic, path_topic
 
 _STATUS_CHECK_PERIOD = 0.2  # wall s
 _LONGEST_DELIVERY = 5.0  # wall s
+
+_SHAPE = "goal_joint_states"
 
 
 class MissionClient:
@@ -87,17 +89,18 @@ class MissionClient:
         self._joint_names = joint_names
         self._sent = 0
         self._follower = GoalFollower()
-        kind, topic = (Path, "goal_path") if base_path else (PoseStamped, "goal_pose")
-        self._goal_topic = self.node.create_publisher(kind, topic, STREAM)
-        self._sends: list[Publisher] = [self._goal_topic]
-        self._shape_topic: Publisher | None = None
+        self.goal_topics = ["goal_path" if base_path else "goal_pose"]
+        """Topics of the goal, that of the base first."""
+        for link in end_effectors:
+            topic_of = path_topic if link in paths else goal_topic
+            self.goal_topics.append(topic_of(link or DEFAULT_END_EFFECTOR))
+        self._sends: dict[str, Publisher] = {}
+        for topic in self.goal_topics:
+            kind = Path if topic.endswith("path") else PoseStamped
+            self._sends[topic] = self.node.create_publisher(kind, topic, STREAM)
+        self._goal_topic = self._sends[self.goal_topics[0]].topic_name
         if joint_names is not None:
-            self._shape_topic = self.node.create_publisher(JointState, "goal_joint_states", STREAM)
-            self._sends.append(self._shape_topic)
-        self._end_effector_topics = {
-            link: self._make_publisher(link, path=link in paths) for link in end_effectors
-        }
-        self._sends += self._end_effector_topics.values()
+            self._sends[_SHAPE] = self.node.create_publisher(JointState, _SHAPE, STREAM)
         self.failures: dict[str, str] = {}
         """Messages from failed nodes, by the last part of their names."""
         self.node.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
@@ -105,12 +108,6 @@ class MissionClient:
         self._status_topic = self.node.create_subscription(
             DiagnosticStatus, topic, self._on_status, LATCHED
         )
-
-    def _make_publisher(self, link: str, *, path: bool) -> Publisher:
-        name = link or DEFAULT_END_EFFECTOR
-        if path:
-            return self.node.create_publisher(Path, path_topic(name), STREAM)
-        return self.node.create_publisher(PoseStamped, goal_topic(name), STREAM)
 
     @property
     def goal_id(self) -> str | None:
@@ -144,10 +141,9 @@ class MissionClient:
         return all(
             publisher.get_subscription_count()
             >= max(
-                self.node.count_subscribers(publisher.topic_name),
-                0 if publisher is self._shape_topic else readers,
+                self.node.count_subscribers(publisher.topic_name), 0 if topic == _SHAPE else readers
             )
-            for publisher in self._sends
+            for topic, publisher in self._sends.items()
         )
 
     def has_goal_commander(self) -> bool:
@@ -158,14 +154,14 @@ class MissionClient:
         if not self._status_topic.get_publisher_count():
             return False
         deciders = self.node.get_publishers_info_by_topic(self._status_topic.topic_name)
-        return bool(_names_of(deciders) & self._readers(self._goal_topic.topic_name))
+        return bool(_names_of(deciders) & self._readers(self._goal_topic))
 
     def has_late_recorder(self) -> bool:
         """Whether a node that follows events and states does not subscribe to goals yet: a
         recorder does once it has discovered this client.
         """
         followers = self._readers("events") & self._readers("odom")
-        return bool(followers - self._readers(self._goal_topic.topic_name))
+        return bool(followers - self._readers(self._goal_topic))
 
     def _readers(self, topic: str) -> set[tuple[str, str]]:
         return _names_of(self.node.get_subscriptions_info_by_topic(topic))
@@ -181,28 +177,15 @@ class MissionClient:
         time_ns = self._now() + self._sent
         self._follower = GoalFollower(GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND)))
         self.message = ""
-        if self._shape_topic is not None and self._joint_names is not None:
-            self._shape_topic.publish(shape_message(goal, self._joint_names()))
-        if goal.waypoints is not None:
-            path = given_path_message(goal.path_values, self._frame, time_ns)
-            self._goal_topic.publish(path)
-        elif goal.base:
-            self._goal_topic.publish(goal_message(goal, self._frame, time_ns))
-        of_links = {
-            each.link: goal_message(each.as_goal(), self._frame, time_ns)
-            if each.waypoints is None
-            else given_path_message(each.path_values, self._frame, time_ns)
-            for each in goal.end_effectors
-        }
-        if end_effector is not None:
-            of_links[""] = goal_message(end_effector, self._frame, time_ns)
-        for link, aim in of_links.items():
-            self._end_effector_topics[link].publish(aim)
+        if self._joint_names is not None:
+            self._sends[_SHAPE].publish(shape_message(goal, self._joint_names()))
+        for topic, aim in goal_messages(goal, end_effector, self._frame, time_ns).items():
+            self._sends[topic].publish(aim)
 
     def await_delivery(self) -> None:
         """Wait until all subscribers have received the last goal."""
         end = time.monotonic() + _LONGEST_DELIVERY
-        for publisher in self._sends:
+        for publisher in self._sends.values():
             publisher.wait_for_all_acked(Duration(seconds=max(0.0, end - time.monotonic())))
 
     def follow(
