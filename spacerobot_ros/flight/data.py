@@ -19,7 +19,6 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.series import Commands, SentGoal, Signal, pose_error
 from spacerobot_ros.measures import (
     CaptureMeasures,
@@ -57,6 +56,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.capture import capture_values, load_target
+from spacerobot_ros.simulation.clearance import FlightClearance
 from spacerobot_ros.simulation.commands import Refusal
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND

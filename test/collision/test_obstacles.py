@@ -16,7 +16,6 @@ from spacerobot_ros.collision import (
     nearest_approaches,
 )
 from spacerobot_ros.collision.planes import PlaneDistance
-from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_world
@@ -24,6 +23,7 @@ from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import RobotState
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
+from spacerobot_ros.simulation.clearance import FlightClearance
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 MIDDLE, RADIUS = np.array([0.4, -0.3, 0.7]), 0.11

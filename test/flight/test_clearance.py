@@ -16,7 +16,6 @@ from support.made_bags import joint_states, made_bag, odometry, pose
 
 from spacerobot_ros import fly, read_bag
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.flight.clearance import FlightClearance
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import FlightBag, open_flight_bag, read_flight, read_run
 from spacerobot_ros.flight.verification import verify_bag
@@ -31,6 +30,7 @@ from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.tables import result_table
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.run import run_scenario
+from spacerobot_ros.simulation.clearance import FlightClearance
 
 RADIUS = 0.12
 """Of the balls of the sliding masses, m: without their SRDF they may touch."""
