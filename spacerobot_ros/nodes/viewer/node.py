@@ -18,7 +18,6 @@ from rclpy.client import Client
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool, Trigger
@@ -76,11 +75,6 @@ from spacerobot_ros.viewer.state import (
 ANNOUNCEMENT = "viewer      "
 """Text before the page address on standard output."""
 
-_ROSOUT_QOS = QoSProfile(
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
 _LEAST_SHOWN_LOG_LEVEL = 30
 
 _PARTS_WITH_RECEIVED_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
@@ -165,7 +159,7 @@ class ViewerNode(FlightNode):
         self.create_subscription(String, "target/robot_description", self._on_target, LATCHED)
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
         self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
-        self.create_subscription(RosoutLog, "/rosout", self._on_log, _ROSOUT_QOS)
+        self.create_subscription(RosoutLog, "/rosout", self._on_log, STREAM)
         self.create_subscription(
             ParameterEvent, "/parameter_events", self._on_parameter_change, STREAM
         )
