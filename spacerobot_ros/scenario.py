@@ -396,6 +396,30 @@ class Scenario:
             scenario = scenario.with_overrides(node, {name: value})
         return scenario
 
+    def with_parameters(self, values: Mapping[str, Any]) -> Scenario:
+        """Return the scenario with parameters set by their names, ``node.parameter``.
+
+        Raises
+        ------
+        ParameterError
+            A name does not begin with a node.
+        """
+        if not isinstance(values, Mapping):
+            raise ParameterError(
+                "Parameters must be given by name, such as {'plant.sensors.position_noise': "
+                f"0.001}}, not as {values!r}."
+            )
+        scenario = self
+        for key, value in values.items():
+            node, _, name = str(key).partition(".")
+            if node not in CONFIGS or not name:
+                raise ParameterError(
+                    f"'{key}' is not a parameter: write it as node.parameter, with one of the "
+                    f"nodes {', '.join(CONFIGS)}."
+                )
+            scenario = scenario.with_overrides(node, {name: value})
+        return scenario
+
     def with_goal(
         self,
         pose: Sequence[float] | None = None,

@@ -28,7 +28,7 @@ from spacerobot_ros.files import load_yaml, read_regular
 from spacerobot_ros.measures import CLEARANCE, METRICS, metric_names
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
-from spacerobot_ros.scenario import CONFIGS, Scenario, scenario_or_robot
+from spacerobot_ros.scenario import Scenario, scenario_or_robot
 
 SAMPLERS = ("random", "latin_hypercube", "sobol", "halton", "saltelli")
 """Sampler names; saltelli (for sensitivity indices) is provided by SALib, and the others by
@@ -284,14 +284,7 @@ def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scena
         The scenario has no goal or is not supported by campaigns, or a parameter is invalid.
     """
     scenario.require_goal()
-    for key, value in _read_mapping(section, "set").items():
-        node, _, parameter = str(key).partition(".")
-        if node not in CONFIGS or not parameter:
-            raise ParameterError(
-                f"'{key}' under 'set' is not a parameter: write NODE.PARAMETER, where NODE is one "
-                f"of {', '.join(CONFIGS)}."
-            )
-        scenario = scenario.with_overrides(node, {parameter: value})
+    scenario = scenario.with_parameters(_read_mapping(section, "set"))
     if "method" in section:
         scenario = scenario.with_method(str(section["method"]))
     for node in ("plant", *scenario.commanders):

@@ -28,7 +28,6 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.resources import resource_names
 from spacerobot_ros.scenario import (
-    CONFIGS,
     Scenario,
     load_scenario,
     scenario_names,
@@ -106,7 +105,7 @@ def fly(
         raise ParameterError("law_options requires a law: pass it as law=MyLaw.")
     if method is not None:
         scenario = scenario.with_method(method)
-    scenario = _with_parameters(scenario, {} if parameters is None else parameters)
+    scenario = scenario.with_parameters({} if parameters is None else parameters)
     if seed is not None:
         scenario = scenario.with_overrides("plant", {"sensors.seed": seed})
     return _raise_if_refused(fly_scenario(scenario))
@@ -182,7 +181,7 @@ def plan(
     """
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     if parameters is not None:
-        what = _with_parameters(scenario_to_fly(what), parameters)
+        what = scenario_to_fly(what).with_parameters(parameters)
     aimed = bool(hands) or any(each is not None for each in (goal, position, rotvec))
     if not _is_scenario(what, aimed=aimed):
         assert not isinstance(what, Scenario)
@@ -309,21 +308,3 @@ def _float_list(values: npt.ArrayLike, what: str) -> list[float]:
         return [float(x) for x in np.asarray(values, dtype=float).reshape(-1)]
     except (TypeError, ValueError, OverflowError):
         raise GoalError(f"The {what} {values!r} is not a list of numbers.") from None
-
-
-def _with_parameters(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
-    if not isinstance(settings, Mapping):
-        raise ParameterError(
-            "Parameters must be given by name, such as {'plant.sensors.position_noise': 0.001}, "
-            "not as "
-            f"{settings!r}."
-        )
-    for key, value in settings.items():
-        node, dot, name = str(key).partition(".")
-        if not dot or node not in CONFIGS:
-            raise ParameterError(
-                f"'{key}' is not a parameter: write it as node.parameter, with one of the nodes "
-                f"{', '.join(CONFIGS)}."
-            )
-        scenario = scenario.with_overrides(node, {name: value})
-    return scenario

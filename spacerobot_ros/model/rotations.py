@@ -82,17 +82,18 @@ def rpy_from_matrix(R: npt.ArrayLike) -> Array:
 
 def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Array:
     """Return the rotation matrix (3, 3) of a unit quaternion (x, y, z, w)."""
-    return np.array(_rows_from_quaternion(*_components(quaternion)))
+    return np.array(rows_from_quaternion(*_components(quaternion)))
 
 
 def matrices_from_quaternions(quaternions: Array) -> Array:
     """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    rows = _rows_from_quaternion(*(quaternions[..., k] for k in range(4)))
+    rows = rows_from_quaternion(*(quaternions[..., k] for k in range(4)))
     entries = np.stack([entry for row in rows for entry in row])
     return np.moveaxis(entries.reshape(3, 3, *quaternions.shape[:-1]), (0, 1), (-2, -1))
 
 
-def _rows_from_quaternion(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
+def rows_from_quaternion(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
+    """Return the rows of a rotation matrix, of numbers, arrays or symbols x, y, z and w."""
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],

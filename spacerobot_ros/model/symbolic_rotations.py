@@ -10,17 +10,12 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from spacerobot_ros.model.rotations import rows_from_quaternion
+
 
 def matrix_from_quaternion(quaternion: ca.SX) -> ca.SX:
     """Return the rotation matrix (3, 3) of a unit quaternion."""
-    x, y, z, w = ca.vertsplit(quaternion)
-    return ca.blockcat(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return ca.blockcat(rows_from_quaternion(*ca.vertsplit(quaternion)))
 
 
 def quaternion_from_matrix(R: ca.SX) -> ca.SX:

@@ -42,7 +42,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"engine": "flight"}, "no engine 'flight'.*Did you mean 'flights'"),
     ({"scenario": "faults/stuck_slidr"}, "Did you mean"),
     ({"set": {"plant.tick_rat": 1}}, "no parameter 'tick_rat'"),
-    ({"set": {"tick_rate": 1}}, "'tick_rate' under 'set' is not a parameter"),
+    ({"set": {"tick_rate": 1}}, "'tick_rate' is not a parameter"),
     ({"set": {"plant.time_mode": "realtime"}}, "campaigns are flown in lockstep"),
     ({"disperse": {"mas": NORM}}, "'mas' cannot be dispersed.*Did you mean 'mass'"),
     ({"disperse": {"mass.mass_7": NORM}}, "no body 'mass_7'.*Did you mean 'mass_"),
