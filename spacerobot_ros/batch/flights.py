@@ -25,19 +25,13 @@ from spacerobot_ros.model.rotations import quaternion_multiply, quaternions_from
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
 from spacerobot_ros.simulation.plant import InitialState, Plant
+from spacerobot_ros.simulation.sensors import NOISE_PARAMETERS
 from spacerobot_ros.times import SECOND
 
 Counts = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-NOISES = (
-    "position_noise",
-    "attitude_noise",
-    "velocity_noise",
-    "angular_velocity_noise",
-    "joint_noise",
-    "joint_rate_noise",
-)
+NOISES = tuple(NOISE_PARAMETERS.values())
 """:class:`.SensorConfig` parameters in the column order of :attr:`SensorErrors.noise`."""
 
 

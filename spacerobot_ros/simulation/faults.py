@@ -25,14 +25,7 @@ _MAX_FAULT_VALUE = 1e6
 WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
 """Axes of the base wrench, in base components."""
 
-POSE_AXES = (
-    "position_x",
-    "position_y",
-    "position_z",
-    "attitude_x",
-    "attitude_y",
-    "attitude_z",
-)
+POSE_AXES = tuple(f"{part}_{axis}" for part in ("position", "attitude") for axis in "xyz")
 """Axes of the measured pose: position in W, rotation vector in B."""
 
 SENSOR_GROUPS = ("position", "attitude", "velocity", "angular_velocity", "joints", "joint_rates")

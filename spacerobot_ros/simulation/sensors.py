@@ -22,7 +22,7 @@ from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSe
 from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
 from spacerobot_ros.topics import Topic, pose_topic, state_topics
 
-_NOISE_PARAMETERS = {
+NOISE_PARAMETERS = {
     "position": "position_noise",
     "attitude": "attitude_noise",
     "velocity": "velocity_noise",
@@ -31,6 +31,9 @@ _NOISE_PARAMETERS = {
     "joint_rates": "joint_rate_noise",
 }
 """Noise parameters by sensor group (:data:`~spacerobot_ros.simulation.faults.SENSOR_GROUPS`)."""
+
+_MEASURED = ("pose", "twist", "q", "qdot")
+"""Arrays of a plant that sensors measure."""
 
 _ROWS_DRAWN_TOGETHER = 32
 
@@ -105,7 +108,7 @@ class Sensors:
         self.dropout = False
         """Whether the pose is missing due to a dropout."""
         self._pose_bias, self._joint_bias = np.zeros(6), np.zeros(n)
-        self._noise = dict.fromkeys(_NOISE_PARAMETERS, 0.0)
+        self._noise = dict.fromkeys(NOISE_PARAMETERS, 0.0)
         self.pose_covariance, self.twist_covariance = np.zeros(36), np.zeros(36)
         """Covariances of pose and twist, each 6 x 6 in row-major order, for the noise only; bias
         and delay are not included."""
@@ -158,7 +161,7 @@ class Sensors:
         self._pose_bias[:3] = config.position_bias or 0.0
         self._pose_bias[3:] = config.attitude_bias or 0.0
         self._joint_bias[:] = config.joint_bias or 0.0
-        variances = {group: getattr(config, name) ** 2 for group, name in _NOISE_PARAMETERS.items()}
+        variances = {group: getattr(config, name) ** 2 for group, name in NOISE_PARAMETERS.items()}
         self.dropout, delay = False, 0.0
         for fault in faults:
             if fault.kind == "sensor_bias" and fault.target in POSE_AXES:
@@ -344,10 +347,7 @@ class ReportedState:
             "pose": plant.pose,
             "effort": plant.effort,
             "momentum": plant.momentum,
-            "measured_pose": measured.pose,
-            "measured_twist": measured.twist,
-            "measured_q": measured.q,
-            "measured_qdot": measured.qdot,
+            **{f"measured_{name}": getattr(measured, name) for name in _MEASURED},
         }
         if self._end_effector is not None:
             quantities["end_effector_pose"] = self._end_effector.poses[0]
@@ -369,12 +369,7 @@ class ReportedState:
         if plant.takes_wrench or self._loaded or capturing is not None:
             quantities["expected_momenta"] = plant.expected_momenta
         if self._sensors_used:
-            quantities |= {
-                "true_pose": plant.pose,
-                "true_twist": plant.twist,
-                "true_q": plant.q,
-                "true_qdot": plant.qdot,
-            }
+            quantities |= {f"true_{name}": getattr(plant, name) for name in _MEASURED}
         if thrusters is not None:
             quantities |= {
                 "thruster_wrench": thrusters.wrench,
