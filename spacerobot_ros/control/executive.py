@@ -20,6 +20,7 @@ from spacerobot_ros.control.goals import (
     goal_parts,
     goals_to_save,
     require_controlled_axes,
+    with_later_goals,
 )
 from spacerobot_ros.control.limits import Saturated
 from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlannedReference
@@ -201,9 +202,8 @@ class ControlExecutive:
 
         Raises PlanningError; see :func:`goal_parts`.
         """
-        for part, each in goal_parts(self.controller, key, goal).items():
-            self._pending.pop(part, None)
-            self._pending[part] = each
+        parts = goal_parts(self.controller, key, goal)
+        self._pending = with_later_goals(self._pending, parts)
 
     def request(self, task: Task) -> None:
         """Begin a task at the next measured state, without a subsequent goal."""
@@ -575,7 +575,7 @@ class ControlExecutive:
         pursued = self._goals if self._pursues else {}
         again = self._goal_id == self._latest_id() and bool(pursued)
         self._goal_id = self._latest_id()
-        self._goals = {**pursued, **self._pending}
+        self._goals = with_later_goals(pursued, self._pending)
         self._after_tasks = dict(self._pending) if carried else {}
         resumes = all(pending.resumes for pending in self._pending.values())
         self._take_tolerance(next(reversed(self._pending.values())).tolerance)

@@ -93,6 +93,25 @@ def goal_parts(
     return parts
 
 
+def with_later_goals(
+    goals: Mapping[str, IdentifiedGoal], later: Mapping[str, IdentifiedGoal]
+) -> dict[str, IdentifiedGoal]:
+    """Return the goals pursued together after later goals were accepted, by frame.
+
+    A goal of both frames ends if a later goal replaces one of them; its other frame keeps its pose
+    as a part of the later goal.
+    """
+    *_, latest = later.values()
+    replaced = {goal.goal_id for part, goal in goals.items() if part in later}
+    replaced -= {goal.goal_id for goal in later.values()}
+    kept = {
+        part: replace(goal, goal_id=latest.goal_id) if goal.goal_id in replaced else goal
+        for part, goal in goals.items()
+        if part not in later
+    }
+    return {**kept, **later}
+
+
 def _parts_of(
     controller: CoordinatedController, identified: IdentifiedGoal
 ) -> dict[str, IdentifiedGoal]:

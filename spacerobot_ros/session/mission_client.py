@@ -14,6 +14,7 @@ from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 
@@ -34,6 +35,12 @@ from spacerobot_ros.times import LATEST_NS, SECOND
 from spacerobot_ros.topics import goal_topic, path_topic
 
 _STATUS_CHECK_PERIOD = 0.2  # wall s
+
+_STATUSES = QoSProfile(
+    depth=STREAM.depth, reliability=LATCHED.reliability, durability=LATCHED.durability
+)
+"""QoS of statuses: the end of a goal and the status of the next goal arrive at the same time."""
+
 _LONGEST_DELIVERY = 5.0  # wall s
 
 _SHAPE = "goal_joint_states"
@@ -106,7 +113,7 @@ class MissionClient:
         self.node.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         topic, self._read = STATUS_TOPICS[decider]
         self._status_topic = self.node.create_subscription(
-            DiagnosticStatus, topic, self._on_status, LATCHED
+            DiagnosticStatus, topic, self._on_status, _STATUSES
         )
 
     @property
@@ -236,7 +243,7 @@ class MissionClient:
     def _on_status(self, received: DiagnosticStatus) -> None:
         message = read_status(received)
         self.status = self._read(dict(message.values), message.message)
-        if not self._is_about_another_goal(self.status):
+        if self.outcome is None and not self._is_about_another_goal(self.status):
             self.message = self.status.message
             self.on_message(self.message)
         if self._follower.update(self.status):

@@ -181,6 +181,26 @@ def test_goals_of_base_and_hand_end_together_and_each_once(end: str) -> None:
     assert not loop.executive.unfinished_goals
 
 
+@pytest.mark.parametrize("begun", [0, 2])
+def test_a_goal_of_base_and_hand_ends_when_a_later_one_replaces_the_base(begun: int) -> None:
+    """The hand keeps its pose: the robot comes to rest where both goals are met."""
+    loop = ExecutiveLoop(settle_time=0.02)
+    loop.answer()
+    loop.aim(base=goal_at(-AIM, "a"), end_effector=goal_at(TIP + AIM, "a"))
+    if begun:
+        loop.answer(begun)
+    loop.aim(base=goal_at(AIM, "b"))
+    loop.answer()
+    assert loop.executive.unfinished_goals == {"b"}
+    hand = loop.executive.controller.goal.end_effector
+    assert hand is not None
+    np.testing.assert_allclose(hand.position, TIP + AIM)
+    loop.place = AIM
+    loop.answer(10)
+    reached = [each.goal_id for each in loop.events if each.kind is EventKind.GOAL_REACHED]
+    assert reached == ["b"]
+
+
 def test_of_goals_between_two_states_the_latest_counts_whichever_it_is_for() -> None:
     loop = ExecutiveLoop()
     loop.aim(base=goal_at(AIM, "a"), end_effector=goal_at(TIP, "b"))

@@ -75,9 +75,12 @@ class Mission:
 
     def report(self, status: PlannerStatus | ControllerStatus) -> None:
         """Publish a status, and wait for the client to receive it."""
+        self.publish(status)
+        self.harness.spin_until(lambda: self.client.status == status)
+
+    def publish(self, status: PlannerStatus | ControllerStatus) -> None:
         values = [KeyValue(key=key, value=value) for key, value in status.to_values().items()]
         self.status.publish(DiagnosticStatus(message=status.message, values=values))
-        self.harness.spin_until(lambda: self.client.status == status)
 
 
 @pytest.mark.parametrize("decider", STATUS)
@@ -106,6 +109,33 @@ def test_only_the_status_of_the_goal_that_was_sent_decides_it(
     mission.report(kind(reached, "Reached.", goal_id=first))  # type: ignore[arg-type]
     assert mission.client.outcome is Outcome.REACHED
     assert mission.client.message == "Reached."
+
+
+@pytest.mark.parametrize("decider", STATUS)
+def test_the_end_of_a_replaced_goal_counts_though_the_next_status_comes_at_once(
+    harness: Harness, decider: str
+) -> None:
+    mission = Mission(harness, decider)
+    goal_id, later = mission.send(GOAL), "12.9"
+    replaced, waiting = f"Aborted: replaced by goal {later}.", "Waiting for the plant."
+    statuses: list[PlannerStatus | ControllerStatus]
+    if decider == "planner":
+        statuses = [
+            PlannerStatus(PlannerState.ABORTED, replaced, goal_id=goal_id),
+            PlannerStatus(PlannerState.EXECUTING, "Executing.", goal_id=later),
+            PlannerStatus(PlannerState.WAITING, waiting),
+        ]
+    else:
+        statuses = [
+            ControllerStatus(ControllerState.ABORTED, replaced, goal_id=goal_id),
+            ControllerStatus(ControllerState.TRACKING, "Flying.", goal_id=later),
+            ControllerStatus(ControllerState.WAITING, waiting),
+        ]
+    for status in statuses:
+        mission.publish(status)
+    harness.spin_until(lambda: mission.client.status == statuses[-1])
+    assert mission.client.outcome is Outcome.ABORTED
+    assert mission.client.message == replaced
 
 
 def test_every_goal_has_an_id_of_its_own_though_time_stands_still(harness: Harness) -> None:
