@@ -116,6 +116,9 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
 
 _LONGEST_DISCOVERY = 10.0  # wall s
 
+_LONGEST_SILENCE = 1.0
+"""Wall time, s, without a commander after which the user is told what is awaited."""
+
 _LONGEST_STATUS_WAIT = 1.0
 """Wall time, s, to wait for the status of earlier goals before a new goal is sent."""
 
@@ -230,7 +233,7 @@ def send_goal(
             for each in clients:
                 executor.add_node(each.node)
             client = _find_goal_commander(
-                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY)
+                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), show
             )
             with graceful_shutdown() as stopped:
                 client.on_message = _StatusPrinter(show)
@@ -249,27 +252,37 @@ def send_goal(
 
 
 def _find_goal_commander(
-    clients: list[MissionClient], executor: EventsExecutor, patience: float
+    clients: list[MissionClient],
+    executor: EventsExecutor,
+    patience: float,
+    show: Callable[[str], None],
 ) -> MissionClient:
     """Return the client that listens to the planner, or to the controller if there is none."""
-    deadline = time.monotonic() + patience
-    while time.monotonic() < deadline:
-        executor.spin_once(timeout_sec=0.05)
-        for client in clients:
-            if client.is_connected() and client.has_goal_commander():
-                latest = time.monotonic() + _LONGEST_STATUS_WAIT
-                while client.status is None and time.monotonic() < latest:
-                    executor.spin_once(timeout_sec=0.05)
-                # Other subscribers may have been discovered in the meantime.
-                while not client.is_connected() and time.monotonic() < deadline:
-                    executor.spin_once(timeout_sec=0.05)
-                latest = time.monotonic() + _LONGEST_RECORDER_WAIT
-                while client.has_late_recorder() and time.monotonic() < latest:
-                    executor.spin_once(timeout_sec=0.05)
-                _await_active(client, executor, deadline)
-                return client
     aims = clients[0].goal_topics
     topics = " and ".join(f"'{topic}'" for topic in aims)
+    began = time.monotonic()
+    deadline, silent = began + patience, True
+    while (now := time.monotonic()) < deadline:
+        executor.spin_once(timeout_sec=0.05)
+        if silent and now > began + _LONGEST_SILENCE:
+            silent = False
+            show(f"Waiting for a planner or a controller on {topics}, up to {patience:g} s.")
+        for client in clients:
+            if not (client.is_connected() and client.has_goal_commander()):
+                if client.knows_commander() and now < began + _LONGEST_STATUS_WAIT:
+                    break  # A planner is being connected; its controller follows references.
+                continue
+            latest = time.monotonic() + _LONGEST_STATUS_WAIT
+            while client.status is None and time.monotonic() < latest:
+                executor.spin_once(timeout_sec=0.05)
+            # Other subscribers may have been discovered in the meantime.
+            while not client.is_connected() and time.monotonic() < deadline:
+                executor.spin_once(timeout_sec=0.05)
+            latest = time.monotonic() + _LONGEST_RECORDER_WAIT
+            while client.has_late_recorder() and time.monotonic() < latest:
+                executor.spin_once(timeout_sec=0.05)
+            _await_active(client, executor, deadline)
+            return client
     listed = "; the planner's parameter end_effectors lists other links" if aims[1:] else ""
     raise SpaceRobotError(
         f"No commander accepts goals on {topics} after {patience:g} s: start a planner or a "

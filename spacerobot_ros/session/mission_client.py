@@ -163,6 +163,10 @@ class MissionClient:
         deciders = self.node.get_publishers_info_by_topic(self._status_topic.topic_name)
         return bool(_names_of(deciders) & self._readers(self._goal_topic))
 
+    def knows_commander(self) -> bool:
+        """Whether a publisher of the commander's status has been discovered."""
+        return self.node.count_publishers(self._status_topic.topic_name) > 0
+
     def has_late_recorder(self) -> bool:
         """Whether a node that follows events and states does not subscribe to goals yet: a
         recorder does once it has discovered this client.

@@ -200,12 +200,14 @@ def test_goals_are_sent_to_a_robot_that_is_up(
 
 
 def test_a_goal_that_nobody_takes_is_one_sentence(spacerobot: Command) -> None:
-    words = ("goal", "0", "0", "0", "--timeout", "0.5")
-    run = spacerobot(*words)
-    assert run.returncode == 2
-    assert run.stderr.count("\n") == 1
-    assert "after 0.5 s" in run.stderr
-    assert "spacerobot up" in run.stderr
+    for seconds, told in (("0.5", ""), ("1.5", "Waiting for a planner or a controller on")):
+        run = spacerobot("goal", "0", "0", "0", "--timeout", seconds)
+        assert run.returncode == 2
+        assert run.stdout.startswith(told)
+        assert run.stdout.count("\n") == bool(told)
+        assert run.stderr.count("\n") == 1
+        assert f"after {seconds} s" in run.stderr
+        assert "spacerobot up" in run.stderr
 
 
 @pytest.mark.parametrize(
