@@ -160,9 +160,10 @@ class CoordinatedControlNode(CommanderNode):
         self._joint_commands.publish(self._joint_message.serialised(stamp))
 
     def publish_status(self, status: Status) -> None:
-        """Publish a goal status, and log it if it is a warning or an error."""
+        """Publish a goal status, and log warnings, errors, reached goals and what is awaited."""
         super().publish_status(status)
-        decision = status.state, status.goal_id
+        awaited = status.message if status.state is ControllerState.WAITING else ""
+        decision = status.state, status.goal_id, awaited
         lasts, self._published = self._published == decision, decision
         # One lost message is no matter for the log.
         if status.state is ControllerState.ESTIMATING:
@@ -170,7 +171,7 @@ class CoordinatedControlNode(CommanderNode):
                 self.get_logger().warning(status.message, throttle_duration_sec=5.0)
         elif status.state.level and not lasts:
             self.get_logger().warning(status.message)
-        elif status.state is ControllerState.REACHED and not lasts:
+        elif (awaited or status.state is ControllerState.REACHED) and not lasts:
             self.get_logger().info(status.message)
 
     def publish_start(self, start: ScheduleStart) -> None:

@@ -97,6 +97,15 @@ def test_a_parameter_that_a_node_does_not_have_is_named_with_the_nearest(
         assert_one_sentence(warning.partition("]: ")[2], f"'{given}'", f"'{meant}'", "'fuel'")
 
 
+@pytest.mark.parametrize("node", ["planner", "coordinated_control"])
+def test_a_commander_without_a_robot_says_once_what_it_waits_for(
+    start: Start, harness: Harness, node: str
+) -> None:
+    process = start(node, {})
+    harness.spin_until(lambda: "goals on '/goal_pose'" in process.said, "it is up", timeout=START)
+    assert process.said.count("Waiting for a robot on 'robot_description'.") == 1
+
+
 def await_nodes(harness: Harness, probe: Probe, processes: list[NodeProcess]) -> None:
     """Wait until every process answers as a node that is active."""
     for process in processes:
