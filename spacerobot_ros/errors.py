@@ -25,6 +25,11 @@ def reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things in words: ``1 joint``, ``2 joints``."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def sentence_case(text: str) -> str:
     """Return a string with its first letter capitalised, as at the beginning of a sentence."""
     return text[:1].upper() + text[1:]

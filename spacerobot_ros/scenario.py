@@ -19,7 +19,7 @@ from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig, waypoints_refusal
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.planned_reference import PlannedReference
-from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, reason
+from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
@@ -306,8 +306,8 @@ class Scenario:
         shape = self.goal.joint_positions
         if shape is not None and len(shape) != robot.n:
             raise GoalError(
-                f"The goal has {len(shape)} joint position(s); robot "
-                f"'{robot.description.name}' has {robot.n} joints."
+                f"The goal has {counted(len(shape), 'joint position')}; robot "
+                f"'{robot.description.name}' has {counted(robot.n, 'joint')}."
             )
 
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
@@ -765,7 +765,7 @@ def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
             if numbers := values.get("goal_waypoints"):
                 if len(numbers) % 7:
                     raise GoalError(
-                        f"goal_waypoints has {len(numbers)} number(s); each pose has 7."
+                        f"goal_waypoints has {counted(len(numbers), 'number')}; each pose has 7."
                     )
                 poses = np.vstack([np.reshape(numbers, (-1, 7)), goal.path_values])
                 goal = replace(goal, waypoints=Goal.through(poses).waypoints, asked=POSE)

@@ -86,7 +86,7 @@ def test_a_result_that_cannot_be_written_is_one_sentence(option: str, tmp_path: 
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 2
     assert_one_sentence(result.stderr, target, "cannot be written")
-    assert result.stdout.startswith("planar_chain: 2 joint(s)")
+    assert result.stdout.startswith("planar_chain: 2 joints")
     assert not list(tmp_path.glob("*.json"))
 
 

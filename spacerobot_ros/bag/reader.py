@@ -30,7 +30,7 @@ from spacerobot_ros.bag.tables import (
     to_xarray,
     with_euler_angles,
 )
-from spacerobot_ros.errors import RecordingError, RobotDescriptionError, printable
+from spacerobot_ros.errors import RecordingError, RobotDescriptionError, counted, printable
 from spacerobot_ros.files import load_yaml, warn_once
 from spacerobot_ros.messages.definitions import MessageType, message_type
 from spacerobot_ros.resources import suggestion
@@ -380,7 +380,7 @@ class Bag(Mapping[str, TopicSeries]):
             if not found:
                 raise reason
             warn_once(
-                f"{len(refused)} topic(s) of the bag {self.path} are omitted: "
+                f"The bag {self.path} is read without {counted(len(refused), 'topic')}: "
                 f"{_format_list(list(refused))}. {reason}"
             )
         return found

@@ -31,7 +31,7 @@ from spacerobot_ros.batch.flights import (
 from spacerobot_ros.batch.lanes import LaneBlock, starts_accepted_by_plant, symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick, Program
 from spacerobot_ros.batch.targets import Target, vector_unit
-from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError, counted
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import NoLibraryError
@@ -171,8 +171,9 @@ class SteppedFlights:
             inertial is not None and len(inertial.masses) != len(chosen)
         ):
             raise ParameterError(
-                f"{len(chosen)} flights are reset to {len(starts)} start state(s)"
-                + ("." if inertial is None else f" with {len(inertial.masses)} rows of masses.")
+                f"A reset of {counted(len(chosen), 'flight')} has "
+                f"{counted(len(starts), 'start state')}"
+                + ("." if inertial is None else f" and {len(inertial.masses)} rows of masses.")
             )
         # Checked as rows of their own: a refusal changes no flight.
         self.require_startable(starts, inertial)

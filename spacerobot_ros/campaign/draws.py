@@ -17,7 +17,7 @@ import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.targets import DrawnFlight
-from spacerobot_ros.errors import ParameterError, RobotDescriptionError
+from spacerobot_ros.errors import ParameterError, RobotDescriptionError, counted
 from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array
 
@@ -132,8 +132,8 @@ class Draws:
         base = self._campaign.flights // (size + 2)
         if base < 2:
             raise ParameterError(
-                f"the sampler 'saltelli' requires at least {2 * (size + 2)} flights for {size} "
-                "dispersion(s)."
+                f"the sampler 'saltelli' requires at least {2 * (size + 2)} flights for "
+                f"{counted(size, 'dispersion')}."
             )
         base = 2 ** int(np.log2(base))
         problem = sobol_problem(self._campaign.names)

@@ -591,7 +591,7 @@ def _decide_goal(
         return outcome, reached_message(remaining, missed)
     if scenario.planner.max_corrections:
         return "needed corrections"
-    return Outcome.FAILED, f"The goal is not reached after 0 correction(s): {remaining}."
+    return Outcome.FAILED, f"The goal is not reached after 0 corrections: {remaining}."
 
 
 @dataclass(frozen=True)

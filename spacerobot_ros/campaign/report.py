@@ -29,7 +29,7 @@ from spacerobot_ros.campaign.statistics import (
     percentiles,
     share,
 )
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, counted
 from spacerobot_ros.files import write_output
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.report.figures import (
@@ -208,7 +208,7 @@ def _outcomes_section(results: Results) -> str:
     made = table("outcomes", ["outcome", "flights", "message"], rows)
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):
-        line = f"{count} flight{'s' if count > 1 else ''} "
+        line = f"{counted(count, 'flight')} "
         if reason.endswith("."):  # The reason is the sentence of an error.
             line += f"used engine 'flights': {reason}"
         else:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, counted
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, quaternion_multiply
@@ -533,7 +533,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
     faults = scenario.plant.faults
     if index >= len(faults):
         raise ParameterError(
-            f"'{name}': plant.faults has {len(faults)} fault(s)"
+            f"'{name}': plant.faults has {counted(len(faults), 'fault')}"
             + ("; the first is faults[0]." if faults else ": add one to plant.faults.")
         )
     kind = _require_fault(faults[index], scenario).kind

@@ -22,8 +22,8 @@ from spacerobot_ros.cli.options import (
     view_option,
     viewer_if_requested,
 )
-from spacerobot_ros.cli.terminal import fail
-from spacerobot_ros.errors import printable
+from spacerobot_ros.cli.terminal import fail, say
+from spacerobot_ros.errors import counted, printable
 
 
 @click.command("export")
@@ -50,10 +50,8 @@ def export_command(bag: Path, format_name: str, out: Path | None, topics: tuple[
     rows_by_topic = export(tables.values(), out, ExportFormat(format_name))
     for topic in tables:
         rows = rows_by_topic.get(topic)
-        click.echo(
-            f"{printable(topic):<27} {'no messages, omitted' if rows is None else f'{rows} rows'}"
-        )
-    click.echo(f"{'tables':<27} {out}")
+        say(f"{printable(topic):<27} {'no messages, omitted' if rows is None else f'{rows} rows'}")
+    say(f"{'tables':<27} {out}")
 
 
 _MILLIMETRES_BY_UNIT = {"": 1.0, "mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72}
@@ -115,10 +113,10 @@ def figures_command(
     results = write_figures(bags[0], folder, names, beside=bags[1:], format=format, **options)
     drawn = {name: result for name, result in results.items() if isinstance(result, Path)}
     for name, path in drawn.items():
-        click.echo(f"{name:<11} {path}")
+        say(f"{name:<11} {path}")
     for name in names or () if drawn else results:
         if name not in drawn:
-            click.echo(f"{name:<11} none: {results[name]}", err=True)
+            say(f"{name:<11} none: {results[name]}", err=True)
     if not drawn or not drawn.keys() >= set(names):
         fail()
 
@@ -208,10 +206,10 @@ def report_command(
 
     target = out or beside(bag, ".html")
     write_report(bag, target, others, namespace=namespace)
-    click.echo(f"report      {target}")
+    say(f"report      {target}")
     if picture is not None:
         write_picture(bag, picture, namespace=namespace)
-        click.echo(f"picture     {picture}")
+        say(f"picture     {picture}")
 
 
 @click.command("salvage")
@@ -225,13 +223,13 @@ def salvage_command(bag: Path, out: Path | None) -> None:
     from spacerobot_ros.bag.salvage import salvage_bag
 
     saved = salvage_bag(bag, out)
-    click.echo(f"saved       {saved.messages} messages over {saved.duration:.9g} s")
-    click.echo(
+    say(f"saved       {saved.messages} messages over {saved.duration:.9g} s")
+    say(
         f"lost        {saved.lost_bytes} bytes after the last whole record, "
-        f"{saved.lost_chunks} damaged chunk(s)"
+        f"{counted(saved.lost_chunks, 'damaged chunk')}"
         + (f"; the first: {saved.loss_reason}" if saved.loss_reason else "")
     )
-    click.echo(f"bag         {saved.path}")
+    say(f"bag         {saved.path}")
 
 
 @click.command("verify")
@@ -257,23 +255,23 @@ def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     from spacerobot_ros.flight.verification import AGREEMENT_TOLERANCE, verify_bag
 
     result = verify_bag(bag, tolerance, mujoco=engine == "mujoco")
-    click.echo(f"flown again {result.ticks} ticks, {result.duration:.9g} s")
-    click.echo(f"compared    {result.messages} messages on {', '.join(result.topics)}")
+    say(f"flown again {result.ticks} ticks, {result.duration:.9g} s")
+    say(f"compared    {result.messages} messages on {', '.join(result.topics)}")
     where = result.largest_at
     place = f", {where.field} of {where.topic} at {where.time:.9g} s" if where else ""
-    click.echo(f"largest     {result.largest:.3g}{place}")
+    say(f"largest     {result.largest:.3g}{place}")
     if result.difference is not None:
         fail(f"The bag differs: {result.difference}")
     if result.missing:
         fail(f"The bag is incomplete: {result.missing}")
-    click.echo("verified    every published state follows from the commands")
+    say("verified    every published state follows from the commands")
     if (other := result.second_opinion) is not None:
-        click.echo(f"engine      {other.engine}, {other.integrator}")
-        click.echo(
+        say(f"engine      {other.engine}, {other.integrator}")
+        say(
             f"deviates    {other.position:.2g} m, {other.attitude:.2g} rad, joints "
             f"{other.joints:.2g} m or rad, largest at {other.time:.9g} s of {other.ticks} ticks"
         )
         if not other.agrees:
             fail(f"{other.engine} differs by more than {AGREEMENT_TOLERANCE:g} m or rad.")
         if other.stop_reason:
-            click.echo(f"note        compared until {other.stop_reason}")
+            say(f"note        compared until {other.stop_reason}")

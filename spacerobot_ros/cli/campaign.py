@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from spacerobot_ros.cli.options import PATH, DefaultGroup, bag_option, out_option, report_option
-from spacerobot_ros.cli.terminal import exit_if_terminated, fail
+from spacerobot_ros.cli.terminal import exit_if_terminated, fail, say
 from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
     path = bag or free_name(folder / f"flight_{number}.mcap")
     result = rerun_flight(folder, number, path)
     for line in result.report_lines:
-        click.echo(line)
+        say(line)
     exit_if_terminated()
     if not result.agrees:
         fail("The flight differs from the recorded flight in the dataset.")
@@ -171,13 +171,13 @@ def _fly_campaign(
         campaign = replace(campaign, name=name)
     folder = out or Path("out") / campaign.name
     for line in campaign.description_lines:
-        click.echo(line)
+        say(line)
     with graceful_shutdown() as stopped, _progress_bar(campaign.name) as show:
         progress = run_campaign(
             campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped
         )
     flown = f"{progress.flown} of {progress.total} flights"
-    click.echo(f"{campaign.name}: {flown}, {progress.flights_per_second:.3g} per second; {folder}")
+    say(f"{campaign.name}: {flown}, {progress.flights_per_second:.3g} per second; {folder}")
     return folder, progress
 
 
@@ -214,8 +214,8 @@ def _write_report(folder: Path, report: Path | None) -> None:
 
     path = report or folder / "report.html"
     for line in write_campaign_report(folder, path):
-        click.echo(line)
-    click.echo(f"report      {path}")
+        say(line)
+    say(f"report      {path}")
 
 
 def _compare(
@@ -241,6 +241,6 @@ def _compare(
     path = report or base / "report.html"
     (first, first_end), (second, second_end) = flown
     for line in write_comparison((first, second), path):
-        click.echo(line)
-    click.echo(f"report      {path}")
+        say(line)
+    say(f"report      {path}")
     _require_flights(first_end, second_end)

@@ -32,8 +32,8 @@ from spacerobot_ros.cli.options import (
     warn_of_large_angles,
     write_json,
 )
-from spacerobot_ros.cli.terminal import display, exit_if_terminated, fail
-from spacerobot_ros.errors import numbers, quantity
+from spacerobot_ros.cli.terminal import display, exit_if_terminated, fail, say
+from spacerobot_ros.errors import counted, numbers, quantity
 from spacerobot_ros.termination import termination
 
 if TYPE_CHECKING:
@@ -127,15 +127,15 @@ def run_command(
     verdict, *lines = _summary_lines(result.summary)
     published = _published_lines(chosen, result.summary)
     for line in (verdict, *_fault_lines(chosen), *lines, *published):
-        click.echo(line)
+        say(line)
     if taken and path != usual:
-        click.echo(f"            {usual} contains an earlier flight and is kept")
+        say(f"            {usual} contains an earlier flight and is kept")
     words = ["spacerobot", "report", str(path)]
     if report is None:
-        click.echo(f"next        `{shlex.join(words)}` draws this flight")
+        say(f"next        `{shlex.join(words)}` draws this flight")
     elif termination() is not None:
         words += ["--out", str(report)]
-        click.echo(f"report      none for an interrupted flight: `{shlex.join(words)}` makes one")
+        say(f"report      none for an interrupted flight: `{shlex.join(words)}` makes one")
     exit_if_terminated()
     if report is not None:
         _write_report(path, report)
@@ -147,7 +147,7 @@ def _write_report(bag: Path, html: Path) -> None:
     from spacerobot_ros.report import write_report
 
     write_report(bag, html)
-    click.echo(f"report      {html}")
+    say(f"report      {html}")
 
 
 def _changed_scenario(
@@ -190,7 +190,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         *_end_effector_line(summary),
         *([f"shape       ({numbers(shape)})"] if (shape := _shape(summary)) else []),
         f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
-        f"{summary['corrections']} correction(s){planned}",
+        f"{counted(summary['corrections'], 'correction')}{planned}",
         f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
         f"{summary['ticks_per_s']:.0f} ticks/s, {pace} times real time",
         f"momentum    {drift} {quantity(summary['linear_momentum_drift'], 'kg m/s')} and "
@@ -364,13 +364,13 @@ def up_command(
         recorded = run_until_stopped(
             chosen,
             bag,
-            click.echo,
+            say,
             namespace=namespace,
             restarts=restarts,
             supervise=lambda: None if viewer is None else viewer.supervise(),
         )
     if recorded is not None:
-        click.echo(f"bag         {recorded}")
+        say(f"bag         {recorded}")
 
 
 @click.command("goal", context_settings={"ignore_unknown_options": True})
@@ -429,7 +429,7 @@ def goal_command(
     from spacerobot_ros.measures import Outcome
     from spacerobot_ros.session.live import send_goal
 
-    outcome = send_goal(goal, click.echo, namespace=namespace, timeout=timeout)
+    outcome = send_goal(goal, say, namespace=namespace, timeout=timeout)
     exit_if_terminated()
     if outcome is not Outcome.REACHED:
         fail()

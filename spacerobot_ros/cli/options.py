@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
-from functools import cached_property, wraps
+from functools import cached_property, partial, wraps
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 from click.shell_completion import CompletionItem
 
-from spacerobot_ros.errors import reason
+from spacerobot_ros.cli.terminal import say
+from spacerobot_ros.errors import counted, reason
 from spacerobot_ros.files import read_regular, write_output
 
 if TYPE_CHECKING:
@@ -307,8 +308,8 @@ def end_effector_goals(
     named = links or [""] * min(len(values), 1)
     if len(named) != len(values):
         raise click.UsageError(
-            f"{len(values)} end-effector goal(s) and {len(links)} name(s): give one "
-            "--end-effector for each --end-effector-goal, then for each "
+            f"{counted(len(values), 'end-effector goal')} and {counted(len(links), 'name')}: give "
+            "one --end-effector for each --end-effector-goal, then for each "
             "--end-effector-position, then for each --end-effector-path."
         )
     goals = [EndEffectorGoal.of_numbers(*each) for each in zip(named, values, strict=True)]
@@ -408,7 +409,7 @@ def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> Non
     """Warn about a rotation of more than one revolution, which may be in degrees."""
     angle = math.hypot(*rotvec)
     if 2 * math.pi < angle < math.inf:
-        click.echo(
+        say(
             f"The goal rotates by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} "
             f"revolutions: only the final attitude matters. For degrees, use {option_in_degrees}.",
             err=True,
@@ -475,7 +476,7 @@ def viewer_if_requested(
         return
     from spacerobot_ros.session.viewing import viewing
 
-    with viewing(parameters, lambda line: click.echo(line, err=True), namespace) as viewer:
+    with viewing(parameters, partial(say, err=True), namespace) as viewer:
         yield viewer
 
 

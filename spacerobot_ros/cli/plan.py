@@ -26,7 +26,7 @@ from spacerobot_ros.cli.options import (
     within_option,
     write_json,
 )
-from spacerobot_ros.cli.terminal import display, fail
+from spacerobot_ros.cli.terminal import display, fail, say
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.files import write_output
 
@@ -103,20 +103,20 @@ def plan_command(
         plans = compare(problem) if comparing else {method: try_method(problem, method)}
     if comparing:
         for line in comparison_lines(plans):
-            click.echo(line)
+            say(line)
     trial = fastest(plans) if comparing and method == "auto" else plans.get(method)
     if not isinstance(trial, PlanEvaluation):
         fail()
     tolerance = problem.config.tolerance
     left = describe_remaining_error(trial.error, trial.controls, tolerance, problem.goal)
     if not comparing:
-        click.echo(f"{scenario}, {method}: {trial.duration:.6g} s; {left}")
-        click.echo(f"planned in {trial.plan_time:.3f} s")
+        say(f"{scenario}, {method}: {trial.duration:.6g} s; {left}")
+        say(f"planned in {trial.plan_time:.3f} s")
         if problem.config.clearance:
-            click.echo(_clearance_line(problem, trial))
+            say(_clearance_line(problem, trial))
         beyond = [str(piece.notes.get(BEYOND_EFFORT_LIMITS, "")) for piece in trial.pieces]
         for clause in filter(None, dict.fromkeys(beyond)):
-            click.echo(f"warning     Efforts exceed limits: {clause}.")
+            say(f"warning     Efforts exceed limits: {clause}.")
     if json_file is not None:
         content = plan_json(problem, trial)
         if comparing:
@@ -125,13 +125,13 @@ def plan_command(
                 for name, each in plans.items()
             }
         write_json(json_file, content, indent=None)
-        click.echo(f"json        {json_file}")
+        say(f"json        {json_file}")
     if picture is not None:
         from spacerobot_ros.report.figures import PictureFormat
         from spacerobot_ros.report.planning_figures import draw_plan
 
         write_output(picture, draw_plan(problem, trial, PictureFormat.of(picture)))
-        click.echo(f"picture     {picture}")
+        say(f"picture     {picture}")
     if not trial.reached:
         stopped = trial.pieces[-1].notes.get("stopped", "")
         fail(f"The goal is not reached: the plan ends {left}. {stopped}".rstrip())
@@ -232,21 +232,21 @@ def _plan_random_goals(
     from spacerobot_ros.flight.trials import PlanEvaluation, random_goals, try_goals
 
     goals = random_goals(problem, count, within[0], math.radians(within[1]))
-    show = partial(click.echo, err=True) if sys.stderr.isatty() else lambda line: None
+    show = partial(say, err=True) if sys.stderr.isatty() else lambda line: None
     results = try_goals(problem, goals, methods, show)
     flown = {
         name: [each for each in found if isinstance(each, PlanEvaluation)]
         for name, found in results.items()
     }
-    click.echo(
+    say(
         f"{'method':<14}{'goals':>7}{'met':>7}{'missed':>8}{'refused':>9}{'shortest':>10}"
         f"{'median':>10}{'longest':>10}{'planned in':>11}{'at most':>9}"
     )
     for name, trials in flown.items():
-        click.echo(_row_of_method(name, len(results[name]), trials))
+        say(_row_of_method(name, len(results[name]), trials))
     for name, found in results.items():
         for reason in dict.fromkeys(str(each) for each in found if isinstance(each, Exception)):
-            click.echo(f"{name} refused: {reason}")
+            say(f"{name} refused: {reason}")
     if not all(each.reached for each in flown[methods[0]]):
         fail()
 

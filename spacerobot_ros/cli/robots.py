@@ -19,8 +19,8 @@ from spacerobot_ros.cli.options import (
     picture_option,
     write_json,
 )
-from spacerobot_ros.cli.terminal import display, fail
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.cli.terminal import display, fail, say
+from spacerobot_ros.errors import ParameterError, counted
 from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def analyze_command(
     model = SpaceRobot.from_file(robot_file(robot))
     found = analyze(model, None if shape is None else _parse_shape(shape), end_effector)
     for line in (*analysis_lines(found), *_notes(model), "", *workspace_lines(found)):
-        click.echo(line)
+        say(line)
     if json_file is not None:
         write_json(json_file, analysis_json(found))
     from spacerobot_ros.report.figures import PictureFormat
@@ -86,16 +86,16 @@ def analyze_command(
     target = picture or Path("out") / f"{name}_curvature.png"
     drawn = draw_analysis(found, PictureFormat.of(target))
     if drawn is None:
-        click.echo(f"{'picture':<13}none: no loops of joints that can move rotate the base")
+        say(f"{'picture':<13}none: no loops of joints that can move rotate the base")
     else:
         write_output(target, drawn)
-        click.echo(f"{'picture':<13}{target}")
+        say(f"{'picture':<13}{target}")
     if found.workspaces:
         of_workspaces = target.with_name(
             f"{name if picture is None else target.stem}_workspaces{target.suffix}"
         )
         write_output(of_workspaces, draw_workspaces(found, PictureFormat.of(of_workspaces)))
-        click.echo(f"{'':<13}{of_workspaces}")
+        say(f"{'':<13}{of_workspaces}")
 
 
 def _parse_shape(text: str) -> list[float]:
@@ -113,7 +113,8 @@ def analysis_lines(found: Analysis) -> list[str]:
     base = robot.description.bodies[0].inertia.mass
     n, name = robot.n, robot.description.name
     lines = [
-        f"{name}: {n} joint(s), {robot.total_mass:.6g} kg, of which {base:.6g} kg for the base"
+        f"{name}: {counted(n, 'joint')}, {robot.total_mass:.6g} kg, of which {base:.6g} kg for the "
+        "base"
     ]
     lines += [*_joint_rows(robot), "", *_rotation_lines(found)]
     lines += [f"{'position':<13}{_position_text(found)}", ""]
@@ -308,8 +309,7 @@ def _finite_or_none(value: float) -> float | None:
 def _distance_lines(found: Analysis) -> list[str]:
     geometry = found.geometry
     distances = geometry.distances_of_links(found.shape)
-    pairs = "1 pair" if len(distances) == 1 else f"{len(distances)} pairs"
-    lines = [f"{pairs} of links may touch"]
+    lines = [f"{counted(len(distances), 'pair')} of links may touch"]
     if distances:
         distance = "a distance" if len(distances) == 1 else "distances"
         lines[0] += f", with {distance} at this shape:"
@@ -358,7 +358,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     if nearest_inertia:
         text, changes = nearest_inertias(file)
         for link, change in changes.items():
-            click.echo(f"{'inertia':<13}link '{link}' is changed by {100 * change:.2g} %")
+            say(f"{'inertia':<13}link '{link}' is changed by {100 * change:.2g} %")
         if changes:
             file = free_name(target.with_name(f"{name}_possible.urdf"))
             write_output(file, text)
@@ -367,14 +367,14 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     with display(name):
         known = analyze(model)
     for line in (*analysis_lines(known), *_notes(model)):
-        click.echo(line)
+        say(line)
     click.echo()
     # A robot file beside its scenario is found from any working folder.
     from_there = os.path.relpath(file.resolve(), target.resolve().parent)
     named = from_there if is_path(robot) else robot
     if not model.n:
         write_output(target, thruster_scenario_text(model, named))
-        click.echo(f"The robot has no joints and uses thrusters. The scenario is {target}:")
+        say(f"The robot has no joints and uses thrusters. The scenario is {target}:")
         click.echo(f"  spacerobot run {shlex.quote(str(target))}")
         return
     missing = [each.link for each in known.geometry.unread_meshes if each.is_collision_shape]
@@ -382,12 +382,12 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     with display(name):
         plans = compare(problem)
     for line in comparison_lines(plans):
-        click.echo(line)
+        say(line)
     best = fastest(plans)
     if best is None:
         fail("No method reaches the goal of the first flight; no scenario is written.")
     write_output(target, scenario_text(problem, best.method, named))
-    click.echo(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
+    say(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
     click.echo(f"  spacerobot run {shlex.quote(str(target))}")
 
 

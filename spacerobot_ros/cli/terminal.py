@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import re
 import shutil
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Iterator
@@ -42,10 +44,39 @@ class ExitCode(IntEnum):
 _ROS_MODULES = ("rclpy", "rosidl_parser", "ament_index_python")
 
 
+_LABEL = re.compile(r"\S+(?: \S+)* {2,}")
+"""Words in front of a column."""
+
+_COMMAND = re.compile(r"`[^`]*`")
+
+
+def say(text: str, *, err: bool = False) -> None:
+    """Print a line; on a terminal, long lines are wrapped, below their column if they have a label.
+
+    Commands in backticks stay whole, so that they can be copied.
+    """
+    if (sys.stderr if err else sys.stdout).isatty():
+        text = "\n".join(map(_wrapped, text.splitlines()))
+    click.echo(text, err=err)
+
+
+def _wrapped(line: str) -> str:
+    width = shutil.get_terminal_size().columns
+    label = _LABEL.match(line)
+    kept = _COMMAND.sub(lambda found: found[0].replace(" ", "\0"), line)
+    return textwrap.fill(
+        kept,
+        width,
+        subsequent_indent=" " * (label.end() if label and 2 * label.end() < width else 0),
+        break_long_words=False,
+        break_on_hyphens=False,
+    ).replace("\0", " ")
+
+
 def fail(message: str = "") -> NoReturn:
     """End a failed command with a message."""
     if message:
-        click.echo(message, err=True)
+        say(message, err=True)
     sys.exit(ExitCode.NOT_REACHED)
 
 
@@ -83,17 +114,17 @@ def sentences() -> Iterator[None]:
         end(ending)
     except SpaceRobotError as error:
         out_of_reach = isinstance(error, PlanningError) and not isinstance(error, GoalError)
-        click.echo(str(error), err=True)
+        say(str(error), err=True)
         sys.exit(ExitCode.NOT_REACHED if out_of_reach else ExitCode.BAD_INPUT)
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
-        click.echo("Standard output cannot be written: no space is left on its device.", err=True)
+        say("Standard output cannot be written: no space is left on its device.", err=True)
         sys.exit(ExitCode.BAD_INPUT)
     except ImportError as error:
         if not error.name or error.name.split(".")[0] not in _ROS_MODULES:
             raise
-        click.echo(
+        say(
             f"ROS 2 was not found ({error}); source its setup file, or install spacerobot_ros "
             "with its extra [jazzy].",
             err=True,

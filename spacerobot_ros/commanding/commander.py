@@ -33,7 +33,13 @@ from spacerobot_ros.commanding.plant_state import (
     StateSynchroniser,
 )
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.errors import CommandError, PlanningError, RobotDescriptionError, printable
+from spacerobot_ros.errors import (
+    CommandError,
+    PlanningError,
+    RobotDescriptionError,
+    counted,
+    printable,
+)
 from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -587,7 +593,7 @@ class Commander(ABC):
         self._obstacles = text
         links = [] if self._world is None else links_with_shapes(self._world)
         listed = f": {', '.join(links)}" if links else ""
-        self.host.log("info", printable(f"Plans avoid {len(links)} obstacle(s){listed}."))
+        self.host.log("info", printable(f"Plans avoid {counted(len(links), 'obstacle')}{listed}."))
         self._use_obstacles()
 
     def _with_payload(self, robot: SpaceRobot) -> SpaceRobot:

@@ -15,6 +15,7 @@ from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.planned_reference import PlannedOptions, PlannedReference
 from spacerobot_ros.control.reference import PROFILES, OutputErrors
 from spacerobot_ros.control.wheels import WheelOptions
+from spacerobot_ros.errors import counted
 from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import group, nonnegative, parameter, registered
 
@@ -42,7 +43,8 @@ class ErrorMargin:
 def waypoints_refusal(count: int) -> str:
     """Return the message for a goal with waypoints that no planned motion passes."""
     return (
-        f"The goal has {count} waypoint(s), which require a planned motion: set profile to planned."
+        f"The goal has {counted(count, 'waypoint')}, which only a planned motion passes: set "
+        "profile to planned."
     )
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
-from spacerobot_ros.errors import CommandError, ParameterError
+from spacerobot_ros.errors import CommandError, ParameterError, counted
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import cross
@@ -403,10 +403,10 @@ class WheelControl:
         name, asked, answered = self.wheels.names[i], self._asked[i], self._answered[i]
         self._used[i] = False
         self._allocate = self._make_allocation()
-        left = ", and thrusters" if self.has_thrusters else ""
+        left = " and the thrusters" if self.has_thrusters else ""
         message = (
             f"Wheel '{name}' absorbed {answered:.3g} of {asked:.3g} N m s and is no longer used: "
-            f"{np.count_nonzero(self._used)} wheel(s){left} remain."
+            f"{counted(int(self._used.sum()), 'wheel')}{left} can be used."
         )
         self._add(EventKind.WHEEL_FAILED, message, 1, name)
 

@@ -11,7 +11,7 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from spacerobot_ros.errors import quantity
+from spacerobot_ros.errors import counted, quantity
 from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
@@ -37,8 +37,9 @@ class Flight(FlightData):
             left = f", {distance} and {angle} from "
         return (
             f"<Flight of {self.scenario.name} by {self.method}: {self.outcome.value} after "
-            f"{self.duration:.6g} s ({len(self.time) - 1} ticks, {self.corrections} "
-            f"correction(s)){left and f'{left}the goal'}. {self.verdict.sentence}>"
+            f"{self.duration:.6g} s ({len(self.time) - 1} ticks, "
+            f"{counted(self.corrections, 'correction')}){left and f'{left}the goal'}. "
+            f"{self.verdict.sentence}>"
         )
 
     def summary(self) -> dict[str, Any]:

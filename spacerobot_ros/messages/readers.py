@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import CommandError
+from spacerobot_ros.errors import CommandError, counted
 from spacerobot_ros.messages.definitions import fields_of, message_definition, message_type
 from spacerobot_ros.messages.layout import (
     BIG_ENDIAN,
@@ -371,7 +371,8 @@ class JointReader:
                 count = self._reader.value_count(quantity)
                 if count != len(names) and (count or i == 0):
                     raise CommandError(
-                        f"{len(names)} joint(s) are named but {count} {quantity} value(s) given"
+                        f"the message has {counted(len(names), 'joint name')} and "
+                        f"{counted(count, f'{quantity} value')}"
                     )
         except CommandError as error:
             self._problem = str(error)

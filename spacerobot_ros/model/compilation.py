@@ -28,7 +28,7 @@ from typing import Literal, TypeVar
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import SpaceRobotError, counted
 from spacerobot_ros.files import Cache, warn_once
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.termination import tool
@@ -99,7 +99,7 @@ class BufferedFunction:
             if np.size(value) != memory.size:
                 name = self.function.name_in(index)
                 raise ValueError(
-                    f"{self.function.name()}: {name} has {np.size(value)} number(s), "
+                    f"{self.function.name()}: {name} has {counted(np.size(value), 'number')}, "
                     f"not {memory.size}"
                 )
             memory[...] = value

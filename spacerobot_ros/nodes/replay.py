@@ -22,7 +22,13 @@ from std_srvs.srv import SetBool
 from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReplayStatus, SubscriberWait, renamed_topics
-from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.errors import (
+    CommandError,
+    ParameterError,
+    RecordingError,
+    SpaceRobotError,
+    counted,
+)
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.visuals import MeshFolder, has_meshes
@@ -135,8 +141,8 @@ class ReplayNode(FlightNode):
         """Return a log message with the bag, the number of topics and the rate."""
         config = self.config
         return (
-            f"Replays {len(self._outputs)} topic(s) of {config.bag} at {config.rate:g} times the "
-            "recorded speed."
+            f"Replays {counted(len(self._outputs), 'topic')} of {config.bag} at {config.rate:g} "
+            "times the recorded speed."
         )
 
     def deactivate(self) -> None:

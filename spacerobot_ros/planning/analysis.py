@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from spacerobot_ros.collision import CollisionGeometry
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.controllability import (
@@ -163,8 +163,8 @@ def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
     values = np.asarray(shape, dtype=float)
     if values.shape != (robot.n,) or not np.all(np.isfinite(values)):
         raise ParameterError(
-            f"The shape has {values.size} number(s); robot '{robot.description.name}' needs a "
-            f"finite value for each joint: {', '.join(robot.joint_names)}."
+            f"The shape has {counted(values.size, 'number')}; robot '{robot.description.name}' "
+            f"needs a finite value for each joint: {', '.join(robot.joint_names)}."
         )
     return values
 

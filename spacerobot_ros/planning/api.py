@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.errors import GoalError, ParameterError, counted
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
@@ -201,7 +201,7 @@ def _start_state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) ->
         q = np.asarray(start, dtype=float)
     if q.shape != (robot.n,):
         raise ParameterError(
-            f"The start has {q.size} joint position(s), but robot '{robot.description.name}' has "
-            f"{robot.n} joints."
+            f"The start has {counted(q.size, 'joint position')}, but robot "
+            f"'{robot.description.name}' has {counted(robot.n, 'joint')}."
         )
     return RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.errors import sentence_case
+from spacerobot_ros.errors import counted, sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.events import event_style, event_text
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
@@ -103,8 +103,7 @@ def _facts_html(flight: FlightReport) -> str:
     if flight.flown_method:
         found.append(f"method {flight.flown_method}")
     if flight.robot is not None:
-        count = len(flight.robot.joint_names)
-        joints = "1 joint" if count == 1 else f"{count} joints"
+        joints = counted(len(flight.robot.joint_names), "joint")
         found.append(f"robot {flight.robot.name}: {joints}, {flight.robot.total_mass:.5g} kg")
     if flight.bag.namespace:
         found.append(f"namespace {flight.bag.namespace}")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Joint
@@ -87,7 +87,7 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
 def _other_joints_clause(count: int) -> str:
     if not count:
         return ""
-    return f" The same applies to {count} other joint{'s' if count > 1 else ''}."
+    return f" The same applies to {counted(count, 'other joint')}."
 
 
 def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.kinematics import LinkPlacement
@@ -97,8 +97,8 @@ class Sensors:
         n = plant.robot.n
         if len(config.joint_bias) not in (0, n):
             raise ParameterError(
-                f"Parameter 'sensors.joint_bias' has {len(config.joint_bias)} value(s); the robot "
-                f"has {n} joints."
+                f"Parameter 'sensors.joint_bias' has {counted(len(config.joint_bias), 'value')}; "
+                f"the robot has {counted(n, 'joint')}."
             )
         self._plant, self._config, self._control_period = plant, config, control_period
         self._normals = NormalNumbers(config.seed, 12 + 2 * n)

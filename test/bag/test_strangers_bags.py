@@ -255,7 +255,7 @@ def test_topics_that_cannot_be_read_are_named_and_the_rest_is_written(
     assert tables["joint_states"]["position[j2]"].tolist() == [201.0]
     (said,) = caplog.messages
     assert said == (
-        f"3 topic(s) of the bag {mixed} are omitted: /cfg, /proto, /chatter. The topic /cfg of "
+        f"The bag {mixed} is read without 3 topics: /cfg, /proto, /chatter. The topic /cfg of "
         f"the bag {mixed} does not use ROS 2's encoding ('cdr' defined by 'ros2msg'), but 'json' "
         "defined by 'jsonschema'."
     )

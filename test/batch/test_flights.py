@@ -521,12 +521,12 @@ def test_bad_values_are_refused_and_change_nothing(three: SteppedFlights) -> Non
         (
             lambda: three.reset([0, 1], one),
             ParameterError,
-            r"2 flights are reset to 1 start state\(s\)",
+            r"A reset of 2 flights has 1 start state",
         ),
         (
             lambda: three.reset([0], one, drawn_masses(robot, 2, np.random.default_rng(1))),
             ParameterError,
-            r"1 flights are reset to 1 start state\(s\) with 2 rows of masses",
+            r"A reset of 1 flight has 1 start state and 2 rows of masses",
         ),
         (lambda: three.reset([0], outside), ParameterError, "slider_3.* outside its limits"),
         (lambda: three.reset([0], one, weightless), RobotDescriptionError, "mass"),

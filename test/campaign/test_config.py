@@ -127,7 +127,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"initial.joints.slider": NORM}}, "no joint 'slider'.*Did you mean 'slider_"),
     ({"disperse": {"goal.position.u": NORM}}, "is not one of goal.position.x"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
-    ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 fault\(s\)"),
+    ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 faults"),
     (
         {
             "disperse": {"faults[0].target": {"choice": ["slider_1", "slider_9"]}},
@@ -143,7 +143,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "joint_slow needs a value: factor on the command",
     ),
     ({"disperse": {"planner.method": NORM}}, "is a string: it must have a 'choice' of strings"),
-    ({"disperse": {"faults[0].present": NORM}}, r"plant.faults has 0 fault\(s\)"),
+    ({"disperse": {"faults[0].present": NORM}}, r"plant.faults has 0 faults"),
     ({"disperse": {"mass": {"choice": ["a"]}}}, "'mass: choice' is 'a'"),
     ({"criteria": {"position_eror_m": {"max": 1}}}, "no metric.*Did you mean 'position_error_m'"),
     ({"criteria": {"peak_rate.slider_9": {"max": 1}}}, "Did you mean 'peak_rate.slider_[123]'"),

@@ -303,7 +303,7 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
         ("initial.velocity.x", "initial.position.x, initial.position.y"),
         ("initial.joints.slider_9", "has no joint 'slider_9'; it has slider_1, slider_2, slider_3"),
         ("end_effector_goal.position.x", "has no goal for the end-effector"),
-        ("faults[3].at", "plant.faults has 3 fault(s); the first is faults[0]."),
+        ("faults[3].at", "plant.faults has 3 faults; the first is faults[0]."),
         ("faults[0].value", "a fault of kind joint_stuck has no value"),
     ],
 )

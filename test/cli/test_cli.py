@@ -130,7 +130,7 @@ def test_scenarios_are_listed() -> None:
 def test_waypoints_without_a_planned_motion_are_bad_input() -> None:
     result = spacerobot("run", "inspection", "--set", "coordinated_control.profile=quintic")
     assert result.exit_code == 2
-    assert_one_sentence(result.stderr, "3 waypoint(s)", "set profile to planned")
+    assert_one_sentence(result.stderr, "3 waypoints", "set profile to planned")
 
 
 # -- `run` and `plan` end with the same code for the same goal: 1 out of reach, 2 bad input ------

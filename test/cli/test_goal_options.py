@@ -99,10 +99,10 @@ def test_end_effectors_have_names_in_the_order_of_poses_then_positions() -> None
 @pytest.mark.parametrize(
     ("poses", "positions", "links", "counts"),
     [
-        ((POSE,), (HAND,), ("left",), "2 end-effector goal(s) and 1 name(s)"),
-        ((POSE,), (), ("left", "right"), "1 end-effector goal(s) and 2 name(s)"),
-        ((), (), ("left",), "0 end-effector goal(s) and 1 name(s)"),
-        ((POSE, POSE), (), (), "2 end-effector goal(s) and 0 name(s)"),
+        ((POSE,), (HAND,), ("left",), "2 end-effector goals and 1 name"),
+        ((POSE,), (), ("left", "right"), "1 end-effector goal and 2 names"),
+        ((), (), ("left",), "0 end-effector goals and 1 name"),
+        ((POSE, POSE), (), (), "2 end-effector goals and 0 names"),
     ],
 )
 def test_end_effectors_with_more_or_fewer_names_are_refused(

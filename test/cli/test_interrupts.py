@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -129,6 +129,29 @@ def test_a_terminal_that_is_closed_ends_a_robot_that_is_up_in_order(
         assert process.wait(PATIENCE) in (0, 129)
         # Complete: nothing had to be killed.
         assert read_bag(tmp_path / "up.mcap").message_count("/clock") > 0
+
+
+def test_a_sentence_is_wrapped_on_a_terminal_and_one_line_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("plan", "sliding_masses", "--goal", *"9000001")
+    with command(*words, cwd=tmp_path, stderr=subprocess.PIPE) as process:
+        _, sentence = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    assert len(sentence.splitlines()) == 1
+    ours, theirs = pty.openpty()
+    monkeypatch.setenv("COLUMNS", "50")
+    with command(*words, cwd=tmp_path, stderr=theirs) as process:
+        os.close(theirs)
+        said = b""
+        with suppress(OSError):  # The last writer has closed the terminal.
+            while received := os.read(ours, 1000):
+                said += received
+        os.close(ours)
+        assert process.wait(PATIENCE) == 1
+    lines = said.decode().rpartition("\x1b[K")[2].split("\r\n")
+    assert max(map(len, lines)) <= 50
+    assert " ".join(lines).strip() == sentence.strip()
 
 
 GIVEN = {"flights": 11, "disperse": {"mass.*": {"uniform": [0.9, 1.1]}}}

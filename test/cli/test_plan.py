@@ -348,8 +348,8 @@ def test_a_robot_whose_loops_turn_nothing_has_no_picture(tmp_path: Path) -> None
     [
         (["nobody"], "There is no robot 'nobody'"),
         (["nobody.urdf"], "no such URDF file"),
-        (["three_joint_arm", "--shape", "0 1"], "The shape has 2 number(s)"),
-        (["three_joint_arm", "--shape", "0 1 nan"], "The shape has 3 number(s)"),
+        (["three_joint_arm", "--shape", "0 1"], "The shape has 2 numbers"),
+        (["three_joint_arm", "--shape", "0 1 nan"], "The shape has 3 numbers"),
         (["three_joint_arm", "--shape", "0 1 two"], "it must have one number per joint"),
         (
             ["planar_chain", "--end-effector", "hand"],

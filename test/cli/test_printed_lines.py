@@ -74,7 +74,7 @@ sliding_masses, lie_bracket: The goal is reached.
 position    (0.12346, -2.00000, 0.50000) m, 1.23 mm from the goal (tolerance 20 mm)
 attitude    (0.10000, 0.20000, -0.30000) rad, 50 mrad = 2.865 deg from the goal (tolerance 60 mrad)
 shape       (0.40000, -0.70000, 1.50000)
-manoeuvre   12.5 s, 3 correction(s), planned in 0.457 s
+manoeuvre   12.5 s, 3 corrections, planned in 0.457 s
 flight      260 ticks in 0.52 s: 500 ticks/s, 25 times real time
 momentum    changed by < 1e-9 kg m/s and 0.000345 kg m^2/s
 bag         out/a.mcap (1234 messages)
@@ -623,7 +623,7 @@ def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.exit_code == 0
     assert result.stdout == (
         "saved       123 messages over 4.5 s\n"
-        "lost        789 bytes after the last whole record, 6 damaged chunk(s)\n"
+        "lost        789 bytes after the last whole record, 6 damaged chunks\n"
         "bag         b.mcap\n"
     )
     assert given == [Path("a.mcap"), None]

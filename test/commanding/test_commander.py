@@ -511,10 +511,10 @@ def test_obstacles_are_told_of_once_and_refused_ones_leave_those_so_far(robot: S
     rig.commander.receive_obstacles(BALL.replace("ball", "stone"))
     rig.commander.receive_obstacles("")
     told = [
-        "1 obstacle(s): ball",
+        "1 obstacle: ball",
         "The previous obstacles are kept",
-        "1 obstacle(s): stone",
-        "0 obstacle(s)",
+        "1 obstacle: stone",
+        "0 obstacles",
     ]
     assert len(rig.host.lines) == len(told)
     for (level, line), words in zip(rig.host.lines, told, strict=True):

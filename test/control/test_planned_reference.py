@@ -367,7 +367,7 @@ def test_waypoints_that_were_passed_are_not_passed_again() -> None:
 def test_a_straight_profile_refuses_waypoints() -> None:
     flight = docked(through_waypoints(), **STRAIGHT)
     assert flight.outcome is Outcome.REFUSED
-    assert_one_sentence(flight.message, "2 waypoint(s)", "set profile to planned")
+    assert_one_sentence(flight.message, "2 waypoints", "set profile to planned")
 
 
 def test_a_start_within_an_obstacle_is_refused() -> None:

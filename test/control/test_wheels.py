@@ -302,8 +302,8 @@ def test_a_wheel_that_does_not_answer_is_taken_out_of_use(share: float) -> None:
     )  # fmt: skip
     answered = {0.0: "0", 0.4: "0.06"}[share]
     assert event.message == (
-        f"Wheel 'spin_c' absorbed {answered} of 0.15 N m s and is no longer used: 2 wheel(s), and "
-        "thrusters remain."
+        f"Wheel 'spin_c' absorbed {answered} of 0.15 N m s and is no longer used: 2 wheels and "
+        "the thrusters can be used."
     )
     assert wheels.rank == 2
     wheels.command_torque(np.array([0.01, 0.02, 0.03]))
@@ -357,7 +357,7 @@ def test_a_failure_without_thrusters_says_so() -> None:
     observe(wheels, [5.0, 0.0, 0.0])
     fly(wheels, [0.3, 0.0, 0.0], 0.0, 0.52)
     (event,) = wheels.events()
-    assert event.message.endswith("and is no longer used: 2 wheel(s) remain.")
+    assert event.message.endswith("and is no longer used: 2 wheels can be used.")
 
 
 # -- the gyrostat and the robot ---------------------------------------------------------------

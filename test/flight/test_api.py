@@ -158,7 +158,7 @@ def test_a_schedule_says_what_it_is_in_one_line() -> None:
     schedule = plan("faults/stuck_slider", method="lie_bracket")
     count, duration = len(schedule.positions) - 1, schedule.duration
     assert repr(schedule).startswith(
-        f"<GaitSchedule by lie_bracket: {duration:g} s in {count} ticks of 0.05 s for 3 joint(s)"
+        f"<GaitSchedule by lie_bracket: {duration:g} s in {count} ticks of 0.05 s for 3 joints"
     )
     assert "\n" not in repr(schedule)
 

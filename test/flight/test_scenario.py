@@ -475,7 +475,7 @@ def test_a_scenario_of_a_robot_flies_that_robot() -> None:
     with pytest.raises(GoalError) as refused:
         replace(found, goal=shape).require_shape_of(SpaceRobot(description))
     assert str(refused.value) == (
-        f"The goal has 1 joint position(s); robot '{description.name}' has 3 joints."
+        f"The goal has 1 joint position; robot '{description.name}' has 3 joints."
     )
 
 

@@ -348,11 +348,11 @@ def test_a_flight_says_how_it_ended_in_one_line() -> None:
     off = Offset(FLIGHT)
     assert repr(FLIGHT) == (
         f"<Flight of servicer_thrusters by {FLIGHT.method}: reached after 1.25 s (2 ticks, "
-        f"0 correction(s)), {off.distance:.3g} m and {off.angle:.3g} rad from the goal. "
+        f"0 corrections), {off.distance:.3g} m and {off.angle:.3g} rad from the goal. "
         f"{FLIGHT.verdict.sentence}>"
     )
     assert repr(made_flight(goal=None, end_effector_goal=None)).endswith(
-        "0 correction(s)). The goal is reached.>"
+        "0 corrections). The goal is reached.>"
     )
 
 

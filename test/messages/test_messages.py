@@ -171,9 +171,12 @@ def test_a_message_that_is_refused_is_refused_again() -> None:
         (message(["fin"], velocity=[1.0]), ["'fin'", "slider_1, elbow, slider_3"]),
         (message(["elbow", "elbow"], velocity=[1.0, 2.0]), ["twice", "elbow"]),
         (message(["elbow", "slider_1"], velocity=[1.0, 2.0]), ["'slider_3' is missing"]),
-        (message(list(JOINTS), velocity=[]), ["3 joint(s)", "0 velocity"]),
-        (message(list(JOINTS), velocity=[1.0, 2.0]), ["3 joint(s)", "2 velocity"]),
-        (message(list(JOINTS), velocity=[1.0] * 3, position=[1.0]), ["3 joint(s)", "1 position"]),
+        (message(list(JOINTS), velocity=[]), ["3 joint names", "0 velocity"]),
+        (message(list(JOINTS), velocity=[1.0, 2.0]), ["3 joint names", "2 velocity"]),
+        (
+            message(list(JOINTS), velocity=[1.0] * 3, position=[1.0]),
+            ["3 joint names", "1 position"],
+        ),
     ],
 )
 def test_a_refusal_says_what_is_wrong(sent: JointState, mentions: list[str]) -> None:

@@ -128,7 +128,7 @@ def test_base_without_inertia_is_refused() -> None:
 
 def test_shape_of_the_wrong_length_is_refused() -> None:
     found = SpaceRobot(parse_robot(robot(HULL, ARM, ELBOW)))
-    with pytest.raises(ValueError, match=r"connection: q has 2 number\(s\), not 1"):
+    with pytest.raises(ValueError, match=r"connection: q has 2 numbers, not 1"):
         found.connection([0.1, 0.2])
 
 

@@ -439,11 +439,11 @@ def test_goals_that_are_refused_have_a_result(harness: Harness) -> None:
         ({**base_at(goal_at(NEAR)), "joint_tolerance": math.nan}, "joint tolerance"),
         ({**base_at(goal_at(NEAR)), "time_limit": Duration(sec=-1)}, "time limit"),
         ({"end_effectors": ["hand"], "end_effector_poses": [goal_at(NEAR)]}, "'hand'"),
-        ({"end_effectors": ["hand"]}, "1 end-effector(s) and 0 pose(s)"),
+        ({"end_effectors": ["hand"]}, "1 end-effector and 0 poses"),
         ({"joint_positions": joints}, "The goal has only joint positions: add a base pose"),
         (
             {**base_at(goal_at(NEAR)), "joint_positions": JointState(position=[0.1])},
-            "0 joint name(s) and 1",
+            "0 joint names and 1",
         ),
     ):
         sent = flight.fly_to.send(**fields)

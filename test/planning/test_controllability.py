@@ -119,7 +119,7 @@ def test_sliders_in_a_plane_or_too_few_are_not() -> None:
     for robot, count in ((two, 2), (flat, 3)):
         found = check_sliding_masses(SpaceRobot.from_urdf(robot.urdf))
         assert not found.controllable
-        assert f"{count} slider(s), whose slots have rank 2" in found.message
+        assert f"{count} movable sliders, whose slots have rank 2" in found.message
 
 
 def test_planar_robots_turn_about_one_axis() -> None:
@@ -175,7 +175,7 @@ def test_with_one_joint_none_of_the_three_axes_is_spanned(robot: str) -> None:
     assert not found.controllable
     assert found.singular_values.tolist() == [0.0, 0.0, 0.0]
     assert found.condition == np.inf
-    with pytest.raises(PlanningError, match=r"has 1 joint\(s\): no loop encloses an area"):
+    with pytest.raises(PlanningError, match=r"has 1 joint: no loop encloses an area"):
         found.require()
 
 

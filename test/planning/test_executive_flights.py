@@ -93,7 +93,7 @@ def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
     loop.tick()
     loop.set(attitude_tolerance=1e-9)
     status = loop.until(PlannerState.FAILED)
-    assert_one_sentence(status.message, "not reached", "0 correction(s)")
+    assert_one_sentence(status.message, "not reached", "0 corrections")
     loop.tick(10)
     assert loop.speeds[-1] == 0.0
 

@@ -279,7 +279,7 @@ def test_fewer_than_three_sliders_are_refused(count: int) -> None:
     robot = replace(robot, sliders=robot.sliders[:count])
     text = refusal_of(robot, origin(count), NEAR)
     assert "three sliders" in text
-    assert f"{count} slider" in text
+    assert f"{count} movable slider" in text
 
 
 @pytest.mark.parametrize("count", [3, 5])
@@ -293,7 +293,7 @@ def test_slots_in_one_plane_are_refused(count: int) -> None:
     robot = SlidingRobot(10.0, np.diag([1.0, 1.5, 1.5]), np.zeros(3), sliders)
     text = refusal_of(robot, origin(count), NEAR)
     assert "linearly independent" in text
-    assert f"{count} slider(s), whose slots have rank 2" in text
+    assert f"{count} movable sliders, whose slots have rank 2" in text
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(0, 1), (1, -1), (2, 1)])

@@ -105,7 +105,7 @@ def test_what_is_no_shape_is_refused(shape: npt.ArrayLike) -> None:
 
 
 def test_a_goal_of_the_end_effector_without_a_name_is_refused_by_that() -> None:
-    with pytest.raises(GoalError, match=r"^The goal of the end-effector has 2 number\(s\); give 3"):
+    with pytest.raises(GoalError, match=r"^The goal of the end-effector has 2 numbers; give 3"):
         EndEffectorGoal.checked("", [1.0, 0.0])
     with pytest.raises(GoalError, match=r"^The end-effector has 2 goals; only one is allowed\.$"):
         Goal.of_end_effectors([EndEffectorGoal.checked("", np.ones(3))] * 2)
@@ -151,7 +151,7 @@ def test_a_call_without_ros_checks_its_options_too() -> None:
 
 
 def test_a_start_has_a_position_for_every_joint_and_a_method_is_one_of_the_registry() -> None:
-    with pytest.raises(ParameterError, match=r"start has 2 joint position\(s\), .* has 3 joints"):
+    with pytest.raises(ParameterError, match=r"start has 2 joint positions, .* has 3 joints"):
         plan(robot_of(ARM), start=(0.1, 0.2))
     with pytest.raises(
         ParameterError, match="no gait method 'magic'; the methods are: lie_bracket, "
@@ -330,7 +330,7 @@ def test_limits_are_the_robots_narrowed_by_options(arm: SpaceRobot) -> None:
     assert found.velocity == pytest.approx(own * [0.5, 1.0, 1.0])
     assert found.acceleration.tolist() == [1.0, 2.0, 3.0]
     for wrong, words in (
-        ({"max_velocity": (1.0,)}, "1 number(s); robot 'three_joint_arm' has 3 joints ("),
+        ({"max_velocity": (1.0,)}, "1 number; robot 'three_joint_arm' has 3 joints ("),
         ({"max_velocity": (1.0, 0.0, 1.0)}, f"'{arm.joint_names[1]}' is limited to 0 per second"),
         ({"max_acceleration": (1.0, 0.0, 1.0)}, "and 0 per second squared; area_loop needs"),
     ):

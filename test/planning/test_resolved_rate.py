@@ -228,7 +228,7 @@ def test_a_path_may_end_where_it_began_and_a_correction_goes_straight(
 
 def test_waypoints_that_lead_nowhere_are_refused(arm: tuple[GaitSchedule, Pose, Array]) -> None:
     start, _ = arm[1]
-    with pytest.raises(ParameterError, match=r"resolved_rate\.waypoints has 4 number\(s\); a way"):
+    with pytest.raises(ParameterError, match=r"resolved_rate\.waypoints has 4 numbers; a way"):
         planned("three_joint_arm", ARM, "end_effector", start, waypoints=(1.0, 2.0, 3.0, 4.0))
     with pytest.raises(
         PlanningError, match=r"^The path through the waypoints meets a dynamic|at its limit"

@@ -424,7 +424,7 @@ def test_names_and_lengths() -> None:
     ):
         with pytest.raises(CommandError, match=words):
             read(named, [0.0] * len(named))
-    with pytest.raises(CommandError, match=r"3 joint\(s\) are named but 2 effort"):
+    with pytest.raises(CommandError, match=r"3 joint names and 2 effort"):
         read(["a", "b", "c"], [1.0, 2.0])
 
 

@@ -18,7 +18,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.serialization import deserialize_message
 
 from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.messages.builders import goal_message
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.messages import (
@@ -69,14 +69,15 @@ class FlyToAction:
         links, poses = list(request.end_effectors), list(request.end_effector_poses)
         if len(links) != len(poses):
             raise PlanningError(
-                f"The goal has {len(links)} end-effector(s) and {len(poses)} pose(s): give "
-                f"exactly one pose for each end-effector."
+                f"The goal has {counted(len(links), 'end-effector')} and "
+                f"{counted(len(poses), 'pose')}: give exactly one pose for each end-effector."
             )
         joints = request.joint_positions
         if len(joints.name) != len(joints.position):
             raise PlanningError(
-                f"The goal has {len(joints.name)} joint name(s) and {len(joints.position)} joint "
-                "position(s): give exactly one position for each joint."
+                f"The goal has {counted(len(joints.name), 'joint name')} and "
+                f"{counted(len(joints.position), 'joint position')}: give exactly one position "
+                "for each joint."
             )
         if not links and not request.base_pose:
             alone = "has only joint positions" if joints.name else "is empty"

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import JointState
 
-from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, printable
+from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, counted, printable
 from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
 from spacerobot_ros.messages.definitions import message_module
 from spacerobot_ros.model.description import Array
@@ -221,7 +221,7 @@ def goal_description(part: str, goal_id: str, message: PoseStamped | Path, goal:
     if aim.quaternion is not None:
         attitude = f"({', '.join(f'{x:.4g}' for x in aim.quaternion)})"
     waypoints = getattr(aim, "waypoints", None)
-    through = "" if waypoints is None else f" through {len(waypoints)} waypoint(s)"
+    through = "" if waypoints is None else f" through {counted(len(waypoints), 'waypoint')}"
     return f"Goal {goal_id} of the {part}: ({position}) m, {attitude}{through}{given}."
 
 

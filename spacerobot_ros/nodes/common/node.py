@@ -33,6 +33,7 @@ from spacerobot_ros.errors import (
     CommandError,
     ParameterError,
     SpaceRobotError,
+    counted,
     describe_exception,
     printable,
 )
@@ -594,4 +595,4 @@ def described_robot(robot: SpaceRobot | None) -> str:
     if robot is None:
         return "the robot expected on robot_description"
     mass = robot.description.total_mass
-    return f"'{robot.description.name}' ({robot.n} joint(s), {mass:.4g} kg)"
+    return f"'{robot.description.name}' ({counted(robot.n, 'joint')}, {mass:.4g} kg)"

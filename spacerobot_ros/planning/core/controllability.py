@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
+from spacerobot_ros.errors import PlanningError, Proof, UnreachableError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
@@ -162,8 +162,8 @@ def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
         return
     raise PlanningError(
         "lie_bracket needs three sliders with linearly independent slots (paper 1, section 4.1); "
-        f"robot '{robot.description.name}' has {slots.shape[1]} slider(s), whose slots have rank "
-        f"{rank}."
+        f"robot '{robot.description.name}' has {counted(slots.shape[1], 'movable slider')}, whose "
+        f"slots have rank {rank}."
     )
 
 
@@ -196,7 +196,7 @@ def _span_of_brackets(
     joints = list(range(robot.n)) if among is None else list(among)
     name = robot.description.name
     if len(joints) < 2:
-        message = f"Robot '{name}' has {len(joints)} joint(s): no loop encloses an area."
+        message = f"Robot '{name}' has {counted(len(joints), 'joint')}: no loop encloses an area."
         return Controllability(0, 3, np.zeros(3), (), shapes[0], message)
     K = curvatures(robot, shapes)
     pairs = np.array(list(itertools.combinations(joints, 2)))

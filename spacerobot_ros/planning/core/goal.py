@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import GoalError
+from spacerobot_ros.errors import GoalError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.rotations import (
@@ -82,8 +82,8 @@ class EndEffectorGoal:
         values = as_numbers(pose, f"The goal of {name}", GoalError)
         if values.shape not in ((3,), (7,)):
             raise GoalError(
-                f"The goal of {name} has {values.size} number(s); give 3 (a position) or 7 (a "
-                "position and a quaternion)."
+                f"The goal of {name} has {counted(values.size, 'number')}; give 3 (a position) or "
+                "7 (a position and a quaternion)."
             )
         given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
         return cls(link, given.position, given.quaternion if len(values) == 7 else None)

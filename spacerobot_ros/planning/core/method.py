@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from spacerobot_ros.collision import BasePoses
-from spacerobot_ros.errors import GoalError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.errors import GoalError, PlanningError, Proof, UnreachableError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
@@ -310,8 +310,8 @@ class GaitMethod(ABC):
             return None
         if len(wanted) != robot.n:
             raise GoalError(
-                f"The goal shape has {len(wanted)} joint position(s), but robot "
-                f"'{robot.description.name}' has {robot.n} joints."
+                f"The goal shape has {counted(len(wanted), 'joint position')}, but robot "
+                f"'{robot.description.name}' has {counted(robot.n, 'joint')}."
             )
         beyond = np.maximum(robot.lower - wanted, wanted - robot.upper)
         worst = int(np.argmax(beyond))

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, PoseError
@@ -93,7 +93,7 @@ class GaitSchedule:
         error = PoseError.between(self.path.position[-1], self.path.quaternion[-1], self.goal)
         return (
             f"<GaitSchedule by {self.method}: {self.duration:.6g} s in {self.ticks} ticks of "
-            f"{self.control_period:g} s for {len(self.joint_names)} joint(s), ends "
+            f"{self.control_period:g} s for {counted(len(self.joint_names), 'joint')}, ends "
             f"{error.distance:.3g} m and {error.angle:.3g} rad from the goal>"
         )
 

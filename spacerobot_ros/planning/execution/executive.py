@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from spacerobot_ros.errors import PlanningError, sentence_case
+from spacerobot_ros.errors import PlanningError, counted, sentence_case
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -461,7 +461,7 @@ class Executive:
         if active.not_flown_reason:
             why = f": {active.not_flown_reason}. Remaining"
         elif corrects and active.corrections >= self.config.max_corrections:
-            why = f" after {active.corrections} correction(s)"
+            why = f" after {counted(active.corrections, 'correction')}"
         if why:
             self._end_goal(active.failed(error, tolerance, why), Event.FAILED)
             return

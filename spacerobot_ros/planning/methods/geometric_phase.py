@@ -21,7 +21,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import (
@@ -77,7 +77,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
     name, bodies = robot.description.name, robot.description.bodies
     if len(bodies) < 3:
         raise PlanningError(
-            f"Robot '{name}' has {len(bodies)} link(s) that move relative to each other: with "
+            f"Robot '{name}' has {counted(len(bodies), 'moving link')}: with "
             "fewer than three, joint loops do not reorient a planar robot (paper 3, section III)."
         )
     axes: list[Array] = []

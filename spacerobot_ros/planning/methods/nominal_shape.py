@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import (
@@ -335,8 +335,8 @@ def _list_triples(robot: SpaceRobot, names: Sequence[str]) -> list[Triple]:
 def _require_shape(robot: SpaceRobot, shape: Array) -> Array:
     if len(shape) != robot.n:
         raise ParameterError(
-            f"area_loop.nominal has {len(shape)} number(s); robot '{robot.description.name}' has "
-            f"{robot.n} joints."
+            f"area_loop.nominal has {counted(len(shape), 'number')}; robot "
+            f"'{robot.description.name}' has {counted(robot.n, 'joint')}."
         )
     outside = np.flatnonzero((shape < robot.lower) | (shape > robot.upper))
     if outside.size:

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import override
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
@@ -523,8 +523,8 @@ class ResolvedRateGait(GaitMethod):
         self._limits = MotionLimits.of(self.robot, self.options, self.name)
         if len(self.options.waypoints) % 3:
             raise ParameterError(
-                f"{self.name}.waypoints has {len(self.options.waypoints)} number(s); a waypoint "
-                "has three."
+                f"{self.name}.waypoints has {counted(len(self.options.waypoints), 'number')}; a "
+                "waypoint has three."
             )
 
     @classmethod

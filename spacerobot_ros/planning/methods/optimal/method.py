@@ -20,7 +20,7 @@ import numpy as np
 from typing_extensions import override
 
 from spacerobot_ros.collision import BasePoses
-from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
+from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError, counted
 from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
@@ -448,7 +448,7 @@ class OptimalGait(GaitMethod):
         if found.cut_short:
             notes["cut_short"] = (
                 f"The search used up optimal.time_budget, {self.options.time_budget:g} s, after "
-                f"{found.starts} start(s); a larger budget may find a faster manoeuvre."
+                f"{counted(found.starts, 'start')}; a larger budget may find a faster manoeuvre."
             )
         return _Plan(found.positions, notes, task.boundary.final_velocity)
 

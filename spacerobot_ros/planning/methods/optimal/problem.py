@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError, PlanningError
+from spacerobot_ros.errors import ParameterError, PlanningError, counted
 from spacerobot_ros.model import SpaceRobot, symbolic_rotations
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
@@ -614,7 +614,7 @@ def per_joint(
         return given
     if len(values) != robot.n:
         raise ParameterError(
-            f"{method}.{option} has {len(values)} number(s); robot '{robot.description.name}' has "
-            f"{robot.n} joints ({', '.join(names)})."
+            f"{method}.{option} has {counted(len(values), 'number')}; robot "
+            f"'{robot.description.name}' has {counted(robot.n, 'joint')} ({', '.join(names)})."
         )
     return np.asarray(values, dtype=float)

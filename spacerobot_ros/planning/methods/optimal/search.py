@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spacerobot_ros.collision import Approach
-from spacerobot_ros.errors import NotFoundError, PlanningError
+from spacerobot_ros.errors import NotFoundError, PlanningError, counted
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.model.wheels import ReactionWheels
@@ -359,9 +359,10 @@ class ManoeuvreSearch:
             limit = "duration" if options.duration > 0 else "longest"
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
             raise NotFoundError(
-                f"No manoeuvre to the goal{in_motion} was found from {search.starts} start(s)"
-                f"{within}: {search.rejection}. {longer} optimal.starts, optimal.iterations or "
-                f"optimal.intervals, a longer optimal.{limit}, or a closer goal may help."
+                f"No manoeuvre to the goal{in_motion} was found from "
+                f"{counted(search.starts, 'start')}{within}: {search.rejection}. {longer} "
+                "optimal.starts, optimal.iterations or optimal.intervals, "
+                f"a longer optimal.{limit}, or a closer goal may help."
             )
         return replace(found, starts=search.starts, cut_short=cut_short)
 
@@ -839,8 +840,8 @@ class _Search:
         if solution is None:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         if pairs:
-            apart, lack = f"{len(pairs)} pair(s) apart", f"{1e3 * solver.lack:.3g} mm too close"
-            self._report(f"{apart}, {solution.duration:.6g} s, {lack}")
+            apart, lack = counted(len(pairs), "pair"), f"{1e3 * solver.lack:.3g} mm too close"
+            self._report(f"{apart} apart, {solution.duration:.6g} s, {lack}")
         return solution
 
     @property
