@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import CommandReport, ControllerStatus
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.errors import RecordingError, sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.series import Commands, SentGoal, Signal, pose_error
 from spacerobot_ros.measures import (
@@ -58,6 +58,7 @@ from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.capture import capture_values, load_target
 from spacerobot_ros.simulation.clearance import FlightClearance
 from spacerobot_ros.simulation.commands import Refusal
+from spacerobot_ros.simulation.faults import active_fault
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND
 
@@ -614,7 +615,31 @@ class FlightData:
     @cached_property
     def verdict(self) -> Verdict:
         """The outcome of the flight in a few words and a sentence, according to its last true
-        state."""
+        state; faults that were active when the flight failed follow in another sentence."""
+        verdict, outcome = self._verdict_without_faults, self.outcome
+        failed = outcome in (Outcome.FAILED, Outcome.ABORTED)
+        faults = self._faults_at_decision
+        if not faults or not (failed or (outcome is Outcome.REACHED and not verdict.succeeded)):
+            return verdict
+        clauses = sentence_case("; ".join(map(active_fault, faults)))
+        return replace(verdict, sentence=f"{verdict.sentence} {clauses}.")
+
+    @property
+    def _faults_at_decision(self) -> list[str]:
+        """The lines of the faults that were active when the goal was decided."""
+        active: dict[str, None] = {}
+        decided: list[str] = []
+        for event in self.events:
+            if event.kind is EventKind.FAULT_INJECTED and "fault" in event.about:
+                active[event.about["fault"]] = None
+            elif event.kind is EventKind.FAULT_ENDED:
+                active.pop(event.about.get("fault", ""), None)
+            elif event.kind.value == f"goal_{self.outcome.value}":
+                decided = list(active)
+        return decided
+
+    @property
+    def _verdict_without_faults(self) -> Verdict:
         late = self.outcome is Outcome.FAILED and isinstance(self.status, ControllerStatus)
         reached = self.outcome in (Outcome.REACHED, Outcome.REACHED_PARTLY)
         if not (reached or late):

@@ -126,7 +126,7 @@ def _outcome_html(flight: FlightReport) -> str:
     word, sentence = tone.capitalize(), last if isinstance(last, str) else last.message
     if tone == "executing":
         sentence += " The recording ends before the outcome is known."
-    if tone in ("reached", "reached_partly", "failed"):
+    if tone in ("reached", "reached_partly", "failed", flight.outcome.value):
         word, sentence = verdict.word, verdict.sentence
     if tone.startswith("reached"):
         tone = "reached" if verdict.complete else "reached partly"

@@ -324,6 +324,21 @@ def with_seconds(line: str) -> str:
     return _TIME.sub(r"\g<0> s", line)
 
 
+_FAULT_LINE = re.compile(r"(?P<noun>[a-z]+)_(?P<state>[a-z]+) (?P<target>\S+).*? at (?P<since>\S+)")
+
+
+def active_fault(line: str) -> str:
+    """Return a clause that says since when the fault of a line has been active, such as ``joint
+    'elbow' has been stuck since 12 s``."""
+    found = _FAULT_LINE.match(line)
+    if found is None:
+        return f"the fault '{line}' has been active"
+    noun, state, target, since = found.groups()
+    if state in ("bias", "noise", "dropout", "delay"):
+        return f"the {noun} {state} of '{target}' has been active since {since} s"
+    return f"{noun} '{target}' has been {state} since {since} s"
+
+
 def format_times(start: float, end: float) -> str:
     """Return the start and end formatted as the last words of a line."""
     # With six digits, an entry that is short and late would begin and end at the same time.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,7 @@ from spacerobot_ros.planning.execution.status import (
     PlannerState,
     PlannerStatus,
 )
+from spacerobot_ros.report import write_report
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.run import run_scenario
@@ -283,3 +286,29 @@ def test_a_part_that_was_asked_for_and_is_not_controlled_is_not_reached(tmp_path
     assert (result.summary["state"], result.succeeded) == ("reached_partly", False)
     assert "but for its position, which is 1.25 m off" in result.message  # It drifts by 0.25 m.
     assert result.summary["verdict"] == result.message
+
+
+@pytest.mark.parametrize(
+    ("fault", "state", "named"),
+    [
+        ("thruster_off all at 1", "failed", "Thruster 'all' has been off since 1 s."),
+        ("thruster_stuck force_x 400 at 1.5", "aborted", "has been stuck since 1.5 s."),
+        ("thruster_off all at 1 until 2", "failed", ""),
+    ],
+)
+def test_a_fault_that_was_active_when_the_goal_failed_is_named(
+    tmp_path: Path, fault: str, state: str, named: str
+) -> None:
+    """In the summary and in the report; a fault that has ended is not."""
+    settings = ("coordinated_control.time_limit=4", f"plant.faults={fault}")
+    scenario = load_scenario("coordinated_control").with_settings(settings)
+    bag, page = tmp_path / "flight.mcap", tmp_path / "flight.html"
+    found = run_scenario(scenario, bag).summary
+    write_report(bag, page)
+    assert found["state"] == state
+    assert found["verdict"].endswith(named)
+    assert ("has been" in found["verdict"]) == bool(named)
+    (outcome,) = re.findall(r'<p class="outcome[^>]*>.*?</p>', page.read_text("utf-8"), re.DOTALL)
+    said = html.unescape(outcome).replace("\N{NO-BREAK SPACE}", " ")
+    assert named in said
+    assert ("has been" in said) == bool(named)
