@@ -73,8 +73,8 @@
       mark.hidden = event.time < span[0] - 1e-9 || event.time > span[1] + 1e-9;
       if (mark.hidden) continue;
       mark.style.left = `${x}px`;
-      const wide = 6.2 * event.text.length;
-      const least = Math.min(wide, 56);
+      const short = event.text.split(":")[0];
+      const [wide, least] = [event.text, short].map((each) => 6.2 * each.length);
       let room = limit[event.row] - x - 14;
       const roomBefore = x - 14 - Math.max(earlier[k], 0);
       // At the right end, and where the next mark is near, the words stand before their mark.
@@ -86,8 +86,9 @@
         (each.event.strong === event.strong ? j > k : each.event.strong));
       mark.classList.toggle("before", before && !outdone);
       words.style.display = outdone || room < least ? "none" : "";
-      words.style.maxWidth = `${Math.max(room, 0)}px`;
-      limit[event.row] = before && !outdone ? x - 14 - Math.min(wide, room) : x - 6;
+      words.textContent = room < wide ? short : event.text;
+      const start = before && !outdone ? x - 14 - (room < wide ? least : wide) : x - 6;
+      limit[event.row] = Math.min(limit[event.row], start);
     }
   }
 

@@ -134,6 +134,41 @@ def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
 
 
 @with_browser
+@pytest.mark.parametrize("width", [1280, 420])
+def test_labels_of_events_stay_in_their_strip_and_apart(tmp_path: Path, width: int) -> None:
+    plans = [
+        (t, {"event": "plan_ready", "time": f"{t}", "method": "area_loop"}) for t in (6.3, 7.5, 8.7)
+    ]
+    begun = [(t - 0.01, {"event": "plan_started", "time": f"{t - 0.01}"}) for t, _ in plans]
+    fault = {"event": "fault_injected", "time": "9.6", "fault": "joint_stuck elbow at 9.6"}
+    ended = {"event": "goal_reached", "time": "9.95"}
+    events = sorted([*plans, *begun, (9.6, fault), (9.95, ended)], key=lambda event: event[0])
+    bag = tell(tmp_path / "late.mcap", Story(np.zeros((200, 3)), events=events))
+    html = bag.with_suffix(".html")
+    with pytest.MonkeyPatch.context() as patch:
+        leave_blank(patch)
+        write_report(bag, html)
+    with browser(tmp_path / "profile") as opened:
+        opened.open(html, width, 900)
+        opened.wait_for("document.querySelector('.lane') !== null")
+        left, right = opened.evaluate(
+            "(lane => [lane.left, lane.right])"
+            "(document.querySelector('.lane').getBoundingClientRect())"
+        )
+        words = opened.evaluate(
+            "[...document.querySelectorAll('.mark i')].filter(each => each.offsetWidth)"
+            ".map(each => [each.getBoundingClientRect(), each.innerText])"
+            ".map(([box, text]) => [box.top, box.left, box.right, text])"
+        )
+    shown = {text.partition(":")[0] for *_, text in words}
+    assert {"plan", "fault on"} | ({"goal reached"} if width > 1000 else set()) <= shown
+    for row in {top for top, *_ in words}:
+        spans = sorted((begin, end) for top, begin, end, _ in words if top == row)
+        edges = [left, *(edge for span in spans for edge in span), right]
+        assert edges == sorted(edges), words
+
+
+@with_browser
 def test_what_happened_stands_once_below_the_first_chart(window: Browser) -> None:
     left, width = chart(window, 0, "[0, chart.lane.clientWidth]")
     marks = chart(
