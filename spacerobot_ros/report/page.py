@@ -83,7 +83,7 @@ def page(
         f"<p>{escape(description)}</p>" if description else "",
         _facts_html(flight),
         _outcome_html(flight),
-        tiles([tile for tile in headline(flight) if tile[0] != "Method"]),  # Among the facts.
+        tiles(headline(flight)),
         "</header>",
         *_runs_html(flight, beside),
         player.markup,
@@ -140,7 +140,7 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
         return []
     flights = [flight, *beside]
     parts = ["<h2>Runs side by side</h2>", _table_html("runs", runs_table(flights))]
-    files = [each.bag.path.name for each in flights]
+    files = [each.label for each in flights]
     if goals := different_goals(flights):
         parts += ["<h3>Goals that differ</h3>", table("goals", ("Goal", *files), goals)]
     if rows := different_parameters([each.scenario for each in flights]):

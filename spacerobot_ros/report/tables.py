@@ -11,7 +11,9 @@ import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError, numbers, quantity
 from spacerobot_ros.flight.captures import payload_estimates
-from spacerobot_ros.flight.series import pose_error
+from spacerobot_ros.flight.reading import impulse
+from spacerobot_ros.flight.series import Signal, pose_error
+from spacerobot_ros.measures import peak, peak_wrench
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
@@ -66,8 +68,6 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
                 "; ".join([*notes, *_time_to_end_texts(flight)]),
             )
         )
-    if flight.flown_method:
-        rows.append(("Method", flight.flown_method, ""))
     if len(flight.unexplained_momentum) > 1:
         linear, angular = flight.momentum_drift.tolist()
         label = "Momentum not explained by thrusters" if flight.has_thrust else "Momentum drift"
@@ -110,14 +110,37 @@ def _error_with_tolerance(
 
 
 def runs_table(flights: Sequence[FlightReport]) -> Table:
-    """Return the outcome and key figures of several flights, one column each."""
+    """Return the outcome, key figures and extreme values of several flights, one column each."""
     found = [
-        {"Outcome": flight.verdict.word} | {label: value for label, value, _ in headline(flight)}
+        {"Outcome": flight.verdict.word}
+        | {label: value for label, value, _ in headline(flight)}
+        | _extreme_values(flight)
         for flight in flights
     ]
     labels = list(dict.fromkeys(label for values in found for label in values))
     rows = [(label, *(values.get(label, _NO_VALUE) for values in found)) for label in labels]
-    return Table(("Bag", *(flight.bag.path.name for flight in flights)), rows)
+    return Table(("Flight", *(flight.label for flight in flights)), rows)
+
+
+def _extreme_values(flight: FlightReport) -> dict[str, str]:
+    """Return the clearance, and the peaks of thrust and effort with the total impulse."""
+    rows, wrench, efforts = {}, flight.wrench, peak(flight.efforts.values)
+    if (clearance := flight.clearance) is not None:
+        rows["Clearance"] = quantity(clearance.nearest.distance, "m")
+    if wrench.values.any():
+        force, torque = peak_wrench(wrench.values).tolist()
+        rows["Peak thruster force"] = quantity(force, "N")
+        rows["Peak thruster torque"] = quantity(torque, "N m")
+        norms = np.linalg.norm(wrench.values[:, :3], axis=1, keepdims=True)
+        thrust = flight.signal("thruster_force") or Signal(wrench.time, norms)
+        total = impulse(thrust, np.ones(thrust.width)).values[-1, 0]
+        rows["Thrust impulse"] = quantity(float(total), "N s")
+    units = [joint_unit(flight, name) for name in flight.joint_names]
+    for of, unit, label in (("rad", "N m", "Peak joint torque"), ("m", "N", "Peak joint force")):
+        largest = max((x for x, each in zip(efforts, units, strict=True) if each == of), default=0)
+        if largest:
+            rows[label] = quantity(float(largest), unit)
+    return rows
 
 
 def result_table(flight: FlightReport) -> Table:
