@@ -218,11 +218,17 @@ class LanesEngine:
         batch: Sequence[_PreparedDraw],
         stopped: Callable[[], bool],
     ) -> Iterator[Row | Fallback]:
-        began = time.perf_counter()
+        began, interrupted = time.perf_counter(), False
+
+        def look() -> bool:
+            nonlocal interrupted
+            interrupted = interrupted or stopped()
+            return interrupted
+
         try:
             flights = lanes.flights(campaign, batch)
-            result = fly_lanes(flights, self._target, stopped)
-            if stopped():
+            result = fly_lanes(flights, self._target, look)
+            if interrupted:
                 return
         # The error is of one draw, so each draw is flown by itself.
         except SpaceRobotError as error:

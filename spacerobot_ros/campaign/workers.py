@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-import multiprocessing
 import os
 import pickle
 import signal
@@ -28,6 +27,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
+from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -138,6 +138,19 @@ class WorkerDeath(Exception):  # noqa: N818
     """A worker died during a task."""
 
 
+class _RecordingContext(SpawnContext):
+    """Starts processes anew, and remembers them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.made: list[SpawnProcess] = []
+
+    def Process(self, *arguments: Any, **options: Any) -> SpawnProcess:  # type: ignore[override]
+        process = SpawnProcess(*arguments, **options)
+        self.made.append(process)
+        return process
+
+
 class LocalWorkers:
     """Processes on this machine, each connected by anonymous pipes that no other process can
     access.
@@ -151,13 +164,11 @@ class LocalWorkers:
     tasks_per_worker = 1
 
     def __init__(self, count: int) -> None:
-        self._count = count
-        self._others = set(multiprocessing.active_children())
+        self._count, self._context = count, _RecordingContext()
         self._pool = self._make_pool()
 
     def _make_pool(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(self._count, context, _end_with_campaign)
+        return ProcessPoolExecutor(self._count, self._context, _end_with_campaign)
 
     def count(self) -> int:
         """Return the number of workers."""
@@ -187,9 +198,10 @@ class LocalWorkers:
         """Stop tasks; :meth:`close` terminates the processes."""
 
     def close(self) -> None:
-        """End the processes."""
-        for process in set(multiprocessing.active_children()) - self._others:
-            process.kill()
+        """End the processes, and no other child of this process."""
+        for process in self._context.made:
+            if process.is_alive():
+                process.kill()
         self._pool.shutdown(cancel_futures=True)
 
 
@@ -440,6 +452,9 @@ class TaskDistributor:
             for task in ended:
                 yield self._collect_rows(task)
         if self._running:
+            # Tasks that have finished since.
+            for task in self._workers.ended(list(self._running)):
+                yield self._collect_rows(task)
             self._workers.cancel(list(self._running))
 
     def _submit_tasks(self, waiting: deque[int]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -368,7 +369,7 @@ def test_a_campaign_that_is_stopped_in_flight_has_no_rows_of_that_batch(engine: 
         return asked > made.flights + 1
 
     assert not list(engine_named(engine).fly(made, list(Draws(made)), stopped))
-    assert asked == made.flights + 3
+    assert asked == made.flights + 2
 
 
 SHARED = "is dispersed, but shared by all lanes"
@@ -440,3 +441,12 @@ def test_what_a_first_schedule_does_not_decide_is_left_to_the_planner(
     rows = flown(engine_named(engine), made)
     assert {row.outcome for row in rows.values()} == {outcome}
     assert {row.fallback for row in rows.values()} == {fallback}
+
+
+def test_a_batch_that_is_complete_when_the_campaign_is_stopped_is_kept() -> None:
+    """Flights of less than 2000 ticks are looked at once before each draw and once in flight."""
+    made, looks = campaign(disperse=DISPERSED, flights=3), itertools.count(1)
+    rows = list(LanesEngine("lanes").fly(made, list(Draws(made)), lambda: next(looks) > 4))
+    assert sorted(row.draw.number for row in rows) == [0, 1, 2]
+    looks = itertools.count(1)
+    assert list(LanesEngine("lanes").fly(made, list(Draws(made)), lambda: next(looks) > 3)) == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -95,6 +97,18 @@ def test_workers_have_as_many_tasks_as_they_take_and_deaths_are_flown_one_at_a_t
     assert queue.cancelled == [6]
 
 
+def test_rows_of_tasks_that_finish_before_a_stop_is_noticed_are_kept() -> None:
+    made, stopped = campaign(flights=8), [False]
+    draws, queue = Draws(made), Queue(2, 1)
+    tasks = TaskDistributor(queue, made, draws, "flights", lambda: stopped[0])  # type: ignore[arg-type]
+    found = tasks.rows(list(range(8)))
+    assert next(found) == []
+    queue.answers[1] = [Row(draws[n], "reached", ".", wall_time=0.5) for n in queue.open[1][0]]
+    stopped[0] = True
+    assert list(found) == [queue.answers[1]]
+    assert queue.cancelled == [0]
+
+
 def test_fallbacks_go_before_what_waits_and_keep_their_reasons() -> None:
     made = campaign(flights=200)
     draws, queue = Draws(made), Queue(1, 1)
@@ -156,6 +170,29 @@ def test_a_process_of_this_machine_flies_a_task_and_says_what_is_wrong() -> None
         assert (row.draw.number, row.outcome) == (1, "reached")
         with pytest.raises(SpaceRobotError, match="A worker has spacerobot_ros"):
             answer("0.0.0")
+
+
+def test_workers_that_are_ended_leave_other_children_of_the_process_alone() -> None:
+    made, mine = campaign(flights=2), None
+    try:
+        with open_workers(Cluster(workers=1), flights=1) as workers:
+            mine = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60.0,))
+            mine.start()
+            task = workers.submit(
+                serialise_campaign(made), this_code(), list(Draws(made)), "flights", True
+            )
+            while not workers.ended([task]):
+                pass
+            workers_of_campaign = set(multiprocessing.active_children()) - {mine}
+            assert len(workers_of_campaign) == 1
+        assert mine.is_alive()
+        for each in workers_of_campaign:
+            each.join(60.0)
+            assert not each.is_alive()
+    finally:
+        if mine is not None:
+            mine.kill()
+            mine.join()
 
 
 # -- tasks of workers by stand-ins for them: their sizes, what they pass on, and deaths ----------
