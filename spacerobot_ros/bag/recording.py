@@ -41,6 +41,10 @@ class RecordingState(Enum):
 _DROPPING_STATES = (RecordingState.PAUSED, RecordingState.FAILED, RecordingState.CLOSED)
 
 
+_MAX_EARLY_MESSAGES = 5000
+"""Number of messages kept in memory from which on a bag no longer waits for a clock."""
+
+
 class _EarlyMessage(NamedTuple):
     """A message received before the bag's time base was chosen."""
 
@@ -54,8 +58,9 @@ class Recording:
     """Writes messages with one time base for the whole bag; it is initially paused.
 
     Messages are logged at the published clock time; earlier messages are logged at the time of the
-    first clock message. If no clock is published for ``clock_wait``, all messages are logged at the
-    wall time of their arrival. The choice is final, because a bag has one time base.
+    first clock message. If no clock is published for ``clock_wait``, or too many messages wait for
+    one, all messages are logged at the wall time of their arrival. The choice is final, because a
+    bag has one time base.
 
     Parameters
     ----------
@@ -163,7 +168,8 @@ class Recording:
         """Write buffered data to the file once per flush period (wall time)."""
         first = next((x for x in self.early_messages if x.channel not in self.preliminary), None)
         waited_ns = self._wall_time() - first.arrival_ns if first is not None else 0
-        if waited_ns > self._clock_wait_ns and not clock_is_published:
+        late = waited_ns > self._clock_wait_ns and not clock_is_published
+        if late or len(self.early_messages) >= _MAX_EARLY_MESSAGES:
             self._choose_time_base(RecordingState.ON_WALL_TIME)
         self._fail_on_error(self.writer.flush)
 

@@ -336,7 +336,10 @@ class RecorderNode(FlightNode):
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
             return
         self.topics.add(topic)
-        if topic.endswith(_PRELIMINARY_TOPICS):
+        # A bag of such topics alone cannot expect a plant.
+        chosen = self._chosen_topics
+        alone = bool(chosen) and all(each.endswith(_PRELIMINARY_TOPICS) for each in chosen)
+        if topic.endswith(_PRELIMINARY_TOPICS) and not alone:
             recording.preliminary.add(channel)
         self._request_parameters(topic, publishers[0])
         listener = None

@@ -145,6 +145,23 @@ def test_messages_from_before_the_plant_wait_for_its_clock(bench: Bench) -> None
     ]
 
 
+@pytest.mark.parametrize("clock", [False, True])
+def test_messages_that_wait_for_a_clock_in_vain_do_not_pile_up(bench: Bench, clock: bool) -> None:
+    recording, count = bench.recording, 20_000
+    recording.preliminary.add(bench.a)
+    recording.start()
+    most = 0
+    for k in range(count):
+        recording.record(bench.a, b"waits for a robot")
+        if k % 100 == 0:  # As the recorder does twice a second.
+            recording.flush(clock_is_published=clock)
+        most = max(most, len(recording.early_messages))
+    assert most < count // 2
+    assert recording.messages > count // 2
+    assert {log_ns for *_, log_ns, _ in bench.written()} == {WALL}
+    assert recording.messages == count
+
+
 def test_a_pause_keeps_what_was_decided(bench: Bench) -> None:
     recording = bench.recording
     recording.start()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.reader import make_reader
 from nav_msgs.msg import Odometry
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -134,6 +135,18 @@ def test_named_objects_of_a_file_are_metadata_and_the_wait_for_a_clock_is_as_giv
     recorder.trigger_shutdown()
     metadata = BagContent(bag).metadata
     assert {name: metadata[name] for name in about} == about
+
+
+def test_a_recorder_of_events_alone_writes_them_without_a_clock(
+    harness: Harness, tmp_path: Path
+) -> None:
+    talk = harness.probe({}).create_publisher(DiagnosticStatus, "/events", 10)
+    named = {"bag": str(tmp_path / "events.mcap"), "topics": "/events", "clock_wait": 0.0}
+    recorder = harness.make(RecorderNode, named)
+    harness.spin_until(lambda: "/events" in recorder.topics, "the subscription")
+    harness.matched(talk)
+    talk.publish(DiagnosticStatus(message="waiting"))
+    harness.spin_until(lambda: recorder.messages_recorded >= 1, "the event in the bag")
 
 
 def test_events_of_services_are_recorded(
