@@ -324,6 +324,18 @@ def test_paths_that_are_none_are_refused(path: Any, message: str) -> None:
         EndEffectorGoal.along("hand", path)
 
 
+def test_quaternions_of_any_length_are_scaled_to_one() -> None:
+    rng = np.random.default_rng(4)
+    turns, lengths = Rotation.random(60, random_state=4), np.repeat([1e-5, 0.5, 1.0, 3.0, 1e9], 12)
+    places = rng.normal(size=(60, 3))
+    path = np.hstack([places, turns.as_quat() * lengths[:, np.newaxis]])
+    found = EndEffectorGoal.along("hand", path)
+    np.testing.assert_array_equal(found.path_values[:, :3], places)
+    np.testing.assert_allclose(found.path_values[:, 3:], turns.as_quat(), atol=1e-15)
+    assert found.waypoints is not None
+    assert len(found.waypoints) == 59
+
+
 # -- one place ----------------------------------------------------------------------------------
 
 

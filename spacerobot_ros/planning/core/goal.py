@@ -42,6 +42,9 @@ _MAX_COORDINATE = 1e12
 MAX_PATH_POSES = 10_000
 """Largest number of poses in a given path, which limits planning time."""
 
+_USUAL_NORM = 0.5
+"""Length of a quaternion above which it is a rotation without further checks."""
+
 _MAX_ANGLE = 2e6 * np.pi
 """A million revolutions, rad: larger angles do not determine the attitude accurately."""
 
@@ -112,18 +115,27 @@ class EndEffectorGoal:
             raise GoalError(
                 f"{name} has {len(values)} poses; at most {MAX_PATH_POSES} are allowed."
             )
-        goals = []
-        for k, pose in enumerate(values):
+        r, q = values[:, :3], values[:, 3:]
+        # A pose alone takes long to check; of a long path, more than a tick for all.
+        most = [_MAX_COORDINATE] * 3 + [1.0] * q.shape[1]
+        usual = np.asarray((np.abs(values) <= most).all(axis=1))
+        norms = np.sqrt([each.dot(each) for each in np.where(usual[:, np.newaxis], q, 0.0)])
+        usual &= (norms > _USUAL_NORM) | (q.shape[1] == 0)
+        found = np.hstack([r, q / np.where(usual & (norms > 0.0), norms, 1.0)[:, np.newaxis]])
+        for k in np.flatnonzero(~usual).tolist():
             try:
-                goals.append(cls.checked(link, pose))
+                found[k] = cls.checked(link, values[k]).values
             except GoalError as error:
                 raise GoalError(
                     f"Pose {k + 1} of the path of '{link}' is invalid: {error}"
                 ) from None
-        *waypoints, goal = goals
-        if not waypoints:
-            return goal
-        return replace(goal, waypoints=np.array([each.values for each in waypoints]))
+        end = found[-1]
+        return cls(
+            link,
+            end[:3],
+            end[3:] if q.shape[1] else None,
+            waypoints=found[:-1] if len(found) > 1 else None,
+        )
 
     @classmethod
     def of_numbers(cls, link: str, numbers: npt.ArrayLike) -> EndEffectorGoal:
