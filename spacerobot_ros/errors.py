@@ -47,7 +47,8 @@ def quantity(value: float, unit: str) -> str:
     """
     size = abs(value)
     if not unit.startswith(("m", "rad")):
-        return f"< 1e-9 {unit}" if 0 < size < 1e-9 else f"{value + 0.0:.3g} {unit}"
+        digits = 4 if 999.5 <= size < 9999.5 else 3
+        return f"< 1e-9 {unit}" if 0 < size < 1e-9 else f"{value + 0.0:.{digits}g} {unit}"
     milli, micro = size < 0.1, size < 1e-4
     factor, prefix = (1e6, "µ") if micro else (1e3, "m") if milli else (1.0, "")
     if 0 < size < 1e-6:

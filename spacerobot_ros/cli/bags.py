@@ -65,8 +65,11 @@ def _parse_length(context: click.Context, option: click.Parameter, text: str) ->
     return float(match[1]) * _MILLIMETRES_BY_UNIT[match[2]]
 
 
+_several_bags = click.argument("bags", metavar="BAG...", type=PATH, nargs=-1, required=True)
+
+
 @click.command("figures")
-@click.argument("bags", metavar="BAG...", type=PATH, nargs=-1, required=True)
+@_several_bags
 @click.option(
     "--only",
     metavar="NAME,NAME",
@@ -182,7 +185,7 @@ def replay_command(
 
 
 @click.command("report")
-@bag_argument
+@_several_bags
 @out_option("HTML file [BAG.html].")
 @picture_option("Also draw an overview (.png, .svg, .pdf).")
 @click.option(
@@ -191,21 +194,24 @@ def replay_command(
     multiple=True,
     type=PATH,
     metavar="BAG",
-    help="Bag of another flight to compare with. May be repeated.",
+    help="Bag of another flight to compare with, like further BAGs. May be repeated.",
 )
 @namespace_option
 def report_command(
-    bag: Path,
+    bags: tuple[Path, ...],
     out: Path | None,
     picture: Path | None,
     others: tuple[Path, ...],
     namespace: str | None,
 ) -> None:
-    """Write an HTML report of a BAG, with pictures and a 3D view."""
+    """Write an HTML report of a BAG, with pictures and a 3D view.
+
+    The report compares the flight of the first BAG with those of further ones.
+    """
     from spacerobot_ros.report import write_picture, write_report
 
-    target = out or beside(bag, ".html")
-    write_report(bag, target, others, namespace=namespace)
+    bag, target = bags[0], out or beside(bags[0], ".html")
+    write_report(bag, target, (*bags[1:], *others), namespace=namespace)
     say(f"report      {target}")
     if picture is not None:
         write_picture(bag, picture, namespace=namespace)

@@ -44,6 +44,13 @@ class Signal:
         first, last = np.searchsorted(self.time, [start - 1e-9, end + 1e-9])
         return Signal(self.time[first:last], self.values[first:last])
 
+    def at(self, time: Array) -> Array:
+        """Return the values (M, k) at times (M,), interpolated linearly; NaN outside the span."""
+        if not len(self):
+            return np.full((len(time), self.width), np.nan)
+        columns = (np.interp(time, self.time, x, np.nan, np.nan) for x in self.values.T)
+        return np.stack([*columns], axis=1) if self.width else np.empty((len(time), 0))
+
     def norms(self, columns: Sequence[int]) -> Signal:
         """Return the norms (N, 1) of selected columns."""
         return Signal(self.time, np.linalg.norm(self.values[:, columns], axis=1, keepdims=True))

@@ -145,7 +145,7 @@
   }
 
   function build(figure, box, chart) {
-    const alone = chart.names.length === 1;
+    const alone = chart.own === 1;
     const height = () => {
       if (chart.rows) return 60 + 19 * chart.names.length;
       return box.clientWidth < 600 ? (alone ? 140 : 190) : alone ? 160 : 240;
@@ -160,6 +160,7 @@
       label: name,
       stroke: () => tint(chart.colours[k]),
       width: 1.4,
+      dash: [[], [9, 3, 2, 3], [2, 3]][Math.min(Math.floor(k / chart.own), 2)],
       spanGaps: false,
       points: { show: chart.time.length < 3 },
       value: (plot, value) =>

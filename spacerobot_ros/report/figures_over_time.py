@@ -170,15 +170,15 @@ def time_figure(
 
 
 def figure_of_flights(
-    flights: Sequence[FlightReport], draw: Callable[[FlightReport], ReportFigure | str | None]
+    flights: Sequence[FlightReport], drawn: Sequence[ReportFigure | str | None]
 ) -> ReportFigure | str | None:
-    """Return a figure over time with traces from several flights, or an explanatory sentence if no
-    flight has such a figure or if the figure does not show values over time.
+    """Return a figure over time with the traces from the figures ``drawn`` of several flights, or
+    an explanatory sentence if no flight has such a figure or if the figure does not show values
+    over time.
 
-    Traces with the same label, unit and name share a panel. Events, cycles and duty cycles are
-    omitted, since they apply to single flights.
+    Traces with the same label, unit and name share a panel. Cycles, duty cycles and the events of
+    later flights are omitted, since they apply to single flights.
     """
-    drawn = [draw(each) for each in flights]
     figures = [each for each in drawn if isinstance(each, ReportFigure)]
     if not figures:
         return drawn[0]
@@ -210,8 +210,7 @@ def figure_of_flights(
     if not merged:
         return "This figure shows a single flight: specify one bag."
     first, labels = figures[0], [each.label for each in flights]
-    only = replace(flights[0], events=())
-    return time_figure(only, first.name, first.heading, first.heading, merged, flights=labels)
+    return time_figure(flights[0], first.name, first.heading, first.heading, merged, flights=labels)
 
 
 def _draw_rows(axes: Axes, group: TraceGroup) -> None:

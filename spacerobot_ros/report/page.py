@@ -72,7 +72,7 @@ def page(
     beside: Sequence[FlightReport] = (),
 ) -> str:
     """Return the whole page; each flight in ``beside`` gets a column in a table."""
-    charts = charts_of(flight, figures)
+    charts = charts_of(flight, figures, beside)
     scenario = flight.scenario.described_for_other_goal() if flight.other_goal else flight.scenario
     name, description = scenario.name, scenario.description
     robot_name = "" if flight.robot is None else flight.robot.name
@@ -237,8 +237,10 @@ def _footer_text(flights: Sequence[FlightReport]) -> str:
 # -- charts -------------------------------------------------------------------------------------
 
 
-def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
-    """Return the charts of all figures over time.
+def charts_of(
+    flight: FlightReport, figures: Figures, beside: Sequence[FlightReport] = ()
+) -> PagePart:
+    """Return the charts of all figures over time, with the traces of flights ``beside``.
 
     Each figure element lists its chart numbers in ``data-charts``.
     """
@@ -246,8 +248,8 @@ def charts_of(flight: FlightReport, figures: Figures) -> PagePart:
     if not groups:
         return PagePart()
     charts = {
-        "end": flight.end,
-        "charts": [_chart_data(group) for group in groups],
+        "end": max(each.end for each in (flight, *beside)),
+        "charts": [_chart_data(group, [each.label for each in beside]) for group in groups],
         "events": _chart_events(flight),
     }
     return PagePart(
@@ -271,9 +273,14 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
     return found
 
 
-def _chart_data(group: TraceGroup) -> dict[str, Any]:
-    signal = thinned(group.signal, _CHART_SLICES)
-    values = signal.values
+def _chart_data(group: TraceGroup, labels: Sequence[str]) -> dict[str, Any]:
+    signals = [thinned(each, _CHART_SLICES) for each in (group.signal, *group.beside)]
+    time, values = signals[0].time, signals[0].values
+    names, flights = list(group.names), len(signals)
+    if group.beside:
+        time = np.unique(np.concatenate([each.time for each in signals]))
+        values = np.hstack([each.at(time) for each in signals])
+        names += [f"{name}, {label}" for label in labels for name in group.names]
     if group.decades:
         # uPlot's own logarithmic axes go wrong with numbers as small as rounding errors.
         floor, _ = log_range(values, group.decades)
@@ -287,9 +294,10 @@ def _chart_data(group: TraceGroup) -> dict[str, Any]:
     return {
         "label": group.label,
         "unit": group.unit,
-        "names": list(group.names),
-        "colours": list(group.colours),
-        "time": _encode_numbers(signal.time, "<f8"),
+        "names": names,
+        "own": len(group.names),
+        "colours": list(group.colours) * flights,
+        "time": _encode_numbers(time, "<f8"),
         "values": [_encode_numbers(column, "<f4") for column in values.T],
         "goals": [list(map(float, goal)) for goal in group.goals],
         "limits": limits,
@@ -302,7 +310,7 @@ def _chart_data(group: TraceGroup) -> dict[str, Any]:
 def _limit_range(group: TraceGroup) -> tuple[float, float]:
     """Return the range of values (lower, upper) in which limits are drawn."""
     goals = np.array([goal[3] for goal in group.goals])
-    numbers = np.append(group.signal.values, goals)
+    numbers = np.append(group.values, goals)
     low, high = group.window or (float(np.min(numbers)), float(np.max(numbers)))
     span = max(high - low, 1e-6)
     return low - 0.2 * span, high + 0.2 * span

@@ -40,7 +40,9 @@ _PICTURE_PIXELS = 1000
 _ROBOT_PANEL_WIDTH = 3.9
 """Robot width in a picture, inches."""
 
-FIGURES: dict[str, Callable[[FlightReport], ReportFigure | str | None]] = {
+Draw = Callable[[FlightReport], ReportFigure | str | None]
+
+FIGURES: dict[str, Draw] = {
     "robot": space.configurations_figure,
     "pose": over_time.pose_figure,
     "position": over_time.position_figure,
@@ -84,9 +86,23 @@ def write_report(
     flight = read_report(bag, namespace)
     others = [read_report(other) for other in beside]
     with drawing():
-        figures = [*(draw(flight) for draw in _REPORT_FIGURES), space.path_figure(flight, others)]
+        figures = [_report_figure(draw, [flight, *others]) for draw in _REPORT_FIGURES]
+        figures.append(space.path_figure(flight, others))
         text = page(flight, player_of(view_of_flight(flight)), figures, others)
     write_output(html, text)
+
+
+def _report_figure(draw: Draw, flights: Sequence[FlightReport]) -> ReportFigure | str | None:
+    """Return a figure of the first flight, with the traces of the others over time."""
+    figure = draw(flights[0])
+    if len(flights) < 2 or not isinstance(figure, ReportFigure) or not figure.groups:
+        return figure
+    if any(group.rows for group in figure.groups):
+        return figure
+    drawn = [figure, *(draw(each) for each in flights[1:])]
+    merged = over_time.figure_of_flights(flights, drawn)
+    assert isinstance(merged, ReportFigure)
+    return replace(merged, caption=f"{figure.caption} Other line styles: flights beside this one.")
 
 
 def write_figures(
@@ -152,7 +168,7 @@ def write_figures(
             "file name."
         )
     flight, *others = (read_report(each, namespace) for each in (bag, *beside))
-    if not events:
+    if others or not events:
         flight = replace(flight, events=())
     made: dict[str, Path | str] = {}
     with drawing(width / 25.4, "paper", style, degrees=degrees):
@@ -161,7 +177,8 @@ def write_figures(
                 if others and name == "path":
                     figure: ReportFigure | str | None = space.path_figure(flight, others)
                 elif others:
-                    figure = over_time.figure_of_flights([flight, *others], FIGURES[name])
+                    drawn = [FIGURES[name](each) for each in (flight, *others)]
+                    figure = over_time.figure_of_flights([flight, *others], drawn)
                 else:
                     figure = FIGURES[name](flight)
                 if not isinstance(figure, ReportFigure):

@@ -98,7 +98,8 @@ def test_two_flights_are_drawn_into_the_same_panels(tmp_path: Path) -> None:
     ]
     bags = [tell(tmp_path / f"{n}.mcap", Story(x)) for n, x in zip("ab", motions, strict=True)]
     with drawing():
-        figure = figure_of_flights([read_report(bag) for bag in bags], FIGURES["joints"])
+        flights = [read_report(bag) for bag in bags]
+        figure = figure_of_flights(flights, [FIGURES["joints"](each) for each in flights])
     assert isinstance(figure, ReportFigure)
     sliders, hinges = figure.figure.axes
     for axes, joints in ((sliders, [0]), (hinges, [1, 2])):

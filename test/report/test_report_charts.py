@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import re
 import unicodedata
 from collections.abc import Iterator
@@ -14,9 +15,11 @@ import numpy as np
 import pypdf
 import pytest
 from support.chromium import Browser, browser, chromium
+from support.command_line import CliRunner
 from support.flight_bags import GOAL, TICK, Story, goal_value, tell
 from support.html_page import leave_blank
 
+from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report import write_report
 from spacerobot_ros.report.figures_over_time import shape_figure
@@ -131,6 +134,38 @@ def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
         "stuck joint: j",
         "fault on: joint_stuck j at 2 s",
     ]
+
+
+def test_charts_have_the_traces_of_a_flight_beside(
+    flight: FlightReport, bag: Path, tmp_path: Path
+) -> None:
+    shapes = 0.3 * np.cos(np.linspace(0.0, 5.0, COUNT // 2))[:, np.newaxis] * np.ones((1, 3))
+    other = tell(tmp_path / "other.mcap", Story(shapes))
+    with pytest.MonkeyPatch.context() as patch:
+        leave_blank(patch)
+        result = CliRunner().invoke(
+            main, ["report", str(bag), str(other), "--out", str(tmp_path / "both.html")]
+        )
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "both.html").read_text("utf-8")
+    (data,) = re.findall(r'<script[^>]*id="charts"[^>]*>(.*?)</script>', text, re.DOTALL)
+    given = json.loads(data)
+    assert given["end"] == pytest.approx(END)
+    charts = [each for each in given["charts"] if each["label"] == "joint position"]
+    assert sum(chart["own"] for chart in charts) == len(flight.joint_names)
+    for chart in charts:
+        own = chart["names"][: chart["own"]]
+        assert chart["names"] == [*own, *(f"{name}, other.mcap" for name in own)]
+        time = np.frombuffer(base64.b64decode(chart["time"]), "<f8")
+        found = [np.frombuffer(base64.b64decode(each), "<f4") for each in chart["values"]]
+        there = time < TICK * (len(shapes) - 0.5)
+        for k, name in enumerate(own):
+            joint, other_time = flight.joint_names.index(name), TICK * np.arange(len(shapes))
+            first = np.interp(time, flight.time, flight.q[:, joint])
+            second = np.interp(time[there], other_time, shapes[:, joint])
+            np.testing.assert_allclose(found[k], first, atol=1e-6)
+            np.testing.assert_allclose(found[len(own) + k][there], second, atol=1e-6)
+            assert np.isnan(found[len(own) + k][~there]).all()
 
 
 @with_browser
