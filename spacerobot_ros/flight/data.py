@@ -582,7 +582,7 @@ class FlightData:
             propellant=math.nan if self.propellant is None else self.propellant,
             plan_time=self.plan_time,
             wall_time=self.wall_time,
-            clearance=self._smallest_distance if clearance else math.nan,
+            clearance=self.smallest_distance if clearance else math.nan,
             capture=self.capture_measures,
         )
 
@@ -605,10 +605,19 @@ class FlightData:
         return [aim.link for aim in aims if aim.quaternion is not None]
 
     @property
-    def _smallest_distance(self) -> float:
+    def smallest_distance(self) -> float:
+        """Smallest distance between links, m; infinite if none can touch, NaN if not measured."""
         if self.clearance is not None:
             return self.clearance.nearest.distance
         return math.inf if self.measures_clearance else math.nan
+
+    @property
+    def thrust_impulse(self) -> float:
+        """Impulse of the thrusters, N s: the sum over all, or of the commanded force; 0: none."""
+        thrust = self.signal("thruster_force").values.sum(axis=1)
+        if not thrust.size and "base_wrench" in self.commands:
+            thrust = np.linalg.norm(self.commands["base_wrench"].values[:, :3], axis=1)
+        return float(thrust[1:].sum() * self.control_period)
 
     # -- verdict ------------------------------------------------------------------------------
 

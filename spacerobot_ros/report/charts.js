@@ -61,12 +61,10 @@
     lane.style.width = `${width}px`;
     // From the last to the first: a mark's words have the room up to the next.
     const limit = [width, width, width];
-    const earlier = marks.map(({ event }, k) => {
-      // Those at the same place have no words beside these.
-      const before = marks.slice(0, k).filter((each) =>
-        each.event.row === event.row && at(each.event.time) < at(event.time) - 10);
-      return before.length ? at(before[before.length - 1].event.time) + 8 : 0;
-    });
+    // Those at the same place have no words beside these.
+    const earlier = marks.map(({ event }, k) => Math.max(0, ...marks.slice(0, k)
+      .filter((each) => each.event.row === event.row && at(each.event.time) < at(event.time) - 10)
+      .map((each) => at(each.event.time) + 8)));
     for (let k = marks.length - 1; k >= 0; k--) {
       const { event, mark, words } = marks[k];
       const x = at(event.time);
@@ -76,7 +74,7 @@
       const short = event.text.split(":")[0];
       const [wide, least] = [event.text, short].map((each) => 6.2 * each.length);
       let room = limit[event.row] - x - 14;
-      const roomBefore = x - 14 - Math.max(earlier[k], 0);
+      const roomBefore = x - 14 - earlier[k];
       // At the right end, and where the next mark is near, the words stand before their mark.
       const before = room < (limit[event.row] === width ? wide : least) && roomBefore > room;
       if (before) room = roomBefore;

@@ -180,7 +180,7 @@ def figure_of_flights(
     later flights are omitted, since they apply to single flights.
     """
     figures = [each for each in drawn if isinstance(each, ReportFigure)]
-    if not figures:
+    if not figures or len(flights) < 2:
         return drawn[0]
     groups = [
         {
@@ -422,16 +422,13 @@ def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
         limit = joint.limits.effort
         return [-limit, limit] if np.isfinite(limit) else []
 
-    def readable(groups: list[TraceGroup]) -> list[TraceGroup]:
-        return [replace(group, window=range_without_peaks(group.signal)) for group in groups]
-
     wrench = axis_groups(flight.wrench, (("thruster force", "N"), ("thruster torque", "N m")))
     wrench = [g for g in wrench if np.abs(g.signal.values).max(initial=0.0) > _EFFORT_ROUNDING]
     joints: list[TraceGroup] = []
     if np.abs(flight.efforts.values).max(initial=0.0) > _EFFORT_ROUNDING:
         units, count = {"m": "N", "rad": "N m"}, len(flight.joint_names)
         joints = joint_groups(flight, flight.efforts, "joint effort", units, bounds, most=count)
-    groups = readable(wrench + joints)
+    groups = [replace(x, window=range_without_peaks(x.signal)) for x in wrench + joints]
     if not groups:
         return None
     caption = (

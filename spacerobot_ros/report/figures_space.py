@@ -348,7 +348,9 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
         axes.set_ylabel(f"{names[j]} ({units[1]})")
         if cycles is not None:
             last = part.between(cycles.end - cycles.period, cycles.end).values
-            area = _signed_area(last[:, i], last[:, j])
+            # Inside a closed curve, positive if it runs counter-clockwise.
+            a, b = last[:, i], last[:, j]
+            area = (a @ np.roll(b, -1) - b @ np.roll(a, -1)) / 2
             factors = [f"({unit})" if " " in unit else unit for unit in units]
             unit = f"{factors[0]}²" if factors[0] == factors[1] else " ".join(factors)
             axes.set_title(f"area {area:+.4g} {unit}")
@@ -368,11 +370,6 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
         caption += f" The first three of {len(flight.shape_columns)} joints are shown."
     heading = "Path in shape space" if cycles is None else "Loops in shape space"
     return ReportFigure("loops", heading, caption, figure)
-
-
-def _signed_area(x: Array, y: Array) -> float:
-    """Return the area inside a closed curve, positive if it runs counter-clockwise."""
-    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
 
 
 def _draw_direction(axes: Axes, x: Array, y: Array) -> None:

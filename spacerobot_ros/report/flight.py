@@ -177,8 +177,12 @@ class FlightReport(Flight):
     def flown_method(self) -> str:
         """Control law, or gait method according to the first schedule or the planner's
         parameter."""
-        named = (method for _, status in self.reports if (method := _method_of(status)))
-        return next(named, str(self.parameter("planner", "method") or ""))
+        for _, status in self.reports:
+            if isinstance(status, PlannerStatus) and status.method:
+                return status.method
+            if isinstance(status, ControllerStatus) and status.command is not None:
+                return status.command.law
+        return str(self.parameter("planner", "method") or "")
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a node parameter; None if the bag does not contain the parameter."""
@@ -435,13 +439,6 @@ class FlightReport(Flight):
         """The joint with that name in the robot description."""
         joints = self.robot.movable_joints if self.robot is not None else ()
         return next((joint for joint in joints if joint.name == name), None)
-
-
-def _method_of(status: Status) -> str:
-    """Return the gait method of the schedule that begins, or the control law; empty if none."""
-    if isinstance(status, PlannerStatus):
-        return status.method
-    return status.command.law if status.command is not None else ""
 
 
 def _timed_goals(goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:

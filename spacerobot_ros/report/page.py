@@ -26,7 +26,6 @@ from spacerobot_ros.report.page_parts import (
 )
 from spacerobot_ros.report.signals import thinned
 from spacerobot_ros.report.tables import (
-    Table,
     different_goals,
     headline,
     joint_table,
@@ -139,7 +138,7 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
     if not beside:
         return []
     flights = [flight, *beside]
-    parts = ["<h2>Runs side by side</h2>", _table_html("runs", runs_table(flights))]
+    parts = ["<h2>Runs side by side</h2>", table("runs", *runs_table(flights))]
     files = [each.label for each in flights]
     if goals := different_goals(flights):
         parts += ["<h3>Goals that differ</h3>", table("goals", ("Goal", *files), goals)]
@@ -157,7 +156,7 @@ def _numbers_html(flight: FlightReport) -> list[str]:
     if result.rows:
         parts.append(table("numbers", (), result.rows))
     if joints is not None:
-        parts.append(_table_html("joints", joints))
+        parts.append(table("joints", *joints))
     return parts
 
 
@@ -167,14 +166,10 @@ def _published_html(flight: FlightReport) -> list[str]:
         return []
     return [
         "<h2>Published and measured values</h2>",
-        _table_html("published", found),
+        table("published", *found),
         '<p class="facts">Source: “planner”, values of the first schedule; “flight”, '
         "measured values.</p>",
     ]
-
-
-def _table_html(identity: str, given: Table) -> str:
-    return table(identity, given.head, given.rows, given.numeric)
 
 
 def _figures_html(figures: Figures, *, has_events: bool) -> list[str]:
@@ -287,8 +282,10 @@ def _chart_data(group: TraceGroup, labels: Sequence[str]) -> dict[str, Any]:
         values = np.log10(np.maximum(values, floor))
         limits = [[k, float(np.log10(each))] for k, each in group.limits if each > floor]
     else:
-        low, high = _limit_range(group)
-        limits = [[k, value] for k, value in group.limits if low < value < high]
+        numbers = np.append(group.values, [goal[3] for goal in group.goals])
+        low, high = group.window or (float(np.min(numbers)), float(np.max(numbers)))
+        room = 0.2 * max(high - low, 1e-6)
+        limits = [[k, x] for k, x in group.limits if low - room < x < high + room]
     if group.rows:
         values = values * 0.8 + np.arange(values.shape[1])[::-1]
     return {
@@ -305,15 +302,6 @@ def _chart_data(group: TraceGroup, labels: Sequence[str]) -> dict[str, Any]:
         "log": group.decades > 0,
         "rows": group.rows,
     }
-
-
-def _limit_range(group: TraceGroup) -> tuple[float, float]:
-    """Return the range of values (lower, upper) in which limits are drawn."""
-    goals = np.array([goal[3] for goal in group.goals])
-    numbers = np.append(group.values, goals)
-    low, high = group.window or (float(np.min(numbers)), float(np.max(numbers)))
-    span = max(high - low, 1e-6)
-    return low - 0.2 * span, high + 0.2 * span
 
 
 def _encode_numbers(values: Any, kind: str) -> str:

@@ -66,7 +66,10 @@ def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[Page
         ``body``.
     """
     parts = (*parts, PagePart(programs=(package_file("page.js"),)))
-    policy = f"{_SECURITY_POLICY}; {_script_policy(parts)}"
+    programs = [program.encode() for part in parts for program in part.programs]
+    hashes = [base64.b64encode(hashlib.sha256(each).digest()).decode() for each in programs]
+    allowed = " ".join(f"'sha256-{each}'" for each in hashes)
+    policy = f"{_SECURITY_POLICY}; script-src {allowed}"
     css = "".join(part.style for part in parts) + package_file("page.css")
     end = f"<footer><p>{escape(footer)}</p></footer>"
     content = "\n".join(filter(None, (*body, _licences_html(parts), end)))
@@ -79,13 +82,6 @@ def html_page(title: str, body: Sequence[str], footer: str, parts: Sequence[Page
         '<button id="theme" type="button" hidden>Dark</button>\n'
         f"{content}\n</main>\n{_scripts_html(parts)}\n</body>\n</html>\n"
     )
-
-
-def _script_policy(parts: Sequence[PagePart]) -> str:
-    programs = [program for part in parts for program in part.programs]
-    hashes = [hashlib.sha256(program.encode()).digest() for program in programs]
-    allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in hashes)
-    return f"script-src {allowed}"
 
 
 def _scripts_html(parts: Sequence[PagePart]) -> str:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError, numbers, quantity
 from spacerobot_ros.flight.captures import payload_estimates
-from spacerobot_ros.flight.reading import impulse
-from spacerobot_ros.flight.series import Signal, pose_error
+from spacerobot_ros.flight.series import pose_error
 from spacerobot_ros.measures import peak, peak_wrench
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
@@ -29,8 +27,7 @@ _EQUAL_TIME_TICKS = 1.5
 """Largest difference between times that are considered equal, in control periods."""
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Rows of text below a header; ``numeric`` contains the columns that are aligned as numbers."""
 
     head: tuple[str, ...]
@@ -124,23 +121,15 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
 
 def _extreme_values(flight: FlightReport) -> dict[str, str]:
     """Return the clearance, and the peaks of thrust and effort with the total impulse."""
-    rows, wrench, efforts = {}, flight.wrench, peak(flight.efforts.values)
-    if (clearance := flight.clearance) is not None:
-        rows["Clearance"] = quantity(clearance.nearest.distance, "m")
-    if wrench.values.any():
-        force, torque = peak_wrench(wrench.values).tolist()
-        rows["Peak thruster force"] = quantity(force, "N")
-        rows["Peak thruster torque"] = quantity(torque, "N m")
-        norms = np.linalg.norm(wrench.values[:, :3], axis=1, keepdims=True)
-        thrust = flight.signal("thruster_force") or Signal(wrench.time, norms)
-        total = impulse(thrust, np.ones(thrust.width)).values[-1, 0]
-        rows["Thrust impulse"] = quantity(float(total), "N s")
-    units = [joint_unit(flight, name) for name in flight.joint_names]
-    for of, unit, label in (("rad", "N m", "Peak joint torque"), ("m", "N", "Peak joint force")):
-        largest = max((x for x, each in zip(efforts, units, strict=True) if each == of), default=0)
-        if largest:
-            rows[label] = quantity(float(largest), unit)
-    return rows
+    found = [("Clearance", flight.smallest_distance, "m")]
+    for label, value in zip(("force", "torque"), peak_wrench(flight.wrench.values), strict=True):
+        found.append((f"Peak thruster {label}", value, "N" if label == "force" else "N m"))
+    found.append(("Thrust impulse", flight.thrust_impulse, "N s"))
+    units = np.array([joint_unit(flight, name) for name in flight.joint_names])
+    for label, of, unit in (("torque", "rad", "N m"), ("force", "m", "N")):
+        largest = peak(flight.efforts.values)[units == of].max(initial=0.0)
+        found.append((f"Peak joint {label}", largest, unit))
+    return {label: quantity(x, unit) for label, x, unit in found if x and math.isfinite(x)}
 
 
 def result_table(flight: FlightReport) -> Table:

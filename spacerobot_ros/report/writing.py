@@ -174,13 +174,10 @@ def write_figures(
     with drawing(width / 25.4, "paper", style, degrees=degrees):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:
             try:
-                if others and name == "path":
-                    figure: ReportFigure | str | None = space.path_figure(flight, others)
-                elif others:
-                    drawn = [FIGURES[name](each) for each in (flight, *others)]
-                    figure = over_time.figure_of_flights([flight, *others], drawn)
-                else:
-                    figure = FIGURES[name](flight)
+                drawn = [FIGURES[name](each) for each in (flight, *others)]
+                figure = over_time.figure_of_flights([flight, *others], drawn)
+                if name == "path":
+                    figure = space.path_figure(flight, others)
                 if not isinstance(figure, ReportFigure):
                     made[name] = figure or "The bag has no data for this figure."
                     continue

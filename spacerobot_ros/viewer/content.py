@@ -284,7 +284,8 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
     lower, upper = robot.limits("lower"), robot.limits("upper")
     fastest, strongest = robot.limits("velocity"), robot.limits("effort")
     for i, joint in enumerate(robot.movable_joints):
-        share = _share_of_range(q[i], lower[i], upper[i])
+        span = upper[i] - lower[i]
+        share = (q[i] - lower[i]) / span if 0.0 < span < math.inf else None
         level = 0
         if share is not None and not _NEAR_LIMIT_SHARE <= share <= 1 - _NEAR_LIMIT_SHARE:
             level = 2 if not 0.0 <= share <= 1.0 else 1
@@ -309,13 +310,6 @@ def _table_html(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
     lines = "".join(f"<tr>{''.join(each)}</tr>" for each in cells)
     style = "border-spacing:3px 2px;text-align:left;white-space:nowrap;font-size:.85em"
     return f'<table style="{style}">{lines}</table>'
-
-
-def _share_of_range(value: float, lower: float, upper: float) -> float | None:
-    """Return the place of a value between its limits, 0 to 1; None if a limit is infinite."""
-    if not (math.isfinite(lower) and math.isfinite(upper)) or upper <= lower:
-        return None
-    return float((value - lower) / (upper - lower))
 
 
 def _bar_html(share: float, level: int) -> str:

@@ -797,8 +797,10 @@ class Page:
             if self._is_due("texts", _TEXTS_S):
                 self._look_back.show(None if replays else self._past.span)
                 self._draw_texts(shown)
-            if self._robot is not None and self._is_due("tables", _TABLES_S):
-                self._draw_joints(self._robot, shown)
+            last = shown.measured
+            if self._robot is not None and last is not None and self._is_due("tables", _TABLES_S):
+                table = content.joints_html(self._robot, last.q, last.qdot, last.effort)
+                self._joints.content = table
             if self._is_due("plots", _PLOTS_S):
                 self._plots.draw(self._tolerance, self._look_back.time_s)
         actions, self._actions = self._actions, []
@@ -892,11 +894,6 @@ class Page:
         self.editor.show_parts(
             tool=has_tool and steered, planned=state.planner is not None and steered
         )
-
-    def _draw_joints(self, robot: RobotDescription, state: StackState) -> None:
-        last = state.measured
-        if last is not None:
-            self._joints.content = content.joints_html(robot, last.q, last.qdot, last.effort)
 
     def _is_due(self, part: str, period: float) -> bool:
         if self._now < self._due.get(part, 0.0):
