@@ -199,6 +199,25 @@ def test_goals_are_sent_to_a_robot_that_is_up(
     np.testing.assert_allclose(last, [0.02, 0.0, 0.0], atol=1e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["sliding_masses", "coordinated_control"])
+def test_a_run_whose_goal_another_one_replaces_says_so_and_has_not_reached_it(
+    spacerobot: Command, tmp_path: Path, scenario: str
+) -> None:
+    """With a planner, and with a controller that pursues a goal of base and end-effector."""
+    slow = ["--realtime", "0.2", "--json", "result.json"]
+    with spacerobot.start("run", scenario, *slow, "--bag", "run.mcap") as run:
+        assert run.stdout is not None
+        next(line for line in iter(run.stdout.readline, "") if line.startswith("flying"))
+        goal = spacerobot("goal", "0.02", "0.01", "0", "0", "0", "0", "1", "--timeout", "30")
+        assert goal.returncode == 1, goal.stdout + goal.stderr
+        said = run.stdout.read()
+        assert run.wait(PATIENCE) == 1, said
+    assert "Aborted: replaced by goal " in said
+    result = json.loads((tmp_path / "result.json").read_text("utf-8"))
+    assert (result["state"], result["succeeded"]) == ("aborted", False)
+
+
 def test_a_goal_that_nobody_takes_is_one_sentence(spacerobot: Command) -> None:
     for seconds, told in (("0.5", ""), ("1.5", "Waiting for a planner or a controller on")):
         run = spacerobot("goal", "0", "0", "0", "--timeout", seconds)
