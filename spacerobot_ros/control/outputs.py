@@ -105,7 +105,9 @@ class OutputSelection:
             _require_known("end-effector link", (self.end_effector_link,), links)
         count, freedom = len(self.labels), 6 + len(description.joint_names)
         if count == 0:
-            raise ParameterError("No output is selected: name base axes or joints.")
+            raise ParameterError(
+                f"No output of robot '{description.name}' is selected: name base axes or joints."
+            )
         if count > freedom:
             raise ParameterError(
                 f"{count} outputs are selected; robot '{description.name}' has "
