@@ -47,13 +47,14 @@ _ROS_MODULES = ("rclpy", "rosidl_parser", "ament_index_python")
 _LABEL = re.compile(r"\S+(?: \S+)* {2,}")
 """Words in front of a column."""
 
-_COMMAND = re.compile(r"`[^`]*`")
+_UNBROKEN = re.compile(r"`[^`]*`|\d [a-zA-Zµ]")
+"""A command, which can then be copied, or a number with its unit."""
 
 
 def say(text: str, *, err: bool = False) -> None:
     """Print a line; on a terminal, long lines are wrapped, below their column if they have a label.
 
-    Commands in backticks stay whole, so that they can be copied.
+    Commands in backticks stay whole, and numbers stay with their units.
     """
     if (sys.stderr if err else sys.stdout).isatty():
         text = "\n".join(map(_wrapped, text.splitlines()))
@@ -63,7 +64,7 @@ def say(text: str, *, err: bool = False) -> None:
 def _wrapped(line: str) -> str:
     width = shutil.get_terminal_size().columns
     label = _LABEL.match(line)
-    kept = _COMMAND.sub(lambda found: found[0].replace(" ", "\0"), line)
+    kept = _UNBROKEN.sub(lambda found: found[0].replace(" ", "\0"), line)
     return textwrap.fill(
         kept,
         width,
