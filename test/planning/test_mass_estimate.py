@@ -24,9 +24,10 @@ from spacerobot_ros.planning.core.progress import (
     log_progress,
     report_progress,
 )
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.path_deviation import (
     MassEstimate,
-    PathDeviation,
+    PathCheck,
     PathSensitivity,
 )
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
@@ -64,6 +65,25 @@ def schedule_of(robot: SpaceRobot, shapes: Array) -> GaitSchedule:
     return GaitSchedule("any", robot.joint_names, TICK, shapes, flown(robot, shapes), goal)
 
 
+class Measured:
+    """A path check, and the schedule on which poses are measured tick by tick."""
+
+    def __init__(
+        self,
+        robot: SpaceRobot,
+        schedule: GaitSchedule,
+        average: int,
+        derivatives: Array,
+        masses: MassEstimate,
+    ) -> None:
+        self.check = PathCheck(robot, schedule, 0, PlannerConfig(), average, derivatives, masses)
+        self._shapes = schedule.positions
+
+    def add(self, k: int, position: Array, quaternion: Array) -> None:
+        assert self.check.due(round(k * TICK * 1e9))
+        self.check.average_pose(RobotState(position, quaternion, self._shapes[k]))
+
+
 def deviations(path: BasePath, predicted: BasePath) -> Array:
     """Return by how much poses differ (K, 6): displacements over turns in the world."""
     turns = Rotation.from_quat(path.quaternion) * Rotation.from_quat(predicted.quaternion).inv()
@@ -98,14 +118,14 @@ def test_half_of_a_path_tells_where_it_ends() -> None:
         true = weighing(robot, rng.uniform(-0.1, 0.1, sensitivity.count))
         path = flown(true, schedule.positions)
         off = Rotation.from_rotvec(2e-3 * rng.normal(size=3))
-        deviation = PathDeviation(schedule.path, 3, derivatives, MassEstimate(sensitivity.count))
+        measured = Measured(robot, schedule, 3, derivatives, MassEstimate(sensitivity.count))
         for k in range(60):
             noise = Rotation.from_rotvec(1e-3 * rng.normal(size=3))
             attitude = off * Rotation.from_quat(path.quaternion[k]) * noise
-            deviation.add(k, path.position[k] + 1e-3 * rng.normal(size=3), attitude.as_quat())
+            measured.add(k, path.position[k] + 1e-3 * rng.normal(size=3), attitude.as_quat())
         end = off * Rotation.from_quat(path.quaternion[-1])
-        for where, errors in ((deviation.end, missed), (deviation.expected_end, known)):
-            errors.append((end.inv() * Rotation.from_quat(where(59)[1])).magnitude())
+        for where, errors in ((measured.check.end, missed), (measured.check.expected_end, known)):
+            errors.append((end.inv() * Rotation.from_quat(where[1])).magnitude())
     assert np.median(missed) > 0.009
     assert np.median(known) < 0.2 * np.median(missed)
     assert max(known) < 0.002
@@ -118,16 +138,16 @@ def test_what_was_learnt_on_one_path_counts_on_the_next() -> None:
     derivatives, masses = sensitivity.path_derivatives(schedule), MassEstimate(sensitivity.count)
     true = weighing(robot, np.random.default_rng(8).uniform(-0.1, 0.1, sensitivity.count))
     path = flown(true, schedule.positions)
-    first = PathDeviation(schedule.path, 1, derivatives, masses)
+    first = Measured(robot, schedule, 1, derivatives, masses)
     for k in range(101):
         first.add(k, path.position[k], path.quaternion[k])
     learnt = masses.errors.copy()
     assert np.abs(learnt).max() > 0.01
-    second = PathDeviation(schedule.path, 1, derivatives, masses)
+    second = Measured(robot, schedule, 1, derivatives, masses)
     second.add(0, path.position[0], path.quaternion[0])
     np.testing.assert_allclose(masses.errors, learnt, rtol=1e-9)
-    end = Rotation.from_quat(second.expected_end(0)[1])
-    unknown = Rotation.from_quat(second.end(0)[1])
+    end = Rotation.from_quat(second.check.expected_end[1])
+    unknown = Rotation.from_quat(second.check.end[1])
     true_end = Rotation.from_quat(path.quaternion[-1])
     assert (true_end.inv() * end).magnitude() < 0.1 * (true_end.inv() * unknown).magnitude()
 
@@ -165,20 +185,20 @@ def test_a_jump_of_what_is_measured_tells_nothing_of_masses(name: str, step: lis
     true = weighing(robot, np.random.default_rng(8).uniform(-0.1, 0.1, sensitivity.count))
     path = flown(true, schedule.positions)
 
-    def follow(until: int, jump_at: int) -> PathDeviation:
-        deviation = PathDeviation(schedule.path, 3, derivatives, masses)
+    def follow(until: int, jump_at: int) -> PathCheck:
+        measured = Measured(robot, schedule, 3, derivatives, masses)
         for k in range(until):
             off = np.array(step) * (k >= jump_at)
             attitude = Rotation.from_rotvec(off[3:]) * Rotation.from_quat(path.quaternion[k])
-            deviation.add(k, path.position[k] + off[:3], attitude.as_quat())
-        return deviation
+            measured.add(k, path.position[k] + off[:3], attitude.as_quat())
+        return measured.check
 
     jumped = follow(60, jump_at=30)
-    for found, plain in zip(jumped.expected_end(59), jumped.end(59), strict=True):
+    for found, plain in zip(jumped.expected_end, jumped.end, strict=True):
         np.testing.assert_allclose(found, plain, atol=1e-12)
     # The path of the jump is forgotten: what comes after it counts alone.
     following = follow(60, jump_at=60)
-    end = Rotation.from_quat(following.expected_end(59)[1])
+    end = Rotation.from_quat(following.expected_end[1])
     assert (Rotation.from_quat(path.quaternion[-1]).inv() * end).magnitude() < 1e-3
 
 

@@ -19,15 +19,17 @@ from support.planner_loop import (
     Place,
     StubMethod,
     goal_at,
+    robot_of,
 )
 
 from spacerobot_ros.events import Event as FlightEvent
-from spacerobot_ros.planning import BasePath, RobotState
+from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
-from spacerobot_ros.planning.execution.path_deviation import PathDeviation
+from spacerobot_ros.planning.execution.path_deviation import PathCheck
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
+from spacerobot_ros.times import SECOND
 
 OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])
 FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -357,6 +359,14 @@ def test_a_motion_that_leads_to_the_goal_is_left_alone() -> None:
     assert len(stub_of(loop).requests) == 1
 
 
+def check_of(path: BasePath, average: int) -> PathCheck:
+    """Return the check of a path with a pose a second, along which the sliders rest."""
+    shapes = np.zeros((len(path.time), 3))
+    goal = Goal(path.position[-1], path.quaternion[-1])
+    schedule = GaitSchedule("any", robot_of().joint_names, 1.0, shapes, path, goal)
+    return PathCheck(robot_of(), schedule, 0, PlannerConfig(), average)
+
+
 def test_the_deviation_from_a_path_is_carried_to_its_end_as_a_rigid_motion() -> None:
     """A path in the world, and the same one seen from a base that is off by a rigid motion."""
     rng = np.random.default_rng(5)
@@ -365,22 +375,23 @@ def test_the_deviation_from_a_path_is_carried_to_its_end_as_a_rigid_motion() -> 
     path = BasePath(np.arange(6.0), positions, attitudes.as_quat())
     turn, shift = Rotation.from_rotvec([0.3, -0.5, 0.2]), np.array([0.4, 0.1, -0.2])
     moved, turned = turn.apply(positions) + shift, turn * attitudes
-    deviation = PathDeviation(path, 1)
-    deviation.add(2, moved[2], turned[2].as_quat())
-    for (position, quaternion), k in ((deviation.pose(2), 2), (deviation.end(2), 5)):
+    check = check_of(path, 1)
+    assert check.due(2 * SECOND)
+    pose = check.average_pose(RobotState(moved[2], turned[2].as_quat(), np.zeros(3)))
+    for (position, quaternion), k in (((pose.position, pose.quaternion), 2), (check.end, 5)):
         np.testing.assert_allclose(position, moved[k], atol=1e-12)
         assert (Rotation.from_quat(quaternion).inv() * turned[k]).magnitude() < 1e-12
 
 
 def test_noise_is_averaged_over_the_last_measurements() -> None:
     path = BasePath(np.arange(9.0), np.zeros((9, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (9, 1)))
-    deviation = PathDeviation(path, 4)
+    check = check_of(path, 4)
     for k, (x, angle) in enumerate([(9.0, 1.0), (0.1, 0.01), (0.3, 0.03), (0.2, 0.0), (0.4, 0.04)]):
         turned = Rotation.from_rotvec([0.0, 0.0, angle]).as_quat()
-        deviation.add(k, np.array([x, 0.0, 0.0]), turned)
-    position, quaternion = deviation.pose(4)
-    np.testing.assert_allclose(position, [0.25, 0.0, 0.0])
-    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_rotvec(), [0.0, 0.0, 0.02])
+        assert check.due(k * SECOND)
+        pose = check.average_pose(RobotState(np.array([x, 0.0, 0.0]), turned, np.zeros(3)))
+    np.testing.assert_allclose(pose.position, [0.25, 0.0, 0.0])
+    np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_rotvec(), [0.0, 0.0, 0.02])
 
 
 def test_a_base_that_is_off_as_its_joints_lag_is_on_its_way_to_the_end() -> None:

@@ -34,7 +34,7 @@ from spacerobot_ros.planning.core.goal import (
     Tolerance,
     end_effector_pose,
 )
-from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 
 _MAX_EVALUATED_SHAPES = 48
@@ -74,6 +74,10 @@ class TrackingError:
 class PathCheck:
     """Compares measured states with a schedule's predicted base path.
 
+    At zero momentum, the base motion relative to the current base pose depends only on the shape
+    path. So a base that deviates from the predicted path by a rotation and a displacement continues
+    along that path, rotated and displaced: by the mean deviation of the latest measured poses.
+
     Call the other methods only for a state that is :meth:`due`.
 
     Parameters
@@ -89,9 +93,11 @@ class PathCheck:
     average
         Number of measured poses whose mean deviation from the path is used for plans that begin in
         motion; 0: none.
-    sensitivity, masses
-        Derivatives of the path with respect to mass errors, and their estimate: see
-        :class:`PathDeviation`.
+    sensitivity
+        (K, 6, P) derivatives of the path with respect to mass and inertia errors, as returned by
+        :class:`PathSensitivity`; None if these errors are not estimated.
+    masses
+        Estimate of these errors, improved by the measurements.
     """
 
     def __init__(
@@ -108,7 +114,6 @@ class PathCheck:
         self._robot = robot.interpreted
         self._path, self._positions = schedule.path, schedule.positions
         self._period, self._deadband = schedule.control_period, config.shape_deadband
-        self._deviation = PathDeviation(schedule.path, average, sensitivity, masses)
         self._max_distance = config.drift_position or np.inf
         self._max_angle = config.drift_attitude or np.inf
         self._stamps = start_ns + (schedule.path.time * 1e9).round().astype(np.int64)
@@ -117,20 +122,20 @@ class PathCheck:
         self._checks_base_path = (
             config.drift_position > 0 or config.drift_attitude > 0 or average > 0
         )
+        self._recent_deviations: deque[tuple[int, Array]] = deque(maxlen=average)
+        if sensitivity is None or masses is None:
+            sensitivity, masses = np.zeros((len(schedule.path.time), 6, 0)), MassEstimate(0)
+        self._sensitivity, self._masses = sensitivity, masses
+        masses.begin_path()
 
     def due(self, stamp_ns: int) -> bool:
         """Whether the path has a predicted pose at a stamp."""
         if not self._checks_base_path:
             return False
-        stamps = self._stamps
-        while (
-            self._next_pose < len(stamps) and stamps[self._next_pose] < stamp_ns - self._stamp_slack
-        ):
+        stamps, slack = self._stamps, self._stamp_slack
+        while self._next_pose < len(stamps) and stamps[self._next_pose] < stamp_ns - slack:
             self._next_pose += 1
-        return (
-            self._next_pose < len(stamps)
-            and stamps[self._next_pose] <= stamp_ns + self._stamp_slack
-        )
+        return self._next_pose < len(stamps) and stamps[self._next_pose] <= stamp_ns + slack
 
     def error(self, state: RobotState) -> TrackingError | None:
         """Return the tracking error in a state; None if within bounds."""
@@ -142,10 +147,18 @@ class PathCheck:
         return TrackingError(distance, angle) if too_far else None
 
     def average_pose(self, state: RobotState) -> RobotState:
-        """Add a state to the mean deviation; return the state with the averaged pose."""
-        k = self._next_pose
-        self._deviation.add(k, state.position, state.quaternion, self._joint_lag_deviation(state))
-        position, quaternion = self._deviation.pose(k)
+        """Add a state to the mean deviation; return the state with the averaged pose.
+
+        The part of the deviation due to joints lagging behind the schedule vanishes when the joints
+        catch up, so it is excluded from the mean deviation.
+        """
+        k, predicted = self._next_pose, self._path.quaternion[self._next_pose]
+        lag = self._joint_lag_deviation(state)
+        turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, state.quaternion)
+        deviation = np.concatenate([state.position - self._path.position[k], turn]) - lag
+        self._recent_deviations.append((k, deviation))
+        self._masses.add(self._sensitivity[k], deviation)
+        position, quaternion = self._displaced_pose(self._mean_deviation() + lag)
         return replace(state, position=position, quaternion=quaternion)
 
     def _joint_lag_deviation(self, state: RobotState) -> Array:
@@ -159,12 +172,37 @@ class PathCheck:
     @property
     def end(self) -> tuple[Array, Array]:
         """End of the path according to the mean deviation: position (3,), attitude (4,)."""
-        return self._deviation.end(self._next_pose)
+        k, mean = self._next_pose, self._mean_deviation()
+        position, quaternion = self._displaced_pose(mean)
+        turn = quaternion_from_rotvec(mean[3:])
+        way = self._path.position[-1] - self._path.position[k]
+        ahead = attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
+        return (
+            position + matrix_from_quaternion(turn) @ way,
+            quaternion_multiply(quaternion, quaternion_from_rotvec(ahead)),
+        )
 
     @property
     def expected_end(self) -> tuple[Array, Array]:
         """End of the path according to the estimated mass errors: position (3,), attitude (4,)."""
-        return self._deviation.expected_end(self._next_pose)
+        k, (position, quaternion) = self._next_pose, self.end
+        more = self._deviation_by_masses(k, -1)
+        turn = quaternion_from_rotvec(more[3:])
+        return position + more[:3], quaternion_multiply(turn, quaternion)
+
+    def _displaced_pose(self, deviation: Array) -> tuple[Array, Array]:
+        turn, k = quaternion_from_rotvec(deviation[3:]), self._next_pose
+        position = self._path.position[k] + deviation[:3]
+        return position, quaternion_multiply(turn, self._path.quaternion[k])
+
+    def _deviation_by_masses(self, begin: int, end: int) -> Array:
+        """Return the change of the deviation (6,) between instants by errors of masses."""
+        return np.asarray((self._sensitivity[end] - self._sensitivity[begin]) @ self._masses.errors)
+
+    def _mean_deviation(self) -> Array:
+        k, recent = self._next_pose, self._recent_deviations
+        changed = [d + self._deviation_by_masses(i, k) for i, d in recent]
+        return np.asarray(np.mean(changed, axis=0)) if changed else np.zeros(6)
 
     def shift_goal(
         self, goal: Goal, within: Tolerance, controls: frozenset[Controlled], *, late: bool
@@ -200,98 +238,6 @@ def _aim(end: tuple[Array, Array], error: PoseError, allowed: Tolerance) -> tupl
 
 def _excess_share(error: float, allowed: float) -> float:
     return max(0.0, 1.0 - allowed / error) if error > 0 else 0.0
-
-
-class PathDeviation:
-    """Mean deviation of the latest measured base poses from a predicted path.
-
-    At zero momentum, the base motion relative to the current base pose depends only on the shape
-    path. So a base that deviates from the predicted path by a rotation and a displacement continues
-    along that path, rotated and displaced.
-
-    Parameters
-    ----------
-    path
-        The prediction.
-    count
-        Measurements to average.
-    sensitivity
-        (K, 6, P) derivatives of the path with respect to mass and inertia errors, as returned by
-        :class:`PathSensitivity`; None if these errors are not estimated.
-    masses
-        Estimate of these errors, improved by the measurements.
-    """
-
-    def __init__(
-        self,
-        path: BasePath,
-        count: int,
-        sensitivity: Array | None = None,
-        masses: MassEstimate | None = None,
-    ) -> None:
-        self._path = path
-        self._recent_deviations: deque[tuple[int, Array]] = deque(maxlen=count)
-        self._joint_lag_deviation = np.zeros(6)
-        if sensitivity is None or masses is None:
-            sensitivity, masses = np.zeros((len(path.time), 6, 0)), MassEstimate(0)
-        self._sensitivity, self._masses = sensitivity, masses
-        masses.begin_path()
-
-    def add(self, k: int, position: Array, quaternion: Array, lag: Array | float = 0.0) -> None:
-        """Add a measured position (3,) and attitude (4,) to the mean deviation, for instant k of
-        the path.
-
-        ``lag`` (6,) is the part of the deviation, displacement (m) and rotation vector (rad) in W,
-        due to joints lagging behind the schedule. This part vanishes when the joints catch up, so
-        it is excluded from the mean deviation.
-        """
-        predicted = self._path.quaternion[k]
-        turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, quaternion)
-        deviation = np.concatenate([position - self._path.position[k], turn]) - lag
-        self._joint_lag_deviation[:] = lag
-        self._recent_deviations.append((k, deviation))
-        self._masses.add(self._sensitivity[k], deviation)
-
-    def pose(self, k: int) -> tuple[Array, Array]:
-        """Return the estimated base pose at instant k: position (3,) and attitude (4,)."""
-        return self._displace_pose(k, self._mean_deviation(k) + self._joint_lag_deviation)
-
-    def end(self, k: int) -> tuple[Array, Array]:
-        """Return the pose at the end of the path, if the base moves as predicted from instant k."""
-        mean = self._mean_deviation(k)
-        position, quaternion = self._displace_pose(k, mean)
-        turn = quaternion_from_rotvec(mean[3:])
-        way = self._path.position[-1] - self._path.position[k]
-        ahead = attitude_error(self._path.quaternion[k], self._path.quaternion[-1])
-        return (
-            position + matrix_from_quaternion(turn) @ way,
-            quaternion_multiply(quaternion, quaternion_from_rotvec(ahead)),
-        )
-
-    def expected_end(self, k: int) -> tuple[Array, Array]:
-        """Return the end of the path according to the estimated mass errors: (3,) and (4,)."""
-        position, quaternion = self.end(k)
-        more = self._deviation_by_masses(k, -1)
-        turn = quaternion_from_rotvec(more[3:])
-        return position + more[:3], quaternion_multiply(turn, quaternion)
-
-    def _displace_pose(self, k: int, deviation: Array) -> tuple[Array, Array]:
-        turn = quaternion_from_rotvec(deviation[3:])
-        position = self._path.position[k] + deviation[:3]
-        return position, quaternion_multiply(turn, self._path.quaternion[k])
-
-    def _deviation_by_masses(self, begin: int, end: int) -> Array:
-        """Return the change of the deviation (6,) between instants by errors of masses."""
-        return np.asarray((self._sensitivity[end] - self._sensitivity[begin]) @ self._masses.errors)
-
-    def _mean_deviation(self, k: int) -> Array:
-        if not self._recent_deviations:
-            return np.zeros(6)
-        return np.asarray(
-            np.mean(
-                [d + self._deviation_by_masses(i, k) for i, d in self._recent_deviations], axis=0
-            )
-        )
 
 
 class PathSensitivity:
