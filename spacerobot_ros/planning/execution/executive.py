@@ -18,11 +18,7 @@ from spacerobot_ros.errors import PlanningError, counted, sentence_case
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning.core.goal import (
-    PoseError,
-    RobotState,
-    Tolerance,
-)
+from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -384,8 +380,7 @@ class Executive:
         if self.phase is Phase.TELEOPERATING:
             self._follow_twist(measured)
         elif not tracker.is_active:
-            base = measured.base if tracker.needs_wheel_rates else None
-            qdot = None if base is None else base.qdot
+            qdot = None if measured.base is None else measured.base.qdot
             tracker.hold(q, qdot, obeyed=not self.plant_rests)
         self.statistics.commands_published += 1
         return tracker.setpoint
@@ -558,9 +553,8 @@ class Executive:
         take_over = self._tracker.take_over(self._stamp_ns, state.q, self.config.takeover_time)
         if take_over is None:
             return
-        reason = PlanReason.SHRINKING_HORIZON
-        job = PlanJob(active.identified, reason, take_over=take_over, aim=aim)
-        self._request_plan(job, replace(state, q=take_over.shapes[0].copy()))
+        job = PlanJob(active.identified, PlanReason.SHRINKING_HORIZON, take_over=take_over)
+        self._request_plan(job, replace(state, q=take_over.shapes[0].copy()), aim)
 
     def _brake_for_replan(self, event: Event) -> None:
         """Come to rest along the planned path: in the background plans are made from rest."""
@@ -632,24 +626,24 @@ class Executive:
             waiting = waiting.kept_at(state.position, state.quaternion)
             self._request_plan(PlanJob(waiting, reason, take_over=take_over), state)
 
-    def _request_plan(self, job: PlanJob, state: RobotState) -> None:
-        """Request a plan from a measured state; unless it is to take over, the joints brake."""
+    def _request_plan(self, job: PlanJob, state: RobotState, aim: Goal | None = None) -> None:
+        """Request a plan from a measured state to the goal, or to another ``aim``; unless it is to
+        take over, the joints brake.
+        """
         active = None if job.reason.is_for_new_goal else self._active_goal
         if active is not None and len(active.stuck_positions) != len(self._tracker.stuck):
             names = self._robot.joint_names
             active.stuck_positions = {names[i]: float(state.q[i]) for i in self._tracker.stuck}
-        braking, rates = None, self._tracker.wheel_rates(state)
+        braking, rates = None, None
         if job.take_over is not None:
             self._change_phase(Event.PLAN_REQUESTED, Phase.REPLANNING)
         else:
-            braking = self._tracker.braking_shapes(self._stamp_ns)
-            if braking is not None:
-                rates = self._tracker.rates_after_braking()
+            braking, rates = self._tracker.braking(self._stamp_ns, state)
             self._commanded_from_ns = self._stamp_ns
             self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
         request = PlanRequest(
             state,
-            job.aim or job.identified.goal,
+            aim or job.identified.goal,
             self._tolerance_of(job.identified),
             correction=job.reason in (PlanReason.CORRECTION, PlanReason.CONTINUATION),
             previous=None if active is None else active.schedule,

@@ -265,23 +265,20 @@ class TrajectoryTracker:
         """Brake along the planned path from now on."""
         self._follower = self._begin_braking(stamp_ns)
 
-    def braking_shapes(self, stamp_ns: int) -> Array | None:
+    def braking(self, stamp_ns: int, state: RobotState) -> tuple[Array | None, Array | None]:
         """Return the shapes (N + 1, n) that the joints would have at the ticks if braking started
-        now; None at rest."""
+        now, None at rest, and the velocities (n,) held after it, None if they are zero.
+
+        At rest, these are the wheel velocities in the measured ``state``.
+        """
         follower = self._begin_braking(stamp_ns)
-        return None if follower is None else follower.shapes_from(stamp_ns)
-
-    def rates_after_braking(self) -> Array | None:
-        """Return the velocities (n,) held after braking; None: zero."""
-        return None if self._follower is None else self._follower.schedule.end_velocities
-
-    def wheel_rates(self, state: RobotState) -> Array | None:
-        """Return the wheel velocities (n,) in a measured state; None without wheels."""
+        if follower is not None:
+            return follower.shapes_from(stamp_ns), follower.schedule.end_velocities
         if not len(self._wheels) or state.qdot is None:
-            return None
+            return None, None
         rates = np.zeros(len(state.q))
         rates[self._wheels] = state.qdot[self._wheels]
-        return rates
+        return None, rates
 
     def _begin_braking(self, stamp_ns: int) -> ScheduleFollower | None:
         if self._follower is None or self._follower.brakes:
@@ -363,12 +360,6 @@ class TrajectoryTracker:
             setpoint.position[:] += setpoint.velocity * self._config.control_period
         setpoint.velocity[:] = velocity
         self._holds_position = True
-
-    @property
-    def needs_wheel_rates(self) -> bool:
-        """Whether :meth:`hold` needs measured rates, which is the case if some wheels have no
-        commanded rates."""
-        return bool(len(self._wheels)) and not self._spins
 
     def forget_wheels(self) -> None:
         """Use the measured wheel rates next, not the commanded ones."""

@@ -20,7 +20,7 @@ from spacerobot_ros.planning.core.cancellation import (
     PlanningJob,
 )
 from spacerobot_ros.planning.core.clearance import Clearance
-from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState
+from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
@@ -56,15 +56,12 @@ class PlanJob:
         Remaining error of an active goal at rest, or deviation of the base from its path.
     take_over
         Tick at which the plan takes over in motion; None: the plan begins at rest, or with braking.
-    aim
-        The shifted goal at which the plan ends; None: the goal itself.
     """
 
     identified: IdentifiedGoal
     reason: PlanReason
     error: PoseError | TrackingError | None = None
     take_over: TakeOver | None = None
-    aim: Goal | None = None
 
 
 @dataclass(frozen=True)
@@ -125,30 +122,6 @@ class Refused:
     wall_time: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Coasting:
-    """A rest at the start of a plan that is made while the robot drifts.
-
-    ``begins_ns`` is the stamp of the state that the ``planned`` task begins from, ``duration`` that
-    of the rest, s: the gait begins where the base has drifted to by then.
-    """
-
-    planned: PlanningTask
-    begins_ns: int
-    duration: float
-
-    def task(self, period: float) -> PlanningTask:
-        """Return the task for a plan that begins with the rest period; ``control_period`` is in
-        s."""
-        ticks, state = math.ceil(self.duration / period - 1e-9), self.planned.request.state
-        shapes = np.tile(state.q, (ticks + 1, 1))
-        if self.planned.rates_after_braking is not None:
-            shapes += (
-                period * np.arange(ticks + 1)[:, np.newaxis] * self.planned.rates_after_braking
-            )
-        return replace(self.planned, braking=shapes)
-
-
 class PlanningWorker:
     """Plans with a planner's method, one plan at a time.
 
@@ -198,14 +171,15 @@ class PlanningWorker:
             config.method_options,
             self.clearance,
         )
-        self._remaining_joints: tuple[PlanningTask, GaitMethod] | None = None
-        """The latest method for the joints that are not stuck, and its task."""
+        self._remaining_joints: tuple[object, GaitMethod] | None = None
+        """The stuck joints and required goal components of the latest task with stuck joints, and
+        the method for its other joints."""
         self._job: PlanningJob[GaitSchedule] | None = None
         self._time = 0.0
         """Wall time of the work on the requested plan so far, s."""
-        self._coasting: _Coasting | None = None
-        """Rest period at the start of the requested plan, because the base drifts during
-        planning."""
+        self._coasting: tuple[PlanningTask, int, float] | None = None
+        """The requested task, if it begins with a rest because the base drifts during planning, the
+        stamp of its state, ns, and the duration of the rest, s."""
 
     @property
     def is_busy(self) -> bool:
@@ -219,11 +193,6 @@ class PlanningWorker:
             return False
         return True
 
-    def _drifts(self, state: RobotState) -> bool:
-        """Whether the base moves on while the joints of a robot rest."""
-        momenta = state.linear_momentum, state.angular_momentum
-        return any(self._method.significant(each).any() for each in momenta)
-
     def starts_in_motion(self, schedule: GaitSchedule) -> bool:
         """Whether a plan may take over from a schedule: the methods of both must allow it."""
         maker = METHODS.get(schedule.method, type(self._method))
@@ -232,11 +201,22 @@ class PlanningWorker:
     def submit(self, task: PlanningTask, stamp_ns: int) -> None:
         """Make a plan from the state with this stamp, synchronously or in a thread."""
         self._coasting, self._time = None, 0.0
-        at_rest = task.braking is None and task.take_over is None
-        if at_rest and self.plans_in_background and self._drifts(task.request.state):
-            self._coasting = _Coasting(task, stamp_ns, _COASTING_TIME)
-            task = self._coasting.task(self._config.control_period)
-        self.start(task)
+        state, at_rest = task.request.state, task.braking is None and task.take_over is None
+        momenta = state.linear_momentum, state.angular_momentum
+        drifts = any(self._method.significant(each).any() for each in momenta)
+        if at_rest and drifts and self.plans_in_background:
+            self._start_coasting(task, stamp_ns, _COASTING_TIME)
+        else:
+            self.start(task)
+
+    def _start_coasting(self, task: PlanningTask, begins_ns: int, duration: float) -> None:
+        """Plan a gait that begins where the base has drifted to after a rest."""
+        self._coasting, period = (task, begins_ns, duration), self._config.control_period
+        ticks = math.ceil(duration / period - 1e-9)
+        shapes = np.tile(task.request.state.q, (ticks + 1, 1))
+        if task.rates_after_braking is not None:
+            shapes += period * np.arange(ticks + 1)[:, np.newaxis] * task.rates_after_braking
+        self.start(replace(task, braking=shapes))
 
     def start(self, task: PlanningTask) -> None:
         """Start the work on a task."""
@@ -259,9 +239,10 @@ class PlanningWorker:
             return result
         if coasting is None:
             return replace(result, begins_ns=stamp_ns)
-        elapsed = (stamp_ns - coasting.begins_ns) / SECOND
-        if elapsed <= coasting.duration:
-            return replace(result, begins_ns=coasting.begins_ns)
+        task, begins_ns, duration = coasting
+        elapsed = (stamp_ns - begins_ns) / SECOND
+        if elapsed <= duration:
+            return replace(result, begins_ns=begins_ns)
         if elapsed > _MAX_COASTING_TIME:
             return Refused(
                 f"The robot drifts, and {elapsed:.3g} s of planning were too short to find a plan "
@@ -269,8 +250,7 @@ class PlanningWorker:
                 result.wall_time,
             )
         # The base has drifted past the start of the plan.
-        self._coasting = replace(coasting, duration=_COASTING_FACTOR * elapsed)
-        self.start(self._coasting.task(self._config.control_period))
+        self._start_coasting(task, begins_ns, _COASTING_FACTOR * elapsed)
         return None
 
     def take_result(self) -> Planned | Refused | None:
@@ -332,49 +312,35 @@ class PlanningWorker:
             return method.plan(replace(task.request, state=state, motion=motion), cancellation)
         if task.braking is None:
             return method.plan(task.request, cancellation)
-        return self._plan_with_braking(
-            task.braking, task.request, method, cancellation, task.rates_after_braking
-        )
+        return self._plan_with_braking(task.braking, task, method, cancellation)
 
     def _choose_method(self, task: PlanningTask) -> GaitMethod:
-        if not task.stuck_joint_positions:
+        stuck, required, config = task.stuck_joint_positions, task.required, self._config
+        if not stuck:
             return self._method
-        if self._remaining_joints is not None:
-            earlier, method = self._remaining_joints
-            if (earlier.stuck_joint_positions, earlier.required) == (
-                task.stuck_joint_positions,
-                task.required,
-            ):
-                return method
-        config = self._config
-        method = RemainingJointsGait(
-            self._robot,
-            config.control_period,
-            config.integration_step,
-            stuck=task.stuck_joint_positions,
-            method=config.method,
-            options=config.method_options,
-            required=task.required,
-            clearance=self.clearance,
-        )
-        self._remaining_joints = task, method
-        return method
+        if self._remaining_joints is None or self._remaining_joints[0] != (stuck, required):
+            method = RemainingJointsGait(
+                self._robot,
+                config.control_period,
+                config.integration_step,
+                stuck=stuck,
+                method=config.method,
+                options=config.method_options,
+                required=required,
+                clearance=self.clearance,
+            )
+            self._remaining_joints = (stuck, required), method
+        return self._remaining_joints[1]
 
     def _plan_with_braking(
-        self,
-        shapes: Array,
-        request: PlanRequest,
-        method: GaitMethod,
-        cancellation: Cancellation,
-        rates: Array | None = None,
+        self, shapes: Array, task: PlanningTask, method: GaitMethod, cancellation: Cancellation
     ) -> GaitSchedule:
-        """Return one schedule: braking in ``shapes`` (K + 1, n), then a gait from rest, at which
-        wheels have ``rates`` (n,)."""
-        state, period = request.state, self._config.control_period
-        shapes[0] = state.q
-        at_rest, positions, attitudes = self._predict_motion(state, shapes)
+        """Return one schedule: braking in ``shapes`` (K + 1, n), then a gait from rest."""
+        request, period = task.request, self._config.control_period
+        shapes[0] = request.state.q
+        at_rest, positions, attitudes = self._predict_motion(request.state, shapes)
         times: Array = period * np.arange(len(shapes), dtype=float)
-        at_rest = replace(at_rest, qdot=rates)
+        at_rest = replace(at_rest, qdot=task.rates_after_braking)
         gait = method.plan(replace(request, state=at_rest), cancellation)
         path = BasePath(
             np.append(times[:-1], times[-1] + gait.path.time),
@@ -392,7 +358,6 @@ class PlanningWorker:
         times: Array = config.control_period * np.arange(len(shapes), dtype=float)
         attitudes = prediction.attitudes(shapes, state.quaternion, state.angular_momentum)
         positions = prediction.positions(state, times, shapes, attitudes)
-        after: RobotState = replace(
-            state, position=positions[-1], quaternion=attitudes[-1], q=shapes[-1].copy()
-        )
+        q = shapes[-1].copy()
+        after = replace(state, position=positions[-1], quaternion=attitudes[-1], q=q)
         return after, positions, attitudes
