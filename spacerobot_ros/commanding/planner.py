@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.host import CommanderHost, StateDecoder
@@ -21,7 +21,7 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
-from spacerobot_ros.planning.execution.state_average import BaseMeasurement
+from spacerobot_ros.planning.execution.state_average import BaseMeasurement, MeasuredState
 from spacerobot_ros.planning.execution.status import (
     Notice,
     PlannerState,
@@ -35,14 +35,6 @@ from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.topics import twist_topic
-
-
-class _MeasuredState(NamedTuple):
-    """A measured state for the planner."""
-
-    stamp_ns: int
-    q: Array
-    base: BaseMeasurement | None
 
 
 class PlannerCommander(Commander):
@@ -240,7 +232,7 @@ class PlannerCommander(Commander):
                 base = BaseMeasurement(*decoder.decode_base(states.odom), decoder.qdot)
             except CommandError as error:
                 self._log_fault("odom", f"odom: {error}.")
-        measured = _MeasuredState(stamp, decoder.q, base)
+        measured = MeasuredState(stamp, decoder.q, base)
         if pairing is Pairing.LATE_POSE:
             # The state was answered without its pose; a plan uses the pose at the next joints.
             executive.add_base_measurement(measured)

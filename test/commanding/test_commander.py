@@ -28,7 +28,12 @@ from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    GoalFile,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
@@ -377,7 +382,7 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
     robot: SpaceRobot, tmp_path: Path
 ) -> None:
     path = tmp_path / "goal.json"
-    GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "9.000000000")})
+    GoalFile(str(path)).pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "9.000000000")}))
     rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
     rig.commander.activate()
     assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("waiting", "9.000000000")

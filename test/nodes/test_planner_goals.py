@@ -34,7 +34,12 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.nodes.common.messages import goal_of
 from spacerobot_ros.planning import METHODS, GaitSchedule
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    GoalFile,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
 pytestmark = pytest.mark.usefixtures("one_plant")
@@ -297,7 +302,7 @@ def test_a_node_that_ends_has_its_search_given_up(harness: Harness) -> None:
 def interrupted(harness: Harness, path: Path) -> Flight:
     """Start a planner whose predecessor was flying to a goal; time stands still."""
     goal = goal_of(goal_at(TURNED), "world")
-    GoalFile(str(path)).save({BASE_GOAL_KEY: IdentifiedGoal(goal, "7.000000000")})
+    GoalFile(str(path)).pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(goal, "7.000000000")}))
     flight = Flight(harness, {"robot": "", "resume_file": str(path)})
     status = flight.wait("waiting")
     assert values_of(status)["goal_id"] == "7.000000000"

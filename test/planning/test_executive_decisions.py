@@ -52,7 +52,12 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
-from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import (
+    BASE_GOAL_KEY,
+    GoalFile,
+    IdentifiedGoal,
+    PursuedGoals,
+)
 from spacerobot_ros.planning.execution.status import (
     Event,
     Phase,
@@ -192,7 +197,7 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
 ) -> None:
     loop = start()
     loop.goal_file = GoalFile(str(tmp_path / "goal.json"))
-    loop.goal_file.save({BASE_GOAL_KEY: IdentifiedGoal(goal_at(NEAR), "goal-1")})
+    loop.goal_file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(goal_at(NEAR), "goal-1")}))
     assert loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
     loop.tick()
     status = loop.statuses[-1]
@@ -318,7 +323,7 @@ def test_after_a_reset_the_shape_of_before_is_not_held() -> None:
     assert np.abs(loop.plant.q).max() > 0.01
     reset_plant(loop)
     loop.tick()
-    np.testing.assert_array_equal(loop.executive.update(loop.measured).position, np.zeros(3))
+    np.testing.assert_array_equal(loop.executive.update(loop.measured.now).position, np.zeros(3))
 
 
 # -- what the statuses say --------------------------------------------------------------------

@@ -20,7 +20,7 @@ from spacerobot_ros.planning import Goal, RobotState, Tolerance, build_method, p
 from spacerobot_ros.planning.core.goal import MAX_PATH_POSES, EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
-from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal
+from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal, PursuedGoals
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 from spacerobot_ros.planning.methods.registry import method_options
@@ -367,7 +367,7 @@ def test_files_of_goals_keep_paths(tmp_path: Any) -> None:
     goal = Goal.of_end_effectors(
         [EndEffectorGoal.along("hand", poses), EndEffectorGoal.checked("foot", [7, 8, 9])]
     )
-    GoalFile(str(path)).save({"base": IdentifiedGoal(goal, "4.2")})
+    GoalFile(str(path)).pursue(PursuedGoals({"base": IdentifiedGoal(goal, "4.2")}))
     loaded = GoalFile(str(path)).load()["base"]
     assert loaded.goal.equals(goal)
     assert loaded.goal.has_path
@@ -378,7 +378,7 @@ def test_a_path_of_the_base_is_saved_and_displaced(tmp_path: Path) -> None:
     goal = Goal.through(values * [1, 1, 1, 2, 2, 2, 2])
     np.testing.assert_allclose(goal.path_values, values, atol=1e-15)
     assert not goal.equals(Goal.through(values[1:]))
-    GoalFile(str(tmp_path / "goal")).save({"base": IdentifiedGoal(goal, "4.2")})
+    GoalFile(str(tmp_path / "goal")).pursue(PursuedGoals({"base": IdentifiedGoal(goal, "4.2")}))
     loaded = GoalFile(str(tmp_path / "goal")).load()["base"].goal
     np.testing.assert_allclose(loaded.path_values, values, atol=1e-15)
     moved = goal.displaced(np.array([0.1, 0.2, -0.3])).path_values

@@ -138,7 +138,7 @@ def test_goal_ids_are_the_stamps() -> None:
 def test_a_goal_survives_its_file(tmp_path: Path, goal_id: str) -> None:
     file = GoalFile(str(tmp_path / "goal.json"))
     assert file.load() == {}
-    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, goal_id)})
+    file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, goal_id)}))
     loaded = file.load()[BASE_GOAL_KEY]
     assert loaded.goal_id == goal_id
     np.testing.assert_array_equal(loaded.goal.position, GOAL.position)
@@ -188,8 +188,9 @@ def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, content: bytes) ->
 
 
 def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match="cannot be written"):
-        GoalFile(str(tmp_path / "none" / "goal.json")).save({BASE_GOAL_KEY: IdentifiedGoal(GOAL)})
+    file = GoalFile(str(tmp_path / "none" / "goal.json"))
+    problem = file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL)}))
+    assert "which cannot be written" in problem
 
 
 def test_a_goal_that_others_could_have_written_is_not_flown_to(
@@ -199,7 +200,7 @@ def test_a_goal_that_others_could_have_written_is_not_flown_to(
     file = GoalFile(str(path))
     before = os.umask(0)
     try:
-        file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL)})
+        file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL)}))
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o600
@@ -211,7 +212,7 @@ def test_a_goal_that_others_could_have_written_is_not_flown_to(
     path.chmod(0o644)
     assert BASE_GOAL_KEY in file.load()
     path.unlink()
-    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL)})
+    file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL)}))
     if os.geteuid() == 0:
         os.chown(path, 12345, 12345)
     else:
@@ -244,7 +245,7 @@ def test_a_goal_file_is_replaced_as_a_whole(
     """Nobody foresees the name that it is written under, and a failure leaves the goal before."""
     path = tmp_path / "goal.json"
     file = GoalFile(str(path))
-    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "1.0")})
+    file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "1.0")}))
     (tmp_path / "goal.json.new").symlink_to(tmp_path / "victim")
 
     def failing(*_: object) -> None:
@@ -252,10 +253,10 @@ def test_a_goal_file_is_replaced_as_a_whole(
 
     with monkeypatch.context() as broken:
         broken.setattr("os.replace", failing)
-        with pytest.raises(ParameterError, match="No space left"):
-            file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "2.0")})
+        problem = file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "2.0")}))
+        assert "No space left" in problem
     assert file.load()[BASE_GOAL_KEY].goal_id == "1.0"
-    file.save({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "2.0")})
+    file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "2.0")}))
     assert file.load()[BASE_GOAL_KEY].goal_id == "2.0"
     assert {each.name for each in tmp_path.iterdir()} == {"goal.json", "goal.json.new"}
 
@@ -362,7 +363,7 @@ def test_a_file_keeps_goals_of_end_effectors(tmp_path: Path) -> None:
         Goal.of_end_effectors(hands[:1], quaternion=[0.0, 0.0, 0.6, 0.8]),
         Goal.of_end_effectors(hands[1:], joint_positions=[0.5, -0.75]),
     ):
-        file.save({BASE_GOAL_KEY: IdentifiedGoal(goal, "1.0")})
+        file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(goal, "1.0")}))
         kept = file.load()[BASE_GOAL_KEY].goal
         assert kept.equals(goal)
         assert not kept.equals(GOAL)

@@ -27,7 +27,7 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
     PursuedGoals,
 )
-from spacerobot_ros.planning.execution.state_average import BaseMeasurement
+from spacerobot_ros.planning.execution.state_average import BaseMeasurement, MeasuredState
 from spacerobot_ros.planning.execution.status import (
     Notice,
     Output,
@@ -199,6 +199,10 @@ class PlantState:
         pose = self._plant.pose * np.nan if self.broken else self._plant.pose
         return BaseMeasurement(pose, self._plant.twist, self._plant.qdot)
 
+    @property
+    def now(self) -> MeasuredState:
+        return MeasuredState(self.stamp_ns, self.q, self.base)
+
 
 class Loop:
     """An executive and a plant that does what it is told, tick by tick.
@@ -268,7 +272,7 @@ class Loop:
     def late(self) -> None:
         """Show the base of the state that was answered last."""
         self.measured.seen = True
-        self.executive.add_base_measurement(self.measured)
+        self.executive.add_base_measurement(self.measured.now)
         self._take()
 
     def set(self, **parameters: Any) -> None:
@@ -280,7 +284,7 @@ class Loop:
         """Answer this many states and step the plant; ``base``: whether it is measured."""
         for _ in range(count):
             self.measured.seen = base
-            setpoint = self.executive.update(self.measured)
+            setpoint = self.executive.update(self.measured.now)
             self._take()
             assert np.all(np.isfinite(setpoint.position))
             assert np.all(np.isfinite(setpoint.velocity))

@@ -101,42 +101,29 @@ class GoalFile:
         """Goal ids in the file."""
 
     def pursue(self, pursued: PursuedGoals) -> str:
-        """Save goals; return a message if they cannot be saved, else an empty string."""
+        """Atomically replace the file content with the goals to resume; return a message if the
+        file cannot be written, else an empty string."""
+        kept = {key: goal for key, goal in pursued.goals.items() if goal.resumes}
+        self._ids = frozenset(goal.goal_id for goal in kept.values())
+        if not kept:
+            self.delete()
+        if self._path is None or not kept:
+            return ""
+        text = json.dumps({key: encode_goal(goal) for key, goal in kept.items()})
         try:
-            self.save(pursued.goals)
-        except ParameterError as error:
-            return f"{error} The goal is pursued, but will not be resumed after a restart."
+            write_whole(self._path, text.encode())
+        except OSError as error:
+            return (
+                f"Parameter 'resume_file' is '{self._path}', which cannot be written: "
+                f"{error.strerror or error}. The goal is pursued, but will not be resumed after a "
+                "restart."
+            )
         return ""
 
     def end(self, goal_id: str, *, refused: bool) -> None:
         """Delete the file when a goal has ended, unless another goal was rejected."""
         if self._ids and (goal_id in self._ids or not refused):
             self.delete()
-
-    def save(self, goals: Mapping[str, IdentifiedGoal]) -> None:
-        """Atomically replace the file content with the goals to resume.
-
-        Raises
-        ------
-        ParameterError
-            The file cannot be written.
-        """
-        if self._path is None:
-            return
-        kept = {key: goal for key, goal in goals.items() if goal.resumes}
-        entries = {key: encode_goal(goal) for key, goal in kept.items()}
-        self._ids = frozenset(goal.goal_id for goal in kept.values())
-        if not entries:
-            self.delete()
-            return
-        text = json.dumps(entries)
-        try:
-            write_whole(self._path, text.encode())
-        except OSError as error:
-            raise ParameterError(
-                f"Parameter 'resume_file' is '{self._path}', which cannot be written: "
-                f"{error.strerror or error}."
-            ) from error
 
     def delete(self) -> None:
         """Delete the file, because its goals were reached, failed or aborted."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,20 +29,13 @@ class BaseMeasurement(NamedTuple):
     qdot: Array
 
 
-class MeasuredState(Protocol):
-    """A measured state: the joints and, if measured at the same time, the base."""
+class MeasuredState(NamedTuple):
+    """A measured state: its stamp, the shape ``q`` (n,), m or rad, and, if measured at the same time,
+    the base."""
 
-    @property
-    def stamp_ns(self) -> int:
-        """Measurement time, ns."""
-
-    @property
-    def q(self) -> Array:
-        """Shape (n,), m or rad."""
-
-    @property
-    def base(self) -> BaseMeasurement | None:
-        """Base and rates; None if the base was not measured together with the joints."""
+    stamp_ns: int
+    q: Array
+    base: BaseMeasurement | None
 
 
 class StateAverage:
@@ -67,11 +60,7 @@ class StateAverage:
         self._robot, self._full_count, self._tolerance = robot, count, rest_tolerance
         wheels = ReactionWheels.of(robot.description)
         self._wheels, self._braked = wheels.index, wheels.other
-        self._poses: list[Array] = []
-        self._rates: list[Array] = []
-        self._shapes: list[Array] = []
-        self._momenta: tuple[Array, Array] | None = None
-        """Momenta last measured at rest, (3,) each; None: none were."""
+        self.forget()
 
     @property
     def count(self) -> int:
@@ -85,12 +74,15 @@ class StateAverage:
 
     def restart(self) -> None:
         """Discard the averaged states, but keep the momenta."""
-        self._poses, self._rates, self._shapes = [], [], []
+        self._poses: list[Array] = []
+        self._rates: list[Array] = []
+        self._shapes: list[Array] = []
 
     def forget(self) -> None:
         """Discard the states and the momenta, because the robot state has changed."""
         self.restart()
-        self._momenta = None
+        self._momenta: tuple[Array, Array] | None = None
+        """Momenta last measured at rest, (3,) each; None: none were."""
 
     def add(self, pose: Array, twist: Array, q: Array, qdot: Array) -> None:
         """Add a state: pose (7,), twist (6,), shape and joint rates (n,), as reported by plants."""
