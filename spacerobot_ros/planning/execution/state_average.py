@@ -30,8 +30,8 @@ class BaseMeasurement(NamedTuple):
 
 
 class MeasuredState(NamedTuple):
-    """A measured state: its stamp, the shape ``q`` (n,), m or rad, and, if measured at the same time,
-    the base."""
+    """A measured state: its stamp, the shape ``q`` (n,), m or rad, and the base, if it was measured
+    at the same time."""
 
     stamp_ns: int
     q: Array

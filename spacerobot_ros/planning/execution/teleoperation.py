@@ -318,23 +318,20 @@ class TwistFollower:
         """Distances (P,), m, that pairs of bodies must keep, determined at the first shape."""
         axes = BaseRotations.of(robot).loop_axes
         (directions,) = EndEffectorRows(robot, [(link, True)], axes).directions
-        self._displacements, self._rotations = directions.displacements, directions.rotations
+        displacements, rotations = directions.displacements, directions.rotations
         kept = len(axes) if self._keeps_attitude else 0
-        if len(self._displacements) + kept > robot.n or not len(self._displacements):
+        if len(displacements) + kept > robot.n or not len(displacements):
             still = " and keep the base attitude" if kept else ""
             raise PlanningError(
                 f"Robot '{robot.description.name}' has too few joints to move '{link}' by "
                 f"twists{still}."
             )
-        self.turns = len(self._displacements) + len(self._rotations) + kept <= robot.n
+        self.turns = len(displacements) + len(rotations) + kept <= robot.n
         """Whether the rotation follows the twist."""
         reach = reach_of_end_effector(robot, limits.lower, limits.upper, link)
-        self._scales = np.concatenate(
-            [
-                np.full(len(self._displacements), 1 / reach),
-                np.ones(len(self._rotations) if self.turns else 0),
-            ]
-        )
+        self._displacements = displacements
+        self._rotations = rotations if self.turns else rotations[:0]
+        self._scales = np.repeat([1 / reach, 1.0], [len(displacements), len(self._rotations)])
 
     def rates(
         self, twist: TwistCommand | None, pose: Array, q: Array, before: Array
@@ -376,10 +373,7 @@ class TwistFollower:
         limits = self._limits
         R_BE, _ = self._robot.link_pose(self.link, q)
         v, omega = twist.in_base(matrix_from_quaternion(pose[3:]), R_BE)
-        rows = [self._displacements @ v]
-        if self.turns:
-            rows.append(self._rotations @ omega)
-        motion = self._scales * np.concatenate(rows)
+        motion = self._scales * np.append(self._displacements @ v, self._rotations @ omega)
         if np.linalg.norm(motion) <= _ROUNDING:
             return np.zeros(len(q)), ""
         rates, progress = self._solution(q, motion)
@@ -417,10 +411,8 @@ class TwistFollower:
     def _solution(self, q: Array, motion: Array) -> tuple[Array, float]:
         """Return the rates (n,) of a scaled motion, and the motion for a radian of the joints."""
         J = self._robot.generalised_jacobian(self.link, q)
-        rows = [self._displacements @ J[:3]]
-        if self.turns:
-            rows.append(self._rotations @ J[3:])
-        M = self._scales[:, np.newaxis] * np.vstack(rows) * self._weights
+        rows = np.vstack([self._displacements @ J[:3], self._rotations @ J[3:]])
+        M = self._scales[:, np.newaxis] * rows * self._weights
         goal = motion
         if self._keeps_attitude:
             M = np.vstack([M, self._robot.connection(q)[3:] * self._weights])

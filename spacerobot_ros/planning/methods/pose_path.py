@@ -176,13 +176,13 @@ class RoundedPath:
         The path, with at least two poses.
     tolerance
         Largest deviation from the lines, m, and from their attitudes, rad.
-    before, total_length
+    before, whole
         Path length before the start of this motion, and length of the whole path, m, for messages.
 
     Attributes
     ----------
-    length
-        Total length of the lines, m.
+    total_length
+        Length of the whole path, m.
     is_straight
         Whether the path is one straight line.
     curvature_breaks
@@ -194,8 +194,8 @@ class RoundedPath:
     ) -> None:
         self._path, self._total = path, float(path.lengths_at_poses[-1])
         self._metres_at_poses = np.append(0.0, np.cumsum(np.linalg.norm(path.chords, axis=1)))
-        self.length = float(self._metres_at_poses[-1])
-        self._length_before, self.total_length = before, self.length if whole is None else whole
+        length = float(self._metres_at_poses[-1])
+        self._length_before, self.total_length = before, length if whole is None else whole
         self.is_straight = len(path.positions) == 2
         near = np.minimum(path.lengths[1:], path.lengths[:-1]) / 2
         self._blends = np.concatenate([[0.0], np.minimum(near, 4 * tolerance), [0.0]])
@@ -205,35 +205,25 @@ class RoundedPath:
         marks = path.lengths_at_poses[inner, np.newaxis] + np.outer(self._blends[inner], parts)
         self.curvature_breaks = np.unique(marks) / self._total
 
-    def displacement(self, share: float) -> Array:
-        """Return the displacement (3,) after a fraction of the way, m."""
+    def pose(self, share: float) -> tuple[Array, Array]:
+        """Return the displacement (3,), m, and the rotation (4,) since the start at a fraction of
+        the way."""
         base, before, after, a, b, _, _ = self._blend_at(share)
-        chords, start = self._path.chords, self._path.positions[0]
-        place = self._path.positions[base] - start
-        return np.asarray(place - a * chords[before] + b * chords[after])
-
-    def displacement_derivative(self, share: float) -> Array:
-        """Return the derivative (3,) of the displacement with respect to the fraction."""
-        _, before, after, _, _, a_rate, b_rate = self._blend_at(share)
-        chords = self._path.chords
-        return np.asarray(b_rate * chords[after] - a_rate * chords[before])
-
-    def rotation(self, share: float) -> Array:
-        """Return the rotation (4,) since the start after a fraction of the way."""
-        base, before, after, a, b, _, _ = self._blend_at(share)
-        path = self._path
-        to_base = quaternion_multiply(
-            path.quaternions[base], quaternion_inverse(path.quaternions[0])
-        )
+        path, start = self._path, quaternion_inverse(self._path.quaternions[0])
+        place = path.positions[base] - path.positions[0]
+        to_base = quaternion_multiply(path.quaternions[base], start)
         back = quaternion_multiply(quaternion_from_rotvec(-a * path.turns[before]), to_base)
-        return quaternion_multiply(quaternion_from_rotvec(b * path.turns[after]), back)
+        turned = quaternion_multiply(quaternion_from_rotvec(b * path.turns[after]), back)
+        return np.asarray(place - a * path.chords[before] + b * path.chords[after]), turned
 
-    def rotation_derivative(self, share: float) -> Array:
-        """Return the angular velocity (3,) with respect to the fraction, rad."""
+    def derivative(self, share: float) -> tuple[Array, Array]:
+        """Return the derivatives of both by the fraction: velocity (3,), m, and angular velocity
+        (3,), rad."""
         _, before, after, _, b, a_rate, b_rate = self._blend_at(share)
-        turns = self._path.turns
+        chords, turns = self._path.chords, self._path.turns
         carried = matrix_from_quaternion(quaternion_from_rotvec(b * turns[after]))
-        return np.asarray(b_rate * turns[after] - a_rate * (carried @ turns[before]))
+        turn = b_rate * turns[after] - a_rate * (carried @ turns[before])
+        return np.asarray(b_rate * chords[after] - a_rate * chords[before]), np.asarray(turn)
 
     def travelled_length(self, share: float) -> float:
         """Return the length along the whole path, m, after a fraction of the way."""

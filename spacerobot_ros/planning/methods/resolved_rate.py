@@ -130,8 +130,8 @@ class _SmoothPath:
     of its chords, which through two points is the straight line.
 
     ``turn`` (3,) is the rotation vector from the start to the end, in step with the way, rad;
-    ``length`` and ``total_length`` are of the chords together, m. There are no
-    ``curvature_breaks``, shares of the way at which its curvature jumps.
+    ``total_length`` is that of the chords together, m. There are no ``curvature_breaks``, shares of
+    the way at which its curvature jumps.
     """
 
     curvature_breaks = np.zeros(0)
@@ -144,32 +144,26 @@ class _SmoothPath:
         kept = np.flatnonzero(np.append(np.inf, chords) > _ZERO_DISTANCE)
         along = np.append(0.0, np.cumsum(chords))[kept]
         self.is_straight = len(kept) <= 2
-        self.length = self.total_length = float(along[-1])
+        self.total_length = float(along[-1])
         self._turn = np.asarray(turn, dtype=float)
         if len(kept) == 1:
             along, kept = np.array([0.0, 1.0]), np.array([0, 0])
         self._place = CubicSpline(along / along[-1], points[kept], bc_type="natural")
         self._rate = self._place.derivative()
 
-    def displacement(self, share: float) -> Array:
-        """Return the displacement (3,) after a fraction of the way."""
-        return np.asarray(self._place(share))
+    def pose(self, share: float) -> tuple[Array, Array]:
+        """Return the displacement (3,), m, and the rotation (4,) since the start at a fraction of
+        the way."""
+        return np.asarray(self._place(share)), quaternion_from_rotvec(share * self._turn)
 
-    def displacement_derivative(self, share: float) -> Array:
-        """Return the derivative (3,) of the displacement with respect to the fraction."""
-        return np.asarray(self._rate(share))
-
-    def rotation(self, share: float) -> Array:
-        """Return the rotation (4,) since the start after a fraction of the way."""
-        return quaternion_from_rotvec(share * self._turn)
-
-    def rotation_derivative(self, share: float) -> Array:
-        """Return the angular velocity (3,) with respect to the fraction, rad."""
-        return self._turn
+    def derivative(self, share: float) -> tuple[Array, Array]:
+        """Return the derivatives of both by the fraction: velocity (3,), m, and angular velocity
+        (3,), rad."""
+        return np.asarray(self._rate(share)), self._turn
 
     def travelled_length(self, share: float) -> float:
         """Return the length, m, of a fraction of the way."""
-        return share * self.length
+        return share * self.total_length
 
 
 @dataclass(frozen=True)
@@ -191,16 +185,12 @@ class _LinkPath:
     def tracking_error(self, R: Array, r: Array, progress: float) -> Array:
         """Return the errors (k + l,) from a pose to the pose at the fraction ``progress`` of the
         line."""
-        target = quaternion_multiply(self.path_from_start.rotation(progress), self.start_attitude)
+        displacement, turn = self.path_from_start.pose(progress)
+        target = quaternion_multiply(turn, self.start_attitude)
         found = quaternion_inverse(quaternion_from_matrix(R))
         rotation = rotvec_from_quaternion(quaternion_multiply(target, found))
-        return np.concatenate(
-            [
-                self.displacements
-                @ (self.start_position + self.path_from_start.displacement(progress) - r),
-                self.rotations @ rotation,
-            ]
-        )
+        left = self.start_position + displacement - r
+        return np.append(self.displacements @ left, self.rotations @ rotation)
 
 
 class _LinkPaths:
@@ -235,13 +225,10 @@ class _LinkPaths:
 
     def _scaled_derivative(self, share: float) -> Array:
         """Return the scaled derivative (m,) of the rows by the share of the lines."""
-        rates = [
-            np.append(
-                x.displacements @ x.path_from_start.displacement_derivative(share),
-                x.rotations @ x.path_from_start.rotation_derivative(share),
-            )
-            for x in self._lines
-        ]
+        rates: list[Array] = []
+        for line in self._lines:
+            velocity, omega = line.path_from_start.derivative(share)
+            rates += [line.displacements @ velocity, line.rotations @ omega]
         return np.asarray(np.concatenate(rates) * self._row_scales)
 
     def jacobian(self, q: Array, X: Array) -> Array:
@@ -293,16 +280,13 @@ class _LinkPaths:
         return "the smallest singular value of J* (scaled)", float(value)
 
     def position_text(self, share: float) -> str:
-        line = self._lines[0]
-        way, kind = (
-            line.path_from_start.total_length,
-            "line" if line.path_from_start.is_straight else "path",
-        )
-        if way > _ZERO_DISTANCE:
-            done = line.path_from_start.travelled_length(share)
-            return f"after {done:.6g} of {way:.6g} m of the {kind} of '{line.link}'"
-        turn = float(np.linalg.norm(line.path_from_start.rotation_derivative(share)))
-        return f"after {share * turn:.6g} of {turn:.6g} rad of the rotation of '{line.link}'"
+        link, path = self._lines[0].link, self._lines[0].path_from_start
+        whole, kind = path.total_length, "line" if path.is_straight else "path"
+        if whole > _ZERO_DISTANCE:
+            done = path.travelled_length(share)
+            return f"after {done:.6g} of {whole:.6g} m of the {kind} of '{link}'"
+        turn = float(np.linalg.norm(path.derivative(share)[1]))
+        return f"after {share * turn:.6g} of {turn:.6g} rad of the rotation of '{link}'"
 
 
 @dataclass(frozen=True)
@@ -589,11 +573,11 @@ class ResolvedRateGait(GaitMethod):
         r, quaternion = end_effector_pose(
             self.robot, aim.link, state.position, state.quaternion, state.q
         )
-        before = request.previous
+        before, progress = request.previous, None
         if before is not None and isinstance(before.progress, PathProgress):
-            done = before.progress.travelled_lengths
+            progress, done = before.progress, before.progress.travelled_lengths
             off = np.linalg.norm(before.positions[-len(done) :] - state.q, axis=1)
-            rest = before.progress.route.remaining_after(float(done[np.argmin(off)]))
+            rest = progress.route.remaining_after(float(done[np.argmin(off)]))
         else:
             points = aim.path_values[-1:] if request.correction else aim.path_values
             # Without an attitude any will do: it does not turn.
@@ -604,8 +588,7 @@ class ResolvedRateGait(GaitMethod):
         route = PosePath.from_poses(
             np.vstack([r, rest.positions]), np.vstack([quaternion, rest.quaternions])
         )
-        is_fresh = before is None or not isinstance(before.progress, PathProgress)
-        return route.simplified(tolerance) if is_fresh else route
+        return route.simplified(tolerance) if progress is None else route
 
     def _trace_without_contact(
         self, lines: _LinkPaths, state: RobotState, cancellation: Cancellation
