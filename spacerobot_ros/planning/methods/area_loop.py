@@ -157,7 +157,7 @@ class AreaLoopGait(GaitMethod):
         self.require_rest(state)
         self.require_goal_of_base(goal)
         final = self._clear_goal_shape(request)
-        gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
+        gait = _PlannedMotion.at(state)
         notes: Notes = {"cycles": 0.0}
         progress = None if request.previous is None else request.previous.progress
         if not isinstance(progress, AreaLoopProgress):
@@ -181,7 +181,7 @@ class AreaLoopGait(GaitMethod):
             if planned < self.options.cycles_per_plan:
                 before = len(gait.positions)
                 gait, cycle_notes, cycles = self._add_cycle(
-                    state, gait, target, left, nominal, tolerance.attitude, flown
+                    gait, target, left, nominal, tolerance.attitude, flown
                 )
                 flown += 1
                 notes = {**cycle_notes, "cycles": float(planned + 1)}
@@ -220,17 +220,16 @@ class AreaLoopGait(GaitMethod):
         """Return the time of the cycles for a goal round a nominal shape, s, infinite where links
         come too near, and whether links keep clear without a smaller loop.
         """
-        state = request.state
         nominal, gait, target = self._move_to_nominal(request, final, chosen)
         left = attitude_error(gait.attitudes[-1], target)
         missing, enough = float(np.linalg.norm(left)), request.tolerance.attitude
         if missing <= enough:
             return 0.0, True
-        if self._too_near(gait.positions, self._base_poses(state, gait.positions, gait.attitudes)):
+        if self._too_near_after(gait, 0):
             return math.inf, False
         S, share = self._initial_loop_areas(left, nominal)
         try:
-            clear, _ = self._shrink_until_clear(state, gait, S, share, nominal)
+            clear, _ = self._shrink_until_clear(gait, S, share, nominal)
         except PlanningError:
             return math.inf, False
         loop = self._add_legs(gait, self._edge_ends(edge_path(clear * S, nominal.longest), nominal))
@@ -247,7 +246,6 @@ class AreaLoopGait(GaitMethod):
 
     def _add_cycle(
         self,
-        state: RobotState,
         gait: _PlannedMotion,
         target: Array,
         left: Array,
@@ -255,17 +253,15 @@ class AreaLoopGait(GaitMethod):
         enough: float,
         flown: int,
     ) -> tuple[_PlannedMotion, Notes, float]:
-        """Add one cycle for the turn ``left`` (3,), rad.
+        """Add one cycle for the turn ``left`` (3,), rad; cycles continue until the attitude is off
+        by ``enough`` (rad), and ``flown`` are done.
 
         Also returned are the paper's symbols and the expected number of cycles for the goal.
-
-        The gait begins in ``state``. Cycles continue until the attitude is off by ``enough`` (rad);
-        ``flown`` are done.
         """
         S, share = self._initial_loop_areas(left, nominal)
         missing = float(np.linalg.norm(left))
         cycles = self._count_cycles_within_limits(missing, share, enough, flown)
-        share, too_near = self._shrink_until_clear(state, gait, S, share, nominal)
+        share, too_near = self._shrink_until_clear(gait, S, share, nominal)
         if too_near:
             cycles = self._count_cycles_within_limits(missing, share, enough, flown, too_near)
         for _ in range(_MAX_CYCLE_TRIALS):
@@ -315,18 +311,12 @@ class AreaLoopGait(GaitMethod):
         return cycles
 
     def _shrink_until_clear(
-        self,
-        state: RobotState,
-        gait: _PlannedMotion,
-        S: Array,
-        share: float,
-        nominal: NominalShape,
+        self, gait: _PlannedMotion, S: Array, share: float, nominal: NominalShape
     ) -> tuple[float, str]:
         """Return a share of areas ``S`` (3,), up to a given one, on whose loop links keep clear.
 
-        ``state`` is the start of the gait. The second is the clause on the last loop that was too
-        large; empty where the first one is clear. PlanningError if links come too near on small
-        loops, too.
+        The second is the clause on the last loop that was too large; empty where the first one is
+        clear. PlanningError if links come too near on small loops, too.
         """
         too_near = ""
         if self.clearance is None:
@@ -334,13 +324,16 @@ class AreaLoopGait(GaitMethod):
         for _ in range(_MAX_SHRINKS):
             path = edge_path(share * S, nominal.longest)
             loop = self._add_legs(gait, self._edge_ends(path, nominal))
-            added = slice(len(gait.positions) - 1, None)
-            shapes, attitudes = loop.positions[added], loop.attitudes[added]
-            found = self._too_near(shapes, self._base_poses(state, shapes, attitudes))
+            found = self._too_near_after(loop, len(gait.positions) - 1)
             if not found:
                 return share, too_near
             share, too_near = share / 2, found
         raise PlanningError(f"Even in the smallest of {_MAX_SHRINKS} loops, {too_near}.")
+
+    def _too_near_after(self, gait: _PlannedMotion, tick: int) -> str:
+        """Return the clause about links that come too near from a tick on; empty: none do."""
+        shapes, attitudes = gait.positions[tick:], gait.attitudes[tick:]
+        return self._too_near(shapes, self._base_poses(gait.start, shapes, attitudes))
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
         """Return the number of cycles left for a missing turn (rad), to first order."""
@@ -377,11 +370,11 @@ class AreaLoopGait(GaitMethod):
         """
         state, edge_time = request.state, self.options.edge_time
         nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
-        gait = _PlannedMotion(state.q[np.newaxis], state.quaternion[np.newaxis])
-        start = _PlannedMotion(nominal.shape[np.newaxis], _IDENTITY[np.newaxis])
+        gait = self._add_legs(_PlannedMotion.at(state), [(nominal.shape, edge_time)])
+        start = _PlannedMotion.at(RobotState(np.zeros(3), _IDENTITY, nominal.shape))
         aside = self._add_legs(start, [] if final is None else [(final, edge_time)]).attitudes[-1]
         target = quaternion_multiply(request.goal.quaternion, quaternion_inverse(aside))
-        return nominal, self._add_legs(gait, [(nominal.shape, edge_time)]), target
+        return nominal, gait, target
 
     def _add_legs(self, gait: _PlannedMotion, ends: LegEnds) -> _PlannedMotion:
         shapes = straight_motion(
@@ -389,9 +382,8 @@ class AreaLoopGait(GaitMethod):
         )
         # A robot at rest has no momentum: its attitudes depend on its shapes alone.
         attitudes = self._prediction.attitudes(shapes, gait.attitudes[-1], np.zeros(3))
-        return _PlannedMotion(
-            np.vstack([gait.positions, shapes[1:]]), np.vstack([gait.attitudes, attitudes[1:]])
-        )
+        positions = np.vstack([gait.positions, shapes[1:]])
+        return _PlannedMotion(gait.start, positions, np.vstack([gait.attitudes, attitudes[1:]]))
 
     def _build_schedule(
         self,
@@ -419,10 +411,15 @@ class AreaLoopGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _PlannedMotion:
-    """Shapes (N + 1, n) at the ticks so far, and the attitudes (N + 1, 4) of the base."""
+    """Shapes (N + 1, n) at the ticks from a start, and the attitudes (N + 1, 4) of the base."""
 
+    start: RobotState
     positions: Array
     attitudes: Array
+
+    @classmethod
+    def at(cls, start: RobotState) -> _PlannedMotion:
+        return cls(start, start.q[np.newaxis], start.quaternion[np.newaxis])
 
 
 @dataclass(frozen=True)

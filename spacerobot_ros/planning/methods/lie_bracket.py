@@ -156,24 +156,16 @@ class LieBracketGait(GaitMethod):
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
         dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):
-            dz = self._keep_strokes(P, shift, z0, dz, lower, upper, enough)
+            dz = self._keep_strokes(P, shift, state.q, dz, enough)
         z_f = state.q.copy()
         z_f[self.sliders] = np.clip(z0 + dz, lower, upper)
         return z_f
 
-    def _keep_strokes(
-        self,
-        P: Array,
-        shift: Array,
-        z0: Array,
-        dz: Array,
-        lower: Array,
-        upper: Array,
-        enough: float,
-    ) -> Array:
+    def _keep_strokes(self, P: Array, shift: Array, q: Array, dz: Array, enough: float) -> Array:
         """Spread a displacement over four or more sliders; name a slider of too short a stroke."""
         from scipy.optimize import lsq_linear  # scipy is slow to import, and few goals need it.
 
+        z0, lower, upper = (x[self.sliders] for x in (q, self.robot.lower, self.robot.upper))
         # The solver needs different bounds, so the range of a slider at its end is widened
         # slightly.
         room = 1e-12 * (1.0 + np.abs(upper - lower))
