@@ -16,9 +16,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 
-import casadi as ca
 import numpy as np
 
 from spacerobot_ros.errors import PlanningError, counted
@@ -27,6 +25,7 @@ from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import (
     ZERO_TURN_PER_AREA,
     Controllability,
+    curvatures,
     shape_box,
 )
 
@@ -41,12 +40,6 @@ _MAX_PANEL_ANGLE = 0.5
 
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(10)
 _GAUSS_NODES, _GAUSS_WEIGHTS = (_GAUSS_NODES + 1) / 2, _GAUSS_WEIGHTS / 2
-
-_FITTED_ANGLES: Array = 2 * math.pi / 3 * np.arange(3.0)
-"""Three angles that determine a trigonometric polynomial of degree one, rad."""
-
-_HARMONIC_DERIVATIVE = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""``h @ _HARMONIC_DERIVATIVE`` is the derivative of ``h = [1, cos, sin]``."""
 
 _UNIT_SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 """Corners of the unit square, counter-clockwise."""
@@ -163,49 +156,42 @@ class PlanarPhase:
     def __init__(self, robot: SpaceRobot) -> None:
         self.axis = planar_axis(robot)
         """Axis (3,) of positive rotations, a unit vector in base components."""
-        psi = ca.SX.sym("psi", robot.n)
-        D, D_q = robot.function("locked_inertia", compile=False)(psi)
-        axis = ca.DM(self.axis)
-        # A = D^-1 D_q, as no inertia couples the axis to other axes.
-        N_D = ca.vertcat((axis.T @ D_q).T, axis.T @ D @ axis)
-        self._N_D = ca.Function("N_D", [psi], [ca.densify(N_D)])
+        self.robot = robot.interpreted
+        """The model, not compiled: that would take longer than planning."""
 
     def turns_by_legs(self, starts: Array, ends: Array) -> Array:
         """Return the rotations (L,) along straight legs in shape space, from starts to ends (L,
         n)."""
-        return _integrate_legs(self._connection_row, starts, ends)
+        moves = ends - starts
+        count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _MAX_PANEL_ANGLE))
+        along = ((np.arange(count)[:, np.newaxis] + _GAUSS_NODES) / count).ravel()
+        weights = np.tile(_GAUSS_WEIGHTS, count) / count
+        shapes = starts[:, np.newaxis] + along[:, np.newaxis] * moves[:, np.newaxis]
+        A = self.robot.function("connection")(shapes.reshape(-1, self.robot.n).T).full()[3:]
+        s = (self.axis @ A).reshape(shapes.shape)
+        return np.asarray(-np.einsum("p,lpn,ln->l", weights, s, moves))
 
     def plane(self, psi: Array, i: int, j: int) -> PhasePlane:
         """Return the phase in the plane of joints i and j, with the other joints at rest at ``psi``
         (n,)."""
-        shapes = np.tile(psi, (9, 1))
-        shapes[:, i], shapes[:, j] = np.repeat(_FITTED_ANGLES, 3), np.tile(_FITTED_ANGLES, 3)
-        samples = self._N_D(shapes.T).full()[[i, j, -1]].reshape(3, 3, 3)
-        fit: Array = np.linalg.inv(_harmonics(_FITTED_ANGLES)).astype(float)
-        return PhasePlane(fit @ samples @ fit.T)
-
-    def _connection_row(self, shapes: Array) -> Array:
-        """Return ``s`` (..., n) at shapes (..., n)."""
-        N_D = self._N_D(shapes.reshape(-1, shapes.shape[-1]).T).full()
-        return np.asarray((N_D[:-1] / N_D[-1]).T).reshape(shapes.shape)
+        return PhasePlane(self, psi, i, j)
 
 
 class PhasePlane:
-    """Base rotations due to two joints, in closed form.
-
-    Each joint rotates one rigid part of the robot relative to the rest, and ``N_i``, ``N_j`` and
-    ``D`` are sums of products of two vectors, each fixed in one body. These are trigonometric
-    polynomials of degree one in either angle: ``f = h(psi_i)' C h(psi_j)`` with ``h(x) = [1, cos x,
-    sin x]``.
+    """Base rotations due to two joints i and j.
 
     Parameters
     ----------
-    coefficients
-        (3, 3, 3) ``C`` of ``N_i``, ``N_j`` and ``D``, kg m^2.
+    phase
+        Base rotations of the robot.
+    psi
+        (n,) shape at which the other joints rest, rad.
+    i, j
+        Indices of the two joints.
     """
 
-    def __init__(self, coefficients: Array) -> None:
-        self._C = coefficients
+    def __init__(self, phase: PlanarPhase, psi: Array, i: int, j: int) -> None:
+        self._phase, self._psi, self._pair = phase, psi, [i, j]
 
     def curvature(self, points: Array) -> Array:
         """Return the base rotation per area of small loops, 1/rad, (...), at points (..., 2).
@@ -213,49 +199,27 @@ class PhasePlane:
         Loops are counter-clockwise in the plane (psi_i, psi_j): the result is ``-H``, eq. (10),
         with ``H = ds_j/dpsi_i - ds_i/dpsi_j``.
         """
-        left, right = _harmonics(points[..., 0]), _harmonics(points[..., 1])
-        N_i, N_j, D = self._polynomials(left, right)
-        _, N_j_i, D_i = self._polynomials(left @ _HARMONIC_DERIVATIVE, right)
-        N_i_j, _, D_j = self._polynomials(left, right @ _HARMONIC_DERIVATIVE)
-        return np.asarray((N_i_j * D - N_i * D_j - N_j_i * D + N_j * D_i) / D**2)
+        i, j = self._pair
+        K = curvatures(self._phase.robot, self._shapes(points))[:, :, i, j]
+        return np.asarray(K @ self._phase.axis).reshape(points.shape[:-1])
 
     def turns_by_squares(self, centres: Array, sides: Array) -> Array:
         """Return the base rotations (R,) caused by counter-clockwise squares with centres (R,
         2)."""
         corners = square_corners(centres, sides)
-        ends = np.roll(corners, -1, axis=1)
-        legs = _integrate_legs(self._connection_row, corners.reshape(-1, 2), ends.reshape(-1, 2))
-        return legs.reshape(-1, 4).sum(axis=1)
+        ends = self._shapes(np.roll(corners, -1, axis=1))
+        return self._phase.turns_by_legs(self._shapes(corners), ends).reshape(-1, 4).sum(axis=1)
 
-    def _connection_row(self, points: Array) -> Array:
-        """Return ``(s_i, s_j)`` (..., 2) at points (..., 2)."""
-        N_i, N_j, D = self._polynomials(_harmonics(points[..., 0]), _harmonics(points[..., 1]))
-        return np.stack([N_i / D, N_j / D], axis=-1)
-
-    def _polynomials(self, left: Array, right: Array) -> tuple[Array, Array, Array]:
-        """Return ``N_i``, ``N_j``, ``D`` (...) at harmonics (..., 3) of the two angles."""
-        N_i, N_j, D = (np.sum(left @ C * right, axis=-1) for C in self._C)
-        return N_i, N_j, D
+    def _shapes(self, points: Array) -> Array:
+        """Return the shapes (N, n) at points (..., 2)."""
+        shapes = np.tile(self._psi, (points.size // 2, 1))
+        shapes[:, self._pair] = points.reshape(-1, 2)
+        return shapes
 
 
 def square_corners(centres: Array, sides: Array) -> Array:
     """Return the corners (R, 4, 2) of squares, counter-clockwise; centres (R, 2), sides (R,)."""
     return centres[:, np.newaxis] + np.multiply.outer(sides, _UNIT_SQUARE)
-
-
-def _harmonics(angles: Array) -> Array:
-    """Return ``[1, cos, sin]`` (..., 3) of angles (...)."""
-    return np.stack([np.ones_like(angles), np.cos(angles), np.sin(angles)], axis=-1)
-
-
-def _integrate_legs(s: Callable[[Array], Array], starts: Array, ends: Array) -> Array:
-    """Return the integrals (L,) of ``-s' dpsi`` along straight legs from (L, n) to (L, n)."""
-    moves = ends - starts
-    count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _MAX_PANEL_ANGLE))
-    along = ((np.arange(count)[:, np.newaxis] + _GAUSS_NODES) / count).ravel()
-    weights = np.tile(_GAUSS_WEIGHTS, count) / count
-    shapes = starts[:, np.newaxis] + along[:, np.newaxis] * moves[:, np.newaxis]
-    return np.asarray(-np.einsum("p,lpn,ln->l", weights, s(shapes), moves))
 
 
 def centre_box(at: Array, lower: Array, upper: Array) -> Array:
