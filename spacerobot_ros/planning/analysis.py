@@ -13,6 +13,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError, counted
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.controllability import (
+    MAX_CONDITION,
     Controllability,
     best_sampled_brackets,
     best_triple,
@@ -174,6 +175,5 @@ def _condition_numbers(robot: SpaceRobot) -> Array:
         return np.full(_CONDITION_SAMPLE_COUNT, np.inf)
     K = curvatures(robot, sample_shapes(robot, _CONDITION_SAMPLE_COUNT))
     matrices = np.array([best_triple(at, range(robot.n))[1] for at in K])
-    values = np.linalg.svd(matrices, compute_uv=False)
-    inverse = values[:, 2] / np.maximum(values[:, 0], 1e-300)
-    return np.asarray(np.where(inverse > 1e-6, 1 / np.maximum(inverse, 1e-300), np.inf))
+    conditions = np.linalg.cond(matrices)
+    return np.where(conditions < MAX_CONDITION, conditions, np.inf)

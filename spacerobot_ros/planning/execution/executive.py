@@ -146,14 +146,12 @@ class Executive:
     @property
     def unfinished_goals(self) -> frozenset[str]:
         """Ids of goals being pursued, being planned, or waiting for a plan."""
-        active = self._active_goal
-        return self.waiting_goals | ({active.identified.goal_id} if active is not None else set())
+        return frozenset(goal.goal_id for goal in self._goals if goal is not None)
 
     @property
     def waiting_goals(self) -> frozenset[str]:
         """Ids of goals being planned or waiting for a plan, including a goal being replanned."""
-        goals = (self._new_goal, self._planned_goal)
-        return frozenset(goal.goal_id for goal in goals if goal is not None)
+        return frozenset(goal.goal_id for goal in self._goals[:2] if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
         """Return the current activity for a goal, and the expected time, s, until the goal is
@@ -161,11 +159,11 @@ class Executive:
 
         None if no schedule leads to the goal yet.
         """
-        active, planned = self._active_goal, self._planned_goal
+        active, job = self._active_goal, self._job
         if active is not None and active.identified.goal_id == goal_id:
             left = max(0.0, active.time_left(self._stamp_ns))
             return self.phase.value, left + active.schedule.remaining
-        if planned is not None and planned.goal_id == goal_id:
+        if job is not None and job.identified.goal_id == goal_id:
             return Phase.PLANNING.value, None
         return Phase.MEASURING.value, None
 
@@ -851,12 +849,13 @@ class Executive:
     @property
     def _latest_goal(self) -> IdentifiedGoal | None:
         """The latest proposed goal that is not decided."""
-        active = None if self._active_goal is None else self._active_goal.identified
-        return self._new_goal or self._planned_goal or active
+        return next((goal for goal in self._goals if goal is not None), None)
 
     @property
-    def _planned_goal(self) -> IdentifiedGoal | None:
-        return None if self._job is None else self._job.identified
+    def _goals(self) -> tuple[IdentifiedGoal | None, ...]:
+        """The waiting goal, the goal being planned, and the active goal; None: there is none."""
+        pursued = (self._job, self._active_goal)
+        return self._new_goal, *(None if each is None else each.identified for each in pursued)
 
     def _tolerance_of(self, identified: IdentifiedGoal) -> Tolerance:
         return identified.tolerance or self.config.tolerance

@@ -454,24 +454,20 @@ def describe_remaining_error(
     }
     if len(error.shape):
         parts["shape"] = quantity(error.max_joint_error, AT_JOINTS)
-    if error.end_effectors:
+    controlled = [text for part, text in parts.items() if part in controls]
+    body = enumeration(controlled) if controlled else ""
+    hand, hands, several = "", "end_effectors" in controls, len(error.end_effectors) > 1
+    if hands and error.end_effectors:
         distance, angle = error.largest_end_effector_distance, error.largest_end_effector_angle
         # Goals of positions alone leave no angle.
         turn = f" and {quantity(angle, 'rad')}" if angle > 0 else ""
-        parts["end_effectors"] = quantity(distance, "m") + turn
-    several = len(error.end_effectors) > 1
-    hand = parts.pop("end_effectors", "") if "end_effectors" in controls else ""
-    if hand:
-        hand = f"end-effectors at most {hand}" if several else f"end-effector {hand}"
-    controlled = [text for part, text in parts.items() if part in controls]
-    body = enumeration(controlled) if controlled else ""
+        hand = f"end-effector{'s at most' if several else ''} {quantity(distance, 'm')}{turn}"
     remaining = f"{body or hand} from the goal"
     if body and hand:
         remaining += f", {hand} from {'theirs' if several else 'its goal'}"
     parts_left = () if goal is None else uncontrolled_parts(goal, controls)
     notes = []
     if tolerance is not None:
-        hands = "end_effectors" in controls
         limits = (
             (quantity(tolerance.position, "m"), hands or "position" in controls),
             (quantity(tolerance.attitude, "rad"), hands or "attitude" in controls),

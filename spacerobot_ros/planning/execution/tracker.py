@@ -230,10 +230,8 @@ class TrajectoryTracker:
     def use_robot(self, robot: SpaceRobot) -> None:
         """Track subsequent schedules for a robot that has the same joints but other masses."""
         self._robot = robot
-        self._sensitivity = PathSensitivity(robot) if self._config.replanning > 0 else None
-        self._mass_estimate = MassEstimate(
-            0 if self._sensitivity is None else self._sensitivity.count
-        )
+        self._sensitivity = PathSensitivity(robot)
+        self._mass_estimate = MassEstimate(self._sensitivity.count)
 
     @property
     def is_active(self) -> bool:
@@ -254,7 +252,7 @@ class TrajectoryTracker:
         gain = config.shape_gain if self._commands_plant else 0.0
         self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
         sensitivity = None
-        if average and self._sensitivity is not None:
+        if average and config.replanning > 0:
             sensitivity = self._sensitivity.path_derivatives(schedule)
         self.path_check = PathCheck(
             self._robot, schedule, stamp_ns, config, average, sensitivity, self._mass_estimate
@@ -377,9 +375,6 @@ class TrajectoryTracker:
             if math.isfinite(q.dot(q)):
                 self.setpoint.position[:] = q
             self._holds_position = True
-            if not len(self._wheels):
-                self.setpoint.velocity[:] = 0.0
-                return
             kept = self.setpoint.velocity[self._wheels]
             if not self._spins and qdot is not None and np.all(np.isfinite(qdot)):
                 kept, self._spins = qdot[self._wheels], True
@@ -465,13 +460,11 @@ class StuckJointWatch:
         if not due.any():
             return []
         commanded, measured = (
-            np.diff(self._commanded_range, axis=0)[0],
-            np.diff(self._measured_range, axis=0)[0],
+            np.ptp(each, axis=0) for each in (self._commanded_range, self._measured_range)
         )
-        stuck = due & (measured <= _STUCK_SHARE * commanded) & (commanded > self._band)
-        moved = commanded > self._band
-        still = measured[moved] <= _STUCK_SHARE * commanded[moved]
-        none_moves = np.count_nonzero(moved) > 1 and still.all()
+        moved, still = commanded > self._band, measured <= _STUCK_SHARE * commanded
+        stuck = due & still & moved
+        none_moves = np.count_nonzero(moved) > 1 and still[moved].all()
         if none_moves and self._window[due].max() < self._max_window:
             # Joints do not all jam at once: perhaps commands do not arrive for a while.
             stuck[:] = False

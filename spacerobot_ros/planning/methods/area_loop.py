@@ -124,7 +124,6 @@ class AreaLoopGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         self._nominal = NominalShapeChooser(
             robot,

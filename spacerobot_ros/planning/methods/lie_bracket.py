@@ -95,7 +95,6 @@ class LieBracketGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         robot = self.robot
         # A cycle is a whole number of ticks, so all cycles have the same commands and rotation.
         self.ticks_a_cycle = max(

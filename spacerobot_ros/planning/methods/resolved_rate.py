@@ -503,7 +503,6 @@ class ResolvedRateGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         self._limits = MotionLimits.of(self.robot, self.options, self.name)
         if len(self.options.waypoints) % 3:
             raise ParameterError(

@@ -138,7 +138,6 @@ class SquarePathGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        """Compute what depends only on the robot and the options; see :meth:`GaitMethod.setup`."""
         robot, chosen = self.robot, self.options
         t1, t2, t3, t4 = chosen.t1, chosen.t2, chosen.t3, chosen.t4
         instants = (0.0, t1, t2, t3, t4)
