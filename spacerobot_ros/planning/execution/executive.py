@@ -11,7 +11,7 @@ Other modules do the work of the phases: :mod:`.tracker` computes the commands a
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from spacerobot_ros.errors import PlanningError, counted, sentence_case
@@ -462,7 +462,7 @@ class Executive:
             off = describe_remaining_error(error, active.schedule.controls)
             active.corrections += 1
             message = f"The remaining motion is planned: {off}."
-            self._add_event(EventKind.CORRECTION, message, active.identified, 1, active.counted)
+            self._add_event(EventKind.CORRECTION, message, active.identified, 1, **active.counted)
         self._request_plan(PlanJob(active.identified, active.next_plan, error), state)
 
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
@@ -585,7 +585,7 @@ class Executive:
         reason = job.reason.value
         message = f"A plan takes over in motion: {reason}."
         about = {"reason": reason, **_about(schedule)}
-        self._add_event(EventKind.PLAN_TAKEN_OVER, message, job.identified, about=about)
+        self._add_event(EventKind.PLAN_TAKEN_OVER, message, job.identified, 0, **about)
         self._execute_schedule(schedule, begins_ns, event=Event.TAKEN_OVER)
 
     def _handle_late_plan(self, job: PlanJob) -> None:
@@ -594,8 +594,7 @@ class Executive:
         self._in_motion_attempts += job.reason.is_for_new_goal
         self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
         message = "The plan was not ready in time to take over."
-        about = {"reason": job.reason.value}
-        self._add_warning(EventKind.PLAN_LATE, message, job.identified, about)
+        self._add_warning(EventKind.PLAN_LATE, message, job.identified, reason=job.reason.value)
 
     # -- plans: request, result, schedule -----------------------------------------------------
 
@@ -648,10 +647,10 @@ class Executive:
         )
         reason = job.reason.value
         message = f"Planning: {reason}."
-        self._add_event(EventKind.PLAN_STARTED, message, job.identified, about={"reason": reason})
+        self._add_event(EventKind.PLAN_STARTED, message, job.identified, reason=reason)
         fresh = job.reason.is_for_new_goal or not self._tracker.is_active
         if fresh and self._worker.plans_in_background:
-            about = (PlannerState.PLANNING, f"Planning: {reason}.")
+            about = PlannerState.PLANNING, message
             status = PlannerStatus.of_goal(*about, job.identified)
             self.outputs.append(status if active is None else active.status(*about))
         task = PlanningTask(
@@ -680,7 +679,7 @@ class Executive:
         if isinstance(result, Planned):
             message = f"The plan is {result.schedule.title}."
             about = _about(result.schedule)
-            self._add_event(EventKind.PLAN_READY, message, job.identified, about=about)
+            self._add_event(EventKind.PLAN_READY, message, job.identified, 0, **about)
         self._act_on_result(job, result)
 
     def _act_on_result(self, job: PlanJob, result: Planned | Refused) -> None:
@@ -770,7 +769,7 @@ class Executive:
     def _correct_path(self, active: ActiveGoal, error: TrackingError) -> None:
         active.corrections += 1
         message = f"{error}: the remaining motion is replanned."
-        self._add_warning(EventKind.CORRECTION, message, active.identified, active.counted)
+        self._add_warning(EventKind.CORRECTION, message, active.identified, **active.counted)
 
     # -- ends of schedules and goals ----------------------------------------------------------
 
@@ -817,7 +816,7 @@ class Executive:
         self._stop_motion(Event.JOINTS_STUCK)
         names = ", ".join(self._robot.joint_names[i] for i in tracker.stuck)
         message = f"Stuck: {names}. The remaining motion is planned without stuck joints."
-        self._add_warning(EventKind.STUCK_JOINT, message, active.identified, {"joints": names})
+        self._add_warning(EventKind.STUCK_JOINT, message, active.identified, joints=names)
 
     def _drop_plan(self) -> None:
         """Drop the requested or ready plan; its new goal, if any, waits again."""
@@ -871,21 +870,16 @@ class Executive:
         self.outputs.append(Notice(level, message))
 
     def _add_warning(
-        self, kind: EventKind, message: str, about: IdentifiedGoal, values: Mapping[str, str]
+        self, kind: EventKind, message: str, goal: IdentifiedGoal, **about: str
     ) -> None:
         self._add_notice("warning", message)
-        self._add_event(kind, message, about, 1, values)
+        self._add_event(kind, message, goal, 1, **about)
 
     def _add_event(
-        self,
-        kind: EventKind,
-        message: str,
-        identified: IdentifiedGoal,
-        level: int = 0,
-        about: Mapping[str, str] | None = None,
+        self, kind: EventKind, message: str, goal: IdentifiedGoal, level: int = 0, **about: str
     ) -> None:
         now = self._stamp_ns / SECOND
-        self.outputs.append(FlightEvent(kind, message, level, now, identified.goal_id, about or {}))
+        self.outputs.append(FlightEvent(kind, message, level, now, goal.goal_id, about))
 
     def _add_abort(self, message: str, goal: IdentifiedGoal | None) -> None:
         goal_id = "" if goal is None else goal.goal_id

@@ -449,9 +449,8 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
     """Return the path around ``areas`` (3,), with edges of at most ``longest`` (3,) if possible.
 
     The cube-like path is used if its edges are short enough, or shorter than those of the
-    rectangles.
-    If the areas are too large, ``excess`` is greater than 1; edges scale with the square root of
-    the areas.
+    rectangles. If the areas are too large, ``edge_ratio`` is greater than 1; edges scale with the
+    square root of the areas.
     """
     areas = np.where(np.abs(areas) > _NEGLIGIBLE_AREA_SHARE * np.abs(areas).max(), areas, 0.0)
     rectangles = _rectangle_path(areas, longest)

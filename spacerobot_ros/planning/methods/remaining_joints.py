@@ -186,12 +186,11 @@ class RemainingJointsGait(GaitMethod):
             )
 
     def _describe_stuck_joints(self) -> str:
-        places = []
-        for joint in self.robot.description.movable_joints:
-            if joint.name in self._stuck:
-                place = f"{self._stuck[joint.name]:.4g} {joint.unit}"
-                places.append(f"joint '{joint.name}' is stuck at {place}")
-        return " and ".join(places)
+        return " and ".join(
+            f"joint '{joint.name}' is stuck at {self._stuck[joint.name]:.4g} {joint.unit}"
+            for joint in self.robot.description.movable_joints
+            if joint.name in self._stuck
+        )
 
 
 def _options_of_remaining(options: Any, stuck: npt.NDArray[np.bool_], names: Sequence[str]) -> Any:
