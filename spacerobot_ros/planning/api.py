@@ -118,13 +118,17 @@ def plan(
     goal = goal.for_robot(robot.description)
     method = method or (PATH_METHOD if goal.has_path else END_EFFECTOR_METHOD)
     options_of_method = {method: method_options(method, options)}
+    described = robot.description
+    if world is not None:
+        world = world if isinstance(world, RobotDescription) else load_world(world)
+        described = with_world(described, world)
     planner = build_method(
         method,
         robot,
         control_period,
         integration_step,
         options_of_method,
-        Clearance.wanted(_among_obstacles(robot, world), clearance),
+        Clearance.wanted(described, clearance),
     )
     state = _start_state(robot, start)
     for name, given in (
@@ -141,16 +145,6 @@ def _momentum(name: str, given: npt.ArrayLike) -> npt.NDArray[np.float64]:
     if momentum.shape != (3,) or not np.all(np.isfinite(momentum)):
         raise ParameterError(f"The {name} is {momentum.tolist()}; it must be three finite numbers.")
     return momentum
-
-
-def _among_obstacles(
-    robot: SpaceRobot, world: RobotDescription | str | Path | None
-) -> RobotDescription:
-    if world is None:
-        return robot.description
-    if not isinstance(world, RobotDescription):
-        world = load_world(world)
-    return with_world(robot.description, world)
 
 
 def end_effector_goals(

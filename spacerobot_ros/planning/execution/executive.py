@@ -570,10 +570,15 @@ class Executive:
         job = self._job
         if job is None or job.take_over is None or self._stamp_ns < job.take_over.stamp_ns:
             return
-        if self._ready_plan is None:
-            self._handle_late_plan(job)
-        else:
+        if self._ready_plan is not None:
             self._switch_schedule(self._ready_plan)
+            return
+        # The present schedule continues; a new goal is planned once more.
+        self._drop_plan()
+        self._in_motion_attempts += job.reason.is_for_new_goal
+        self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
+        message = "The plan was not ready in time to take over."
+        self._add_warning(EventKind.PLAN_LATE, message, job.identified, reason=job.reason.value)
 
     def _switch_schedule(self, schedule: GaitSchedule) -> None:
         job, self._job, self._ready_plan = self._job, None, None
@@ -587,14 +592,6 @@ class Executive:
         about = {"reason": reason, **_about(schedule)}
         self._add_event(EventKind.PLAN_TAKEN_OVER, message, job.identified, 0, **about)
         self._execute_schedule(schedule, begins_ns, event=Event.TAKEN_OVER)
-
-    def _handle_late_plan(self, job: PlanJob) -> None:
-        """Continue along the present schedule; plan for a new goal once more."""
-        self._drop_plan()
-        self._in_motion_attempts += job.reason.is_for_new_goal
-        self._change_phase(Event.PLAN_LATE, Phase.EXECUTING)
-        message = "The plan was not ready in time to take over."
-        self._add_warning(EventKind.PLAN_LATE, message, job.identified, reason=job.reason.value)
 
     # -- plans: request, result, schedule -----------------------------------------------------
 
@@ -731,7 +728,10 @@ class Executive:
             failed = active.failed(job.error, tolerance, f": {why} Remaining")
             self._end_goal(failed, Event.REFUSED)
             return
-        self._change_phase(Event.REFUSED, self._phase_without_plan())
+        target = self._phase_at_rest()
+        if self._tracker.is_active:
+            target = Phase.BRAKING if self._tracker.is_braking else Phase.EXECUTING
+        self._change_phase(Event.REFUSED, target)
 
     def _accept_goal(self, active: ActiveGoal) -> None:
         self._active_goal, self._tracker.stuck = active, []
@@ -824,11 +824,6 @@ class Executive:
         job, self._job, self._ready_plan = self._job, None, None
         if job is not None and job.reason.is_for_new_goal:
             self._new_goal = self._new_goal or job.identified
-
-    def _phase_without_plan(self) -> Phase:
-        if self._tracker.is_active:
-            return Phase.BRAKING if self._tracker.is_braking else Phase.EXECUTING
-        return self._phase_at_rest()
 
     def _phase_at_rest(self) -> Phase:
         if self._new_goal is not None:

@@ -343,7 +343,6 @@ class MassEstimate:
         # Information matrix and vector of the prior and of all earlier paths.
         self._information = (_POSE_NOISE / _PRIOR_DEVIATION) ** 2 * np.eye(count)
         self._vector = np.zeros(count)
-        self._errors: Array | None = None
         self._clear_path()
 
     def _clear_path(self) -> None:
@@ -351,7 +350,7 @@ class MassEstimate:
         self._poses = 0
         self._sum_J, self._sum_y = np.zeros((6, count)), np.zeros(6)
         self._squares, self._products = np.zeros((count, count)), np.zeros(count)
-        self._errors = None
+        self._errors: Array | None = None
 
     def begin_path(self) -> None:
         """Start a new path, but keep the information from earlier paths."""

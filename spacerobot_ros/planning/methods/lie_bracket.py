@@ -191,33 +191,31 @@ class LieBracketGait(GaitMethod):
         raise UnreachableError(message, Proof.LIMITS)
 
     def _slide_shapes(self, z0: Array, z_f: Array) -> Array:
-        """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10)."""
-        displacement = z_f - z0
+        """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10).
+
+        t1 is longer for slow servos: the peak speed is twice the mean.
+        """
+        displacement, t1, longest = z_f - z0, self.options.t1, self.options.longest
         if np.abs(displacement).max() <= _ZERO_MOTION:
             return z_f[np.newaxis].copy()
-        t1 = self._slide_time(displacement)
-        ticks = max(math.ceil(t1 / self.control_period - 1e-9), 4 * self.options.n1)
-        phase = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
-        n1 = self.options.n1
-        progress = phase - np.sin(4 * np.pi * n1 * phase) / (4 * np.pi * n1)
-        shapes = z0 + progress * displacement
-        shapes[-1] = z_f
-        return shapes
-
-    def _slide_time(self, displacement: Array) -> float:
-        """Return t1 (s), longer for slow servos: the peak speed is twice the mean."""
-        slowest, longest = self.options.t1, self.options.longest
         for name, distance, rate in zip(
             self.robot.joint_names, np.abs(displacement), self.robot.velocity_limit, strict=True
         ):
-            if distance > _ZERO_MOTION and 2 * distance > rate * longest:
+            if distance <= _ZERO_MOTION:
+                continue
+            if 2 * distance > rate * longest:
                 raise PlanningError(
                     f"The slide would take more than {longest:.6g} s: joint '{name}' must move "
                     f"{distance:.4g} m at no more than {rate:.4g} m/s."
                 )
-            if distance > _ZERO_MOTION:
-                slowest = max(slowest, 2 * distance / rate)
-        return float(slowest)
+            t1 = max(t1, float(2 * distance / rate))
+        n1 = self.options.n1
+        ticks = max(math.ceil(t1 / self.control_period - 1e-9), 4 * n1)
+        phase = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
+        progress = phase - np.sin(4 * np.pi * n1 * phase) / (4 * np.pi * n1)
+        shapes = z0 + progress * displacement
+        shapes[-1] = z_f
+        return shapes
 
     def _plan_turn(
         self, quaternion: Array, z_f: Array, request: PlanRequest

@@ -271,7 +271,10 @@ class NominalShapeChooser:
                 roomy = self._is_roomy(shapes)
                 if roomy.any():
                     measures = np.where(roomy, measures, 0.0)
-            best = _most_central_index(at, measures, (lower + upper) / 2)
+            # Of equally good shapes, the most central one.
+            good = np.flatnonzero(measures >= (1 - _EQUAL_MEASURE_TOLERANCE) * measures.max())
+            off_centre = np.linalg.norm(at[good] - (lower + upper) / 2, axis=1)
+            best = int(good[np.argmin(off_centre)])
             step = step / 2
             at = np.clip(at[best] + step * _NEIGHBOUR_OFFSETS, lower, upper)
         # The search ends with the best point in the centre of its neighbourhood.
@@ -312,11 +315,6 @@ def _worst_axis_turn(M: Array, longest: Array) -> Array:
     """Return the turn (...) of the base about the worst axis by the largest loops, rad."""
     areas = np.stack([longest[..., i] * longest[..., j] for i, j in JOINT_PLANES], axis=-1)
     return np.asarray(np.linalg.svd(M * areas[..., np.newaxis, :], compute_uv=False)[..., 2])
-
-
-def _most_central_index(at: Array, measures: Array, middle: Array) -> int:
-    good = np.flatnonzero(measures >= (1 - _EQUAL_MEASURE_TOLERANCE) * measures.max())
-    return int(good[np.argmin(np.linalg.norm(at[good] - middle, axis=1))])
 
 
 def _list_triples(robot: SpaceRobot, names: Sequence[str]) -> list[Triple]:

@@ -182,16 +182,6 @@ class _LinkPath:
     start_attitude: Array
     path_from_start: _SmoothPath | RoundedPath
 
-    def tracking_error(self, R: Array, r: Array, progress: float) -> Array:
-        """Return the errors (k + l,) from a pose to the pose at the fraction ``progress`` of the
-        line."""
-        displacement, turn = self.path_from_start.pose(progress)
-        target = quaternion_multiply(turn, self.start_attitude)
-        found = quaternion_inverse(quaternion_from_matrix(R))
-        rotation = rotvec_from_quaternion(quaternion_multiply(target, found))
-        left = self.start_position + displacement - r
-        return np.append(self.displacements @ left, self.rotations @ rotation)
-
 
 class _LinkPaths:
     """The lines of all links of a goal, and how the joints move the links along them.
@@ -247,11 +237,16 @@ class _LinkPaths:
     def least_correction(self, q: Array, X: Array, progress: float) -> tuple[Array, float]:
         """Return the smallest joint motion (n,) that brings the links onto their lines, and the
         scaled error."""
-        R_X, missing = matrix_from_quaternion(X), []
+        R_X, missing = matrix_from_quaternion(X), list[Array]()
         r_BC = self._robot.center_of_mass(q)
         for line in self._lines:
             R, r = self._robot.link_pose(line.link, q)
-            missing.append(line.tracking_error(R_X @ R, R_X @ (r - r_BC), progress))
+            displacement, turn = line.path_from_start.pose(progress)
+            target = quaternion_multiply(turn, line.start_attitude)
+            found = quaternion_inverse(quaternion_from_matrix(R_X @ R))
+            rotation = rotvec_from_quaternion(quaternion_multiply(target, found))
+            left = line.start_position + displacement - R_X @ (r - r_BC)
+            missing += [line.displacements @ left, line.rotations @ rotation]
         miss = np.concatenate(missing) * self._row_scales
         least = np.linalg.lstsq(self.scaled_jacobian(q, X), miss, rcond=None)[0]
         return self.joint_scales * least, float(np.linalg.norm(miss))

@@ -172,23 +172,30 @@ class SquarePathGait(GaitMethod):
         step_1 = float(self._phase.turns_by_legs(state.q[np.newaxis], psi_e[np.newaxis])[0])
         # Full turns do not change the attitude, so the shorter way round is taken.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
-        loop = None
+        duration_1, duration_2, duration_3, duration_4 = self._durations
+        legs = [(psi_e, duration_1)]
+        loop_notes: Notes = {"loops": 0.0}
         if abs(wanted) > max(_ZERO_ROTATION_ANGLE, _MIN_CORRECTED_SHARE * tolerance.attitude):
             loop = self._find_loop(psi_e, wanted)
-        positions = straight_motion(
-            self.robot,
-            state.q,
-            self._straight_legs(psi_e, loop),
-            self.control_period,
-            self.options.longest,
-        )
+            around = [(corner, duration_3 / 4) for corner in np.roll(loop.corners, -1, axis=0)]
+            legs += [(loop.corners[0], duration_2), *loop.loops * around, (psi_e, duration_4)]
+            loop_notes = {
+                "joints": ", ".join(self.robot.joint_names[i] for i in loop.pair),
+                "psi_star": loop.centre.tolist(),
+                "z_star": loop.side,
+                "loops": float(loop.loops),
+                "direction": "clockwise" if loop.clockwise else "counter-clockwise",
+                "corner": loop.corners[0].tolist(),
+            }
+        longest = self.options.longest
+        positions = straight_motion(self.robot, state.q, legs, self.control_period, longest)
         path = self._prediction.path(state, positions)
         left = PoseError.between(path.position[-1], path.quaternion[-1], goal)
         notes: Notes = {
             "psi_e": psi_e.tolist(),
             "turn_of_step_1": step_1,
             "wanted_phase": wanted,
-            **self._loop_notes(loop),
+            **loop_notes,
             "final_position": path.position[-1].tolist(),
             "predicted_attitude_error": left.angle,
         }
@@ -204,29 +211,6 @@ class SquarePathGait(GaitMethod):
             raise tilted_goal_error(self.robot, axis, tilt)
         twist = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         return math.remainder(twist, 2 * math.pi)
-
-    def _straight_legs(self, psi_e: Array, loop: _SquareLoop | None) -> list[tuple[Array, float]]:
-        """Return the ends (n,) of the straight legs, and the duration of each, s."""
-        step_1, step_2, step_3, step_4 = self._durations
-        legs = [(psi_e, step_1)]
-        if loop is not None:
-            legs.append((loop.corners[0], step_2))
-            around = [(corner, step_3 / 4) for corner in np.roll(loop.corners, -1, axis=0)]
-            legs += loop.loops * around
-            legs.append((psi_e, step_4))
-        return legs
-
-    def _loop_notes(self, loop: _SquareLoop | None) -> Notes:
-        if loop is None:
-            return {"loops": 0.0}
-        return {
-            "joints": ", ".join(self.robot.joint_names[i] for i in loop.pair),
-            "psi_star": loop.centre.tolist(),
-            "z_star": loop.side,
-            "loops": float(loop.loops),
-            "direction": "clockwise" if loop.clockwise else "counter-clockwise",
-            "corner": loop.corners[0].tolist(),
-        }
 
     def _find_loop(self, psi_e: Array, wanted: float) -> _SquareLoop:
         """Return the loop for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,).
