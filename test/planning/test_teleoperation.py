@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
-from support.planner_loop import NEAR, TICK, Array, Loop, robot_of
+from support.planner_loop import NEAR, TICK, Array, Loop, PlantState, robot_of
 from support.planner_phases import executing, stub_of
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import Notice, Phase, PlannerState
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower, TwistFrame
+from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateOptions
-from spacerobot_ros.simulation import InitialState
+from spacerobot_ros.simulation import InitialState, VelocityPlant
 
 HAND = "end_effector"
 START = InitialState(
@@ -87,6 +89,20 @@ def test_the_origin_of_the_link_has_the_velocity_of_the_twist_in_its_frame(
     assert loop.states[-1] == "teleoperating"
     assert loop.statuses[-1].message == "'end_effector' follows twists."
     assert loop.states.count("teleoperating") == 1
+
+
+def test_twists_are_followed_with_the_masses_that_a_capture_has_changed() -> None:
+    loop, old = loop_of(), robot_of("three_joint_arm").description.urdf
+    urdf = old.replace('<mass value="15"/>', '<mass value="90"/>')
+    assert urdf != old
+    heavy = SpaceRobot.from_urdf(urdf)
+    loop.executive.use_robot(heavy, PlanningWorker(heavy, loop.config))
+    loop.plant = VelocityPlant(heavy, TICK, START)
+    stamp_ns, loop.measured = loop.measured.stamp_ns, PlantState(loop.plant)
+    loop.measured.stamp_ns = stamp_ns
+    fly(loop, 30)
+    twist, _ = twist_of(loop, 31)
+    np.testing.assert_allclose(twist[:3], LINEAR, atol=1e-6)
 
 
 def test_seven_joints_follow_the_rotation_as_well() -> None:

@@ -274,7 +274,7 @@ class Executive:
             self._tracker.use_robot(robot)
         else:
             self.config, self._tracker = config, TrajectoryTracker(robot, config)
-            self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
+        self._teleoperation = Teleoperation(robot, self.config, worker.clearance)
 
     def plan_at_once(self) -> None:
         """From now on, let states wait during planning, because the plant runs in lockstep."""
@@ -503,10 +503,8 @@ class Executive:
         """Plan the remaining motion periodically, and when the base is off its predicted path."""
         self._average.restart()
         corrected = active.corrections >= self.config.max_corrections
-        if not self._worker.is_free():
-            return
         replans = self.config.replanning > 0 and self._can_replan()
-        if corrected and not replans:
+        if not self._worker.is_free() or (corrected and not replans):
             return
         if not self._average.take(measured):
             return
