@@ -417,47 +417,34 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
     return np.maximum(np.asarray(found.x, dtype=float), 0.0) * unit
 
 
-@dataclass(frozen=True)
 class _TimedPath:
-    """A path in time, as fast as velocities and accelerations allow.
+    """A path in time, as fast as velocities and accelerations allow."""
 
-    ``time`` (K + 1,) at lengths that are ``arc_length_step`` apart, ``speed`` (K + 1,) there.
-    """
-
-    path: JointPath
-    time: Array
-    speed: Array
-    arc_length_step: float
-
-    @classmethod
-    def of(
-        cls, path: JointPath, limits: MotionLimits, intervals: int = _TIMING_INTERVALS
-    ) -> _TimedPath:
+    def __init__(
+        self, path: JointPath, limits: MotionLimits, intervals: int = _TIMING_INTERVALS
+    ) -> None:
         from scipy.interpolate import CubicSpline
 
-        shape = CubicSpline(path.arc_length, path.shapes)
-        places, interval = np.linspace(0.0, path.arc_length[-1], intervals + 1, retstep=True)
-        slopes, bends = shape(places, 1), shape(places, 2)
-        speed = np.sqrt(_fastest_speeds(slopes, bends, limits, float(interval)))
-        time = np.cumsum(np.append(0.0, 2 * interval / (speed[1:] + speed[:-1])))
-        return cls(path, time, speed, float(interval))
+        self._end, self._length = path.path_fractions[-1], path.arc_length[-1]
+        values = np.column_stack([path.shapes, path.path_fractions])
+        self._by_length = CubicSpline(path.arc_length, values)
+        places, self._interval = np.linspace(0.0, self._length, intervals + 1, retstep=True)
+        slopes, bends = (self._by_length(places, order)[:, :-1] for order in (1, 2))
+        self._speed = np.sqrt(_fastest_speeds(slopes, bends, limits, float(self._interval)))
+        mean_speed = (self._speed[1:] + self._speed[:-1]) / 2
+        self.time = np.cumsum(np.append(0.0, self._interval / mean_speed))
+        """Times (K + 1,), s, at equal distances along the path."""
 
     def at_ticks(self, ticks: int) -> tuple[Array, Array]:
         """Return the shapes (ticks + 1, n) and fractions of the lines at equal time intervals."""
-        from scipy.interpolate import CubicSpline
-
         t = np.linspace(0.0, self.time[-1], ticks + 1)
         k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.time) - 2)
         since, duration = t - self.time[k], self.time[k + 1] - self.time[k]
-        change = (self.speed[k + 1] - self.speed[k]) / duration
-        length = k * self.arc_length_step + self.speed[k] * since + change * since**2 / 2
-        path = self.path
-        of_length = CubicSpline(
-            path.arc_length, np.column_stack([path.shapes, path.path_fractions])
-        )
-        found = of_length(np.minimum(length, path.arc_length[-1]))
+        change = (self._speed[k + 1] - self._speed[k]) / duration
+        length = k * self._interval + self._speed[k] * since + change * since**2 / 2
+        found = self._by_length(np.minimum(length, self._length))
         shares = np.clip(found[:, -1], 0.0, 1.0)
-        shares[-1] = path.path_fractions[-1]
+        shares[-1] = self._end
         return found[:, :-1], shares
 
 
@@ -601,15 +588,15 @@ class ResolvedRateGait(GaitMethod):
         intervals = _TIMING_INTERVALS
         if len(lines.curvature_breaks):
             intervals = min(max(_TIMING_INTERVALS, len(path.arc_length) - 1), _MAX_TIMING_INTERVALS)
-        timed = _TimedPath.of(path, self._limits, intervals)
-        positions = self._held_commands(lines, state, timed)
+        timed = _TimedPath(path, self._limits, intervals)
+        positions, shares = self._held_commands(lines, state, timed)
         name, first = lines.singularity_measure(state.q, path.turns[0])
         least = min(
             lines.singularity_measure(shape, X)[1]
             for shape, X in zip(path.shapes, path.turns, strict=True)
         )
         notes |= {"singularity_measure": name, "at_start": first, "least": least}
-        return positions, timed.at_ticks(len(positions) - 1)[1], notes
+        return positions, shares, notes
 
     def _find_contact(
         self, state: RobotState, path: JointPath, obstacle: tuple[int, str] | None
@@ -785,17 +772,22 @@ class ResolvedRateGait(GaitMethod):
             "the goal without following the line; so may a line from another shape."
         )
 
-    def _held_commands(self, lines: _LinkPaths, state: RobotState, timed: _TimedPath) -> Array:
-        """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each."""
+    def _held_commands(
+        self, lines: _LinkPaths, state: RobotState, timed: _TimedPath
+    ) -> tuple[Array, Array]:
+        """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each, and
+        the shares of the lines (N + 1,).
+        """
         period = self.control_period
         ticks = max(1, math.ceil(timed.time[-1] / period - 1e-9))
         for _ in range(_MAX_CORRECTION_ITERATIONS):
-            positions = self._shapes_on_lines(lines, state, *timed.at_ticks(ticks))
+            shapes, shares = timed.at_ticks(ticks)
+            positions = self._shapes_on_lines(lines, state, shapes, shares)
             factor, overrun = self._limits.excess(positions, period)
             if overrun > _LIMIT_ROUNDING:
                 break
             if factor <= 1 + _LIMIT_ROUNDING:
-                return positions
+                return positions, shares
             ticks = max(ticks + 1, math.ceil(ticks * factor))
         raise PlanningError(
             f"Held commands of {period:g} s along the line violate the joint limits: a higher "

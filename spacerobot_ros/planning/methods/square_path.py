@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -226,52 +225,32 @@ class SquarePathGait(GaitMethod):
         largest = max(found, key=lambda candidates: candidates.largest, default=None)
         if largest is None or largest.largest * self.options.most_loops < abs(wanted):
             raise PlanningError(self._describe_refusal(wanted, largest))
-        fewest = math.ceil(abs(wanted) / largest.largest)
         obstacle = ""
+        fewest = math.ceil(abs(wanted) / largest.largest)
         for loops in range(fewest, self.options.most_loops + 1):
-            for loop in self._squares(psi_e, wanted, found, largest, loops):
-                shapes = np.vstack([psi_e, loop.corners, loop.corners[0], psi_e])
+            target = abs(wanted) / loops
+            solved = [
+                (candidates, *self._solve_for_side(candidates, target))
+                for candidates in found
+                if candidates is largest or candidates.largest >= target
+            ]
+            for candidates, row, side in sorted(solved, key=lambda square: square[2]):
+                centre = candidates.centres[row]
+                clockwise = bool(candidates.geometric_phases[row] * wanted < 0)
+                corners = np.tile(psi_e, (4, 1))
+                corners[:, candidates.pair] = square_corners(centre[np.newaxis], np.array([side]))
+                corners = corners[::-1] if clockwise else corners
+                nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
+                corners = np.roll(corners, -nearest, axis=0)
+                shapes = np.vstack([psi_e, corners, corners[0], psi_e])
                 too_near = self._too_near(shapes, at_ticks=False)
                 if not too_near:
-                    return loop
+                    return _SquareLoop(candidates.pair, centre, side, loops, clockwise, corners)
                 obstacle = obstacle or too_near
         raise PlanningError(
             f"On square loops within the joint limits, links come too close to each other with up "
             f"to most_loops = {self.options.most_loops} loops: {obstacle}."
         )
-
-    def _squares(
-        self,
-        psi_e: Array,
-        wanted: float,
-        found: list[_SquareFamily],
-        largest: _SquareFamily,
-        loops: int,
-    ) -> Iterator[_SquareLoop]:
-        """Yield the squares that turn the base by ``wanted`` (rad) in a number of loops, the
-        smallest first.
-        """
-        target = abs(wanted) / loops
-        solved = [
-            (candidates, *self._solve_for_side(candidates, target))
-            for candidates in found
-            if candidates is largest or candidates.largest >= target
-        ]
-        for candidates, row, side in sorted(solved, key=lambda square: square[2]):
-            clockwise = candidates.geometric_phases[row] * wanted < 0
-            corners = np.tile(psi_e, (4, 1))
-            squares = square_corners(candidates.centres[[row]], np.array([side]))
-            corners[:, candidates.pair] = squares[0]
-            corners = corners[::-1] if clockwise else corners
-            nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
-            yield _SquareLoop(
-                candidates.pair,
-                candidates.centres[row],
-                side,
-                loops,
-                clockwise,
-                np.roll(corners, -nearest, axis=0),
-            )
 
     def _describe_refusal(self, wanted: float, largest: _SquareFamily | None) -> str:
         """Return the message for a turn without a loop; ``largest`` turns the base farthest."""
