@@ -92,19 +92,14 @@ class AutoGait(GaitMethod):
                     refusals[name] = PlanningError(f"{name} plans only from rest.")
             names = [name for name in names if name not in refusals]
         flying = "" if request.previous is None else request.previous.method
-        if flying in names:
-            names.remove(flying)
-            kept = self._plan_by_method(flying, request, refusals, cancellation)
-            if kept is not None:
-                result = {flying: _MethodResult.of(self.robot, kept, request)}
-                return _add_notes(
-                    kept, flying, f"{flying} planned for this goal before.", result, {}
-                )
         results: dict[str, _MethodResult] = {}
-        for name in names:
-            schedule = self._plan_by_method(name, request, refusals, cancellation)
-            if schedule is not None:
-                results[name] = _MethodResult.of(self.robot, schedule, request)
+        for name in sorted(names, key=lambda name: name != flying):
+            result = self._plan_by_method(name, request, refusals, cancellation)
+            if result is not None and name == flying:
+                because = f"{flying} planned for this goal before."
+                return _add_notes(result.schedule, flying, because, {flying: result}, {})
+            if result is not None:
+                results[name] = result
         if not results:
             raise self._refuse_goal(refusals)
         for refusal in refusals.values():
@@ -161,15 +156,16 @@ class AutoGait(GaitMethod):
         request: PlanRequest,
         refusals: dict[str, SpaceRobotError],
         cancellation: Cancellation,
-    ) -> GaitSchedule | None:
-        """Return the schedule of one method; None for a refusal, which is added to ``refusals``."""
+    ) -> _MethodResult | None:
+        """Return the result of one method; None for a refusal, which is added to ``refusals``."""
         try:
-            return self._get_method(name).plan(request, cancellation)
+            schedule = self._get_method(name).plan(request, cancellation)
         except PlanningCancelled:
             raise
         except (ParameterError, PlanningError) as refusal:
             refusals[name] = refusal
             return None
+        return _MethodResult.of(self.robot, schedule, request)
 
 
 @dataclass(frozen=True)
