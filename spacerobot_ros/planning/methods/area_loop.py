@@ -178,14 +178,11 @@ class AreaLoopGait(GaitMethod):
                     gait = self._add_legs(gait, [(final, self.options.edge_time)])
                 break
             if planned < self.options.cycles_per_plan:
-                before = len(gait.positions)
-                gait, cycle_notes, cycles = self._add_cycle(
+                gait, cycle_notes, remaining = self._add_cycle(
                     gait, target, left, nominal, tolerance.attitude, flown
                 )
                 flown += 1
                 notes = {**cycle_notes, "cycles": float(planned + 1)}
-                cycle = (len(gait.positions) - before) * self.control_period
-                remaining = max(0.0, cycles - flown) * cycle
         progress = AreaLoopProgress(chosen, flown)
         return self._build_schedule(gait, request, notes, progress, remaining)
 
@@ -231,7 +228,7 @@ class AreaLoopGait(GaitMethod):
             clear, _ = self._shrink_until_clear(gait, S, share, nominal)
         except PlanningError:
             return math.inf, False
-        loop = self._add_legs(gait, self._edge_ends(edge_path(clear * S, nominal.longest), nominal))
+        loop, _ = self._add_loop(gait, clear * S, nominal)
         duration = (len(loop.positions) - len(gait.positions)) * self.control_period
         return self._count_cycles_left(missing, clear, enough) * duration, clear == share
 
@@ -255,7 +252,7 @@ class AreaLoopGait(GaitMethod):
         """Add one cycle for the turn ``left`` (3,), rad; cycles continue until the attitude is off
         by ``enough`` (rad), and ``flown`` are done.
 
-        Also returned are the paper's symbols and the expected number of cycles for the goal.
+        Also returned are the paper's symbols and the expected duration of later cycles, s.
         """
         S, share = self._initial_loop_areas(left, nominal)
         missing = float(np.linalg.norm(left))
@@ -264,8 +261,7 @@ class AreaLoopGait(GaitMethod):
         if too_near:
             cycles = self._count_cycles_within_limits(missing, share, enough, flown, too_near)
         for _ in range(_MAX_CYCLE_TRIALS):
-            path = edge_path(share * S, nominal.longest)
-            after = self._add_legs(gait, self._edge_ends(path, nominal))
+            after, path = self._add_loop(gait, share * S, nominal)
             if np.linalg.norm(attitude_error(after.attitudes[-1], target)) < missing:
                 break
             share /= 2
@@ -281,19 +277,16 @@ class AreaLoopGait(GaitMethod):
                 f"The manoeuvre would take about {cycles:.4g} cycles of {duration:.4g} s, more "
                 f"than longest = {self.options.longest:.6g} s."
             )
-        return (
-            after,
-            {
-                "joints": ", ".join(self.robot.joint_names[i] for i in nominal.joints),
-                "nominal": nominal.shape.tolist(),
-                "condition": nominal.condition,
-                "S": (share * S).tolist(),
-                "path": path.kind,
-                "edges": np.ptp(np.vstack(path.loops), axis=0).tolist(),
-                "expected_cycles": cycles,
-            },
-            cycles,
-        )
+        notes: Notes = {
+            "joints": ", ".join(self.robot.joint_names[i] for i in nominal.joints),
+            "nominal": nominal.shape.tolist(),
+            "condition": nominal.condition,
+            "S": (share * S).tolist(),
+            "path": path.kind,
+            "edges": np.ptp(np.vstack(path.loops), axis=0).tolist(),
+            "expected_cycles": cycles,
+        }
+        return after, notes, max(0.0, cycles - flown - 1) * duration
 
     def _count_cycles_within_limits(
         self, missing: float, share: float, enough: float, flown: int, too_near: str = ""
@@ -321,8 +314,7 @@ class AreaLoopGait(GaitMethod):
         if self.clearance is None:
             return share, too_near
         for _ in range(_MAX_SHRINKS):
-            path = edge_path(share * S, nominal.longest)
-            loop = self._add_legs(gait, self._edge_ends(path, nominal))
+            loop, _ = self._add_loop(gait, share * S, nominal)
             found = self._too_near_after(loop, len(gait.positions) - 1)
             if not found:
                 return share, too_near
@@ -345,8 +337,11 @@ class AreaLoopGait(GaitMethod):
         factor = -math.log1p(-min(self.options.k, _MAX_CYCLE_SHARE))
         return many + max(1.0, math.log(unbounded / enough) / factor)
 
-    def _edge_ends(self, path: EdgePath, nominal: NominalShape) -> LegEnds:
-        chosen = list(nominal.joints)
+    def _add_loop(
+        self, gait: _PlannedMotion, areas: Array, nominal: NominalShape
+    ) -> tuple[_PlannedMotion, EdgePath]:
+        """Add a loop around areas (3,); return the motion, and the path of the loop."""
+        path, chosen = edge_path(areas, nominal.longest), list(nominal.joints)
         lower, upper = self.robot.lower[chosen], self.robot.upper[chosen]
         ends: LegEnds = []
         for loop in path.loops:
@@ -359,7 +354,7 @@ class AreaLoopGait(GaitMethod):
             ends.append((corners[0], self.options.edge_time / 2))
             ends += [(corner, self.options.edge_time) for corner in corners[1:]]
             ends.append((nominal.shape, self.options.edge_time / 2))
-        return ends
+        return self._add_legs(gait, ends), path
 
     def _move_to_nominal(
         self, request: PlanRequest, final: Array | None, chosen: NominalShape
