@@ -130,13 +130,9 @@ def plan(
         options_of_method,
         Clearance.wanted(described, clearance),
     )
-    state = _start_state(robot, start)
-    for name, given in (
-        ("linear_momentum", linear_momentum),
-        ("angular_momentum", angular_momentum),
-    ):
-        if given is not None:
-            state = replace(state, **{name: _momentum(name, given)})
+    momenta = {"linear_momentum": linear_momentum, "angular_momentum": angular_momentum}
+    given = {name: _momentum(name, each) for name, each in momenta.items() if each is not None}
+    state = replace(_start_state(robot, start), **given)
     return planner.plan(PlanRequest(state, goal, tolerance))
 
 

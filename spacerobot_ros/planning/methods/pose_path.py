@@ -84,18 +84,17 @@ class PosePath:
         """(K,) path length up to each pose: metres plus radians."""
         return np.append(0.0, np.cumsum(self.lengths))
 
+    def line_at(self, length: float) -> int:
+        """Return the index of the line that continues after a given length of the path."""
+        i = np.searchsorted(self.lengths_at_poses, length, side="right") - 1
+        return int(np.clip(i, 0, len(self.chords) - 1))
+
     def remaining_after(self, length: float) -> PosePath:
         """Return the rest of the path after a given length; at the end, a single pose."""
         length = min(max(length, 0.0), float(self.lengths_at_poses[-1]))
         if len(self.positions) == 1:
             return self
-        i = int(
-            np.clip(
-                np.searchsorted(self.lengths_at_poses, length, side="right") - 1,
-                0,
-                len(self.chords) - 1,
-            )
-        )
+        i = self.line_at(length)
         share = (length - self.lengths_at_poses[i]) / self.lengths[i]
         r = self.positions[i] + share * self.chords[i]
         turned = quaternion_multiply(
@@ -237,7 +236,7 @@ class RoundedPath:
         """
         along, lengths, total = self._path.lengths_at_poses, self._path.lengths, self._total
         s = share * total
-        i = int(np.clip(np.searchsorted(along, s, side="right") - 1, 0, len(lengths) - 1))
+        i = self._path.line_at(s)
         corner = i + 1 if s > along[i + 1] - self._blends[i + 1] else i
         d = self._blends[corner]
         if abs(s - along[corner]) >= d:

@@ -322,6 +322,7 @@ class JointPath:
 def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath:
     """Follow lines from a shape (n,) to their ends, or to a singularity (Runge-Kutta 4)."""
     n, total = len(q), lines.length
+    breaks = lines.curvature_breaks * total
     y = np.concatenate([q, [0.0, 0.0, 0.0, 1.0, 0.0]])
 
     def rate(y: Array) -> Array:
@@ -336,11 +337,7 @@ def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) ->
     while progress[-1] > _ZERO_PROGRESS_RATE:
         cancellation.raise_if_requested()
         left = total - y[-1]
-        ahead = (
-            lines.curvature_breaks[lines.curvature_breaks * total > y[-1] + _KNOT_TOLERANCE * total]
-            * total
-            - y[-1]
-        )
+        ahead = breaks[breaks > y[-1] + _KNOT_TOLERANCE * total] - y[-1]
         # Steps end where the curvature of the way jumps.
         step = min(longest, left / progress[-1], *ahead[:1] / progress[-1])
         if len(progress) > 1 and (falls := progress[-2] - progress[-1]) > 0:
