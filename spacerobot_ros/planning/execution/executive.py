@@ -613,7 +613,7 @@ class Executive:
         self.statistics.plan_time_s, self.statistics.plans = 0.0, 0
         if state is None:
             self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
-            self._act_on_result(PlanJob(waiting, reason), Refused(refusal))
+            self._handle_refusal(PlanJob(waiting, reason), refusal)
         else:
             waiting = waiting.kept_at(state.position, state.quaternion)
             self._request_plan(PlanJob(waiting, reason, take_over=take_over), state)
@@ -661,41 +661,35 @@ class Executive:
         self._take_plan_result()
 
     def _take_plan_result(self) -> None:
+        """Execute a plan, or report its refusal; the job alone decides on the next phase."""
         result = self._worker.poll(self._stamp_ns)
         if result is None:
             return
         self.statistics.plan_time_s += result.wall_time
-        job, self._job = self._job, None
+        job, self._job, active = self._job, None, self._active_goal
         assert job is not None
         self.statistics.plans += 1
         self._add_notice("info", f"Planned in {result.wall_time:.6f} s.")
         if isinstance(result, Planned):
             result = result.for_goal(job.identified)
-        if isinstance(result, Planned):
-            message = f"The plan is {result.schedule.title}."
-            about = _about(result.schedule)
-            self._add_event(EventKind.PLAN_READY, message, job.identified, 0, **about)
-        self._act_on_result(job, result)
-
-    def _act_on_result(self, job: PlanJob, result: Planned | Refused) -> None:
-        """Execute a plan, or report its refusal; the job alone decides on the next phase."""
-        active, reason = self._active_goal, job.reason
-        match result:
-            case Planned(schedule) if job.take_over is not None:
-                self._job, self._ready_plan = job, schedule
-                self._change_phase(Event.PLANNED, Phase.TAKING_OVER)
-            case Planned(schedule, begins_ns=begins):
-                error = None
-                if reason.is_for_new_goal:
-                    self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
-                elif isinstance(job.error, TrackingError):
-                    assert active is not None
-                    self._correct_path(active, job.error)
-                else:
-                    error = job.error
-                self._execute_schedule(schedule, begins, error)
-            case Refused(why):
-                self._handle_refusal(job, why)
+        if isinstance(result, Refused):
+            self._handle_refusal(job, result.reason)
+            return
+        schedule, error = result.schedule, None
+        message, about = f"The plan is {schedule.title}.", _about(schedule)
+        self._add_event(EventKind.PLAN_READY, message, job.identified, 0, **about)
+        if job.take_over is not None:
+            self._job, self._ready_plan = job, schedule
+            self._change_phase(Event.PLANNED, Phase.TAKING_OVER)
+            return
+        if job.reason.is_for_new_goal:
+            self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
+        elif isinstance(job.error, TrackingError):
+            assert active is not None
+            self._correct_path(active, job.error)
+        else:
+            error = job.error
+        self._execute_schedule(schedule, result.begins_ns, error)
 
     def _handle_refusal(self, job: PlanJob, why: str) -> None:
         """Report that there is no plan; an active goal at rest fails."""
