@@ -48,7 +48,6 @@ from spacerobot_ros.planning.execution.teleoperation import Teleoperation, Twist
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import (
     PlanJob,
-    Planned,
     PlanningTask,
     PlanningWorker,
     Refused,
@@ -670,12 +669,17 @@ class Executive:
         assert job is not None
         self.statistics.plans += 1
         self._add_notice("info", f"Planned in {result.wall_time:.6f} s.")
-        if isinstance(result, Planned):
-            result = result.for_goal(job.identified)
         if isinstance(result, Refused):
             self._handle_refusal(job, result.reason)
             return
-        schedule, error = result.schedule, None
+        # The goal of the plan may be a shifted one.
+        goal, required = job.identified.goal, job.identified.required
+        schedule, error = replace(result.schedule, goal=goal), None
+        try:
+            required.require_control(goal, schedule.controls, schedule.method)
+        except PlanningError as refusal:
+            self._handle_refusal(job, str(refusal))
+            return
         message, about = f"The plan is {schedule.title}.", _about(schedule)
         self._add_event(EventKind.PLAN_READY, message, job.identified, 0, **about)
         if job.take_over is not None:

@@ -102,17 +102,6 @@ class Planned:
     wall_time: float
     begins_ns: int = 0
 
-    def for_goal(self, identified: IdentifiedGoal) -> Planned | Refused:
-        """Return the plan with the original goal in place of a shifted goal, or a refusal if the
-        plan controls too few components.
-        """
-        goal, schedule = identified.goal, replace(self.schedule, goal=identified.goal)
-        try:
-            identified.required.require_control(goal, schedule.controls, schedule.method)
-        except PlanningError as refusal:
-            return Refused(str(refusal), self.wall_time)
-        return replace(self, schedule=schedule)
-
 
 @dataclass(frozen=True)
 class Refused:
