@@ -353,10 +353,8 @@ class Executive:
         if self.phase is Phase.TELEOPERATING:
             self._teleoperation.keep_base_pose(measured)
         elif self.measuring:
-            if self._tracker.is_active:
-                # A moving robot has no average: only its last state counts.
-                self._average.restart()
-            self._average.take(measured)
+            # A moving robot has no average: only its last state counts.
+            self._average.take(measured, alone=self._tracker.is_active)
 
     def update(self, measured: MeasuredState) -> Setpoint:
         """Return the setpoint for a measured state; see :attr:`setpoint`."""

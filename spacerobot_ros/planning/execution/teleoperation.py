@@ -437,10 +437,7 @@ class TwistFollower:
             share = float(np.nanmin(np.append(most / np.abs(change), 1.0)))
         # All joints change together, so that the direction of the motion stays; but stops count.
         rates = before + share * change
-        up, down = (
-            self._rates_that_can_stop(limits.upper - q),
-            self._rates_that_can_stop(q - limits.lower),
-        )
+        up, down = map(self._rates_that_can_stop, (limits.upper - q, q - limits.lower))
         return np.asarray(np.clip(rates, -down, up))
 
     def _too_near(self, clearance: Clearance, rates: Array, pose: Array, q: Array) -> str:
