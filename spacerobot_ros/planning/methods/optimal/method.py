@@ -110,6 +110,9 @@ _STARTS_BEFORE_FASTEST = 8
 """Number of guesses without a manoeuvre in the requested time after which the fastest manoeuvre is
 searched for."""
 
+_MIN_HALVED_ANGLE = math.radians(20.0)
+"""Smallest rotation that is planned in two halves if no single manoeuvre is found."""
+
 _LIMIT_ROUNDING = 1e-8
 
 
@@ -402,12 +405,54 @@ class OptimalGait(GaitMethod):
         if cache is not None and (kept := cache.load(name, key)):
             positions, notes = json.loads(kept[1])
             return _Plan(np.array(positions), {**notes, "from_cache": 1.0}, end)
-        found = self._plan_from_rest(task, final_is_given=shape is not None or same_shape)
-        plan = self._found(task, found)
+        try:
+            found = self._plan_from_rest(task, final_is_given=shape is not None or same_shape)
+            plan, is_final = self._found(task, found), self._is_within_efforts(task, found)
+        except NotFoundError as refusal:
+            plan, is_final = self._plan_by_halves(task, refusal), True
         # A result of a busy machine is not cached, as an idle machine finds a better one.
-        if cache is not None and self._is_within_efforts(task, found) and not found.cut_short:
+        if cache is not None and is_final and "cut_short" not in plan.notes:
             cache.store(name, key, json.dumps([plan.positions.tolist(), plan.notes]).encode())
         return plan
+
+    def _plan_by_halves(self, task: SearchProblem, refusal: NotFoundError) -> _Plan:
+        """Plan a rotation in two halves, with the joints at rest between them.
+
+        A rotation by many loops is beyond the guesses of a single search. The ``refusal`` is raised
+        if the rotation is not large, if its duration is limited, or if a half is not found either.
+        """
+        request, options = task.request, task.options
+        state, goal = request.state, request.goal
+        alike = math.copysign(1.0, state.quaternion @ goal.quaternion)
+        between = state.quaternion + alike * goal.quaternion
+        between /= np.linalg.norm(between)
+        angle = 4.0 * math.acos(min(1.0, abs(float(state.quaternion @ between))))
+        limited = options.duration > 0 or options.longest < OptimalOptions().longest
+        timed = request.correction or task.boundary.drifts or limited
+        free = goal.end_effectors or "attitude" not in self._specification.controls & goal.base
+        if timed or free or angle < _MIN_HALVED_ANGLE:
+            raise refusal
+        position = (state.position + goal.position) / 2
+        halfway = replace(goal, position=position, quaternion=between, joint_positions=None)
+        plans: list[_Plan] = []
+        for aim in (halfway, goal):
+            part = replace(request, state=state, goal=aim)
+            try:
+                plans.append(self._plan_about_center(part, task.cancellation, task.clock))
+            except PlanningError:
+                task.cancellation.raise_if_requested()
+                raise refusal from None
+            shapes = plans[-1].positions
+            base = self._prediction.poses(state, shapes)
+            r_WB, attitude = base.position[-1], base.quaternion[-1]
+            state = replace(state, position=r_WB, quaternion=attitude, q=shapes[-1])
+        # A tick of rest joins the halves, each of which begins and ends with its own velocities.
+        shapes = np.vstack([each.positions for each in plans])
+        first, last = plans
+        notes: Notes = {**first.notes, **last.notes}
+        for name in ("starts", "solution_time"):
+            notes[name] = sum(float(each.notes.get(name, 0.0)) for each in plans)  # type: ignore[arg-type]
+        return _Plan(shapes, notes, last.final_velocity)
 
     def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> Manoeuvre:
         """Return a manoeuvre whose joints rest at the start; see :meth:`_require_enough_time`."""
