@@ -105,6 +105,13 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"disperse": {"planner.optimal.max_velocity[0]": NORM}},
         "the list is empty, and an empty list has",
     ),
+    (
+        {
+            "set": {"planner.optimal.max_velocity": ["slider_2:0.1"]},
+            "disperse": {"planner.optimal.max_velocity[0]": NORM},
+        },
+        "the list consists of strings NAME:VALUE; set a number for each",
+    ),
     ({"disperse": {"plant.robot": {"choice": ["dual_arm"]}}}, "the same in all flights"),
     ({"disperse": {"plant.time_mode": {"choice": ["realtime"]}}}, "the same in all flights"),
     ({"disperse": {"initial.joint.slider_1": NORM}}, "Did you mean 'initial.joints.slider_1'"),

@@ -11,7 +11,6 @@ import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -510,7 +509,7 @@ def test_random_goals_that_are_missed_are_exit_1(
         like = trial(problem, methods[0])
 
         def flown(duration: float, plan_time: float, *, reached: bool) -> PlanEvaluation:
-            piece: Any = SimpleNamespace(duration=duration)
+            piece = replace(like.pieces[0], control_period=duration / 2)  # Of two ticks.
             return replace(like, pieces=[piece], plan_time=plan_time, reached=reached)
 
         times = ((4.0, 0.1), (1.0, 0.5), (2.0, 0.2), (4.0, 0.2), (1.0, 0.2))

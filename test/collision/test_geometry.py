@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import logging
+import os
 import re
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +19,10 @@ from support.slow import some_fast
 from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair
-from spacerobot_ros.collision import distances as distances_module
 from spacerobot_ros.collision.distances import EnclosureDistances
 from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.errors import PlanningError, RobotDescriptionError
+from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.srdf import with_srdf
@@ -255,40 +259,56 @@ def test_distances_are_those_of_pinocchio(name: str) -> None:
         assert nearest[0] == pytest.approx(min(found.values()), abs=1e-9)
 
 
-def test_without_coal_distances_are_bounds(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
-) -> None:
+WITHOUT_COAL = """
+import json, logging, sys
+import numpy as np
+sys.modules["coal"] = None
+logging.basicConfig(format="%(message)s")
+from spacerobot_ros.collision import CollisionGeometry
+from spacerobot_ros.model.urdf import parse_robot
+text, shapes = json.load(sys.stdin)
+geometry = CollisionGeometry(parse_robot(text))
+poses = geometry.poses(np.array(shapes))
+bounds = [geometry.distances(k, poses).tolist() for k in range(len(geometry.pairs))]
+pairs = list(zip(geometry.pairs.tolist(), bounds))
+ignored = sorted(map(sorted, geometry.ignored_pairs))
+json.dump([geometry.exact, ignored, pairs], sys.stdout)
+"""
+
+
+def test_without_coal_distances_are_bounds(tmp_path: Path) -> None:
     robot = parse_robot(without_collisions(load_robot(robot_file("surveyor")).urdf))
     exact = CollisionGeometry(robot)
-    monkeypatch.setitem(sys.modules, "coal", None)
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path / "cache"))
-    distances_module._coal.cache_clear()
-    try:
-        bounds = CollisionGeometry(robot)
-        # The next command, a process of its own, warns of it no more.
-        distances_module._coal.cache_clear()
-        again = CollisionGeometry(robot)
-        assert not bounds.exact
-        assert not again.exact
-    finally:
-        monkeypatch.undo()
-        distances_module._coal.cache_clear()
-    assert [each.message for each in caplog.records if "coal" in each.message] == [
-        "Distances between links are lower bounds from enclosing spheres, capsules and boxes, "
-        "because the package coal is not installed: `pip install '.[collision]'` in the clone."
+    low, high = robot.limits("lower"), robot.limits("upper")
+    shapes = np.random.default_rng(7).uniform(low, high, (20, len(low)))
+    ended = [
+        subprocess.run(
+            [sys.executable, "-c", WITHOUT_COAL],
+            input=json.dumps([robot.urdf, shapes.tolist()]),
+            env={**os.environ, "SPACEROBOT_CACHE_DIR": str(tmp_path / "cache")},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        for _ in range(2)
     ]
-    assert exact.exact
+    # The next command warns of it no more.
+    assert [each.stderr for each in ended] == [
+        "Distances between links are lower bounds from enclosing spheres, capsules and boxes, "
+        "because the package coal is not installed: `pip install '.[collision]'` in the clone.\n",
+        "",
+    ]
+    is_exact, ignored_pairs, bounds = json.loads(ended[0].stdout)
+    assert (exact.exact, is_exact) == (True, False)
     # The box around the bus and that around the arm are always in contact.
     assert set(exact.ignored_pairs) == set()
-    assert set(bounds.ignored_pairs) == {LinkPair("base_link", "upper_arm")}
+    assert ignored_pairs == [["base_link", "upper_arm"]]
     numbers = {tuple(pair): number for number, pair in enumerate(exact.pairs.tolist())}
-    rng = np.random.default_rng(7)
-    low, high = robot.limits("lower"), robot.limits("upper")
-    poses = exact.poses(rng.uniform(low, high, (20, len(low))))
+    poses = exact.poses(shapes)
     loose = 0.0
-    for number, pair in enumerate(bounds.pairs.tolist()):
+    for pair, bound in bounds:
         true = exact.distances(numbers[tuple(pair)], poses)
-        difference = true - bounds.distances(number, poses)
+        difference = true - bound
         assert difference.min() > -1e-5
         loose = max(loose, float(difference.max()))
     assert 0.001 < loose < 0.3
@@ -297,17 +317,12 @@ def test_without_coal_distances_are_bounds(
 def test_installations_that_share_a_cache_are_each_told_once_that_coal_is_missing(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    monkeypatch.setitem(sys.modules, "coal", None)
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path / "cache"))
-    told = []
+    sentence, told = "Distances between links are lower bounds.", []
     for prefix in ("/opt/first", "/opt/second", "/opt/first"):
         monkeypatch.setattr(sys, "prefix", prefix)
-        distances_module._coal.cache_clear()
         caplog.clear()
-        assert distances_module._coal() is None
-        told.append([each.message.split(",")[0] for each in caplog.records])
-    distances_module._coal.cache_clear()
-    sentence = "Distances between links are lower bounds from enclosing spheres"
+        warn_first_time(logging.getLogger("collision"), tmp_path, "warned_of_coal", sentence)
+        told.append([each.message for each in caplog.records])
     assert told == [[sentence], [sentence], []]
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -21,6 +19,8 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.model.world import with_world
 from spacerobot_ros.planning import RobotState
+from spacerobot_ros.planning.core.clearance import Clearance
+from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
 from spacerobot_ros.simulation.clearance import FlightClearance
@@ -112,8 +112,8 @@ def test_planes_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None
     r_WC = base.position[0] + start.apply(robot.center_of_mass(shapes[0]))
     state = RobotState(base.position[0], base.quaternion[0], shapes[0])
     boundary = BoundaryConditions(shapes[0], IDENTITY, shapes[-1], state=state)
-    clearance, prediction = SimpleNamespace(geometry=geometry), SimpleNamespace()
-    library = DistanceLibrary(clearance, robot, prediction)  # type: ignore[arg-type]
+    prediction = BasePrediction(robot, 0.05, 0.05)
+    library = DistanceLibrary(Clearance(geometry.robot, 0.01), robot, prediction)
     rng = np.random.default_rng(3)
 
     def distance(y: Array) -> float:

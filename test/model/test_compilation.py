@@ -15,7 +15,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from spacerobot_ros import files
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import c_compiler, cached_function, compiled, load_library
 from spacerobot_ros.resources import robot_file
@@ -28,7 +27,6 @@ def cache(compiled_code: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     """Return the folder of this test's objects; nothing was said before."""
     folder = tmp_path / "cache"
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(folder))
-    monkeypatch.setattr(files, "_logged_warnings", set())
     return folder
 
 

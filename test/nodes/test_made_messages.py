@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -423,26 +422,23 @@ def test_a_package_without_its_libraries_is_not_installed(monkeypatch: pytest.Mo
     assert interface_class("nav_msgs.msg", "Absent") is None
 
 
-class Feedback(SimpleNamespace):
-    """As nav2_msgs/action/NavigateToPose has it."""
+class NavigateToPose:
+    """As nav2_msgs of ROS 2 Jazzy has it."""
 
-    def __init__(self) -> None:
-        super().__init__(
-            current_pose=None,
-            navigation_time=Duration(),
-            estimated_time_remaining=Duration(),
-            distance_remaining=-1.0,
-        )
+    @dataclass
+    class Feedback:
+        current_pose: Any = None
+        navigation_time: Duration = field(default_factory=Duration)
+        estimated_time_remaining: Duration = field(default_factory=Duration)
+        distance_remaining: float = -1.0
 
-
-class Result(SimpleNamespace):
-    """As that of ROS 2 Jazzy."""
-
-    def __init__(self) -> None:
-        super().__init__(error_code=7, error_msg="")
+    @dataclass
+    class Result:
+        error_code: int = 7
+        error_msg: str = ""
 
 
-ACTION = NavigateToPoseAction(SimpleNamespace(Feedback=Feedback, Result=Result))
+ACTION = NavigateToPoseAction(NavigateToPose)
 POSE = np.array([0.1, -0.2, 0.3, 0.0, 0.6, 0.0, 0.8])
 
 

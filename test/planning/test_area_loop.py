@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ import pytest
 from planning.flown import STEP, fly, measured, plant_at
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from support.decided_clearance import DecidedClearance
 from support.oracles import PinocchioOracle
 from support.planar_manoeuvres import goal_of
 from support.planners import Planner, planner_of
@@ -452,26 +453,15 @@ def beyond_the_wall(shapes: Array) -> bool:
     return bool(np.all(shapes[:, 1] <= WALL))
 
 
-def replaced(method: AreaLoopGait, clear: str, too_near: str) -> None:
-    """Have a method find one clause on motions this side of the wall, and another beyond it."""
-
-    def look(positions: Array, base: object = None, **_: object) -> str:
-        return clear if beyond_the_wall(positions) else too_near
-
-    method.__dict__.update(_too_near=look)
-
-
-def walled(roomy_arm: SpaceRobot, **options: Any) -> AreaLoopGait:
+def walled(
+    roomy_arm: SpaceRobot, motions: Callable[[Array], bool] | None = None, **options: Any
+) -> AreaLoopGait:
     """Return a method for which links come too near where the second joint is above the wall."""
     method = planner_of("area_loop", roomy_arm, 0.25, TOLERANCE, 0.05, **options).method
     assert isinstance(method, AreaLoopGait)
-    stand_in: Any = SimpleNamespace(
-        is_clear=lambda shapes, required: beyond_the_wall(shapes),
-        required=lambda start: None,
-        has_obstacles=False,
+    method.clearance = DecidedClearance(
+        roomy_arm.description, lambda shapes: not beyond_the_wall(shapes), motions
     )
-    method.clearance = stand_in
-    replaced(method, "", "links 'a' and 'b' come within 0.004 m")
     return method
 
 
@@ -520,8 +510,7 @@ def test_a_loop_without_room_goes_elsewhere_and_one_with_room_stays(roomy_arm: S
     # Edges are as long as a box has room for: 0.2 rad is far more than a shrunk loop has.
     assert max(np.atleast_1d(moved.notes["edges"])) > 0.2
     # A wall that no loop comes to changes nothing.
-    method = walled(roomy_arm)
-    replaced(method, "", "")
+    method = walled(roomy_arm, lambda positions: False)
     same = method.plan(PlanRequest(START, GOAL, TOLERANCE))
     np.testing.assert_array_equal(same.positions, free.positions)
 

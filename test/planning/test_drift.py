@@ -346,7 +346,7 @@ def test_planning_that_takes_too_long_is_refused() -> None:
 
 def test_a_correction_begins_with_a_rest_too() -> None:
     loop = loop_of(max_corrections=1)
-    method = loop.held._method
+    method = loop.method
     assert isinstance(method, Coasting)
     method.overshoot = 0.2
     loop.propose_goal(goal_at(GOAL))

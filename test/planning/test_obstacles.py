@@ -25,7 +25,8 @@ from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.worker import PlanningWorker
-from spacerobot_ros.planning.methods.optimal.transcription import _distance_block
+from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
+from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock, Stages
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import load_scenario
 
@@ -226,7 +227,7 @@ def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool)
         assert worker.clearance is None
     else:
         assert worker.clearance is not None
-        assert worker.clearance._robot.world is described.world
+        assert worker.clearance.has_obstacles
         assert worker.clearance.distance == 0.01
 
 
@@ -280,8 +281,16 @@ def by_hand(z: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
+def distance_block() -> ConstraintBlock:
+    chain = SpaceRobot.from_file(robot_file("planar_chain"))
+    constraints = PathConstraints.of(chain, OptimalOptions())
+    block = Stages.of(chain, np.eye(3), False, constraints).with_distances(ROWS, 3).distances
+    assert block is not None
+    return block
+
+
 def test_rows_are_those_of_the_shapes_between_the_knots() -> None:
-    block, p = _distance_block(N, ROWS, 3), PLANES.ravel()
+    block, p = distance_block(), PLANES.ravel()
     np.testing.assert_allclose(block.values(Z, p).full().ravel(), by_hand(Z), atol=1e-13)
     values, J = block.jacobian(Z, p)
     np.testing.assert_allclose(values.full().ravel(), by_hand(Z), atol=1e-13)
@@ -291,7 +300,7 @@ def test_rows_are_those_of_the_shapes_between_the_knots() -> None:
 
 
 def test_second_derivatives_are_those_of_differences() -> None:
-    block, p = _distance_block(N, ROWS, 3), PLANES.ravel()
+    block, p = distance_block(), PLANES.ravel()
     multipliers = np.array([0.7, -1.2, 0.4, 2.0, -0.6, 1.1])
 
     def gradient(z: np.ndarray) -> np.ndarray:

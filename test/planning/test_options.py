@@ -13,15 +13,15 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
+from rclpy.parameter import Parameter as RosParameter
 from support.effort_flights import robot_of
 from support.planner_loop import robot_of as looped_robot
 
-from spacerobot_ros.campaign.targets import _list_values
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.nodes.common.ros_parameters import _ros_parameter
-from spacerobot_ros.parameters import Parameter, configured, declared, values_of
+from spacerobot_ros.nodes.common.ros_parameters import typed
+from spacerobot_ros.parameters import Parameter, configured, declared
 from spacerobot_ros.planning import METHODS, Goal, PoseError, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
@@ -32,9 +32,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     PathConstraints,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.remaining_joints import _options_of_remaining
 from spacerobot_ros.resources import robot_file, share_directory
-from spacerobot_ros.scenario import load_scenario
 
 
 def test_methods_say_what_they_control() -> None:
@@ -279,29 +277,12 @@ def test_an_unknown_joint_is_refused(name: str) -> None:
     )
 
 
-def test_options_of_stuck_joints_are_left_out_by_name() -> None:
-    options = configured(OptimalOptions, {"max_velocity": {THIRD: 0.1, FIRST: 0.2}})
-    kept = _options_of_remaining(options, np.array([True, False, False]), NAMED_ARM.joint_names)
-    assert kept.max_velocity == (f"{THIRD}:0.1",)
-
-
 def test_options_by_name_are_ros_parameters_of_texts() -> None:
     declaration = option("max_velocity")
-    assert _ros_parameter(declaration, (0.5,)).type_.name == "DOUBLE_ARRAY"
-    named = _ros_parameter(declaration, ("a:0.5",))
+    changes = [RosParameter(declaration.name, value=each) for each in ([0.5], ["a: 0.5"])]
+    numbers, named = typed({declaration.name: declaration}, changes)
+    assert numbers.type_.name == "DOUBLE_ARRAY"
     assert (named.type_.name, named.value) == ("STRING_ARRAY", ["a:0.5"])
-
-
-def test_options_by_name_are_not_dispersed() -> None:
-    scenario = load_scenario("sliding_masses").with_overrides(
-        "planner", {"optimal.max_velocity": {"slider_2": 0.1}}
-    )
-    assert values_of(scenario.planner)["optimal.max_velocity"] == ("slider_2:0.1",)
-    declaration = Parameter("optimal.max_velocity", ())
-    with pytest.raises(
-        ParameterError, match="the list consists of strings NAME:VALUE; set a number for ea"
-    ):
-        _list_values("n", "planner", declaration, scenario)
 
 
 # -- limits of joints, constraints on paths, and initial guesses, as functions of numbers --------

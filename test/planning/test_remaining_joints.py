@@ -241,10 +241,12 @@ def test_an_arm_turns_its_base_without_its_elbow(options: dict[str, Any]) -> Non
     assert "attitude" in schedule.controls
 
 
-def test_options_of_joints_are_those_of_the_joints_that_are_left() -> None:
+@pytest.mark.parametrize("named", [False, True])
+def test_options_of_joints_are_those_of_the_joints_that_are_left(named: bool) -> None:
     """Three joints, and directions of three numbers: only what is of joints gets shorter."""
     start = np.array([0.1, -0.7, 1.5])
     speeds = np.array([0.5, 0.02, 0.3])
+    by_name = dict(zip(robot_of(ARM).joint_names, speeds.tolist(), strict=True))
     method = gait(
         ARM,
         start,
@@ -252,7 +254,7 @@ def test_options_of_joints_are_those_of_the_joints_that_are_left() -> None:
         method="optimal",
         base_attitude=0,
         base_position=2,
-        max_velocity=speeds.tolist(),
+        max_velocity=by_name if named else speeds.tolist(),
         keep_axis=[1.0, 0.0, 0.0],
         keep_direction=[0.0, 0.0, 1.0],
         keep_angle=0.5,

@@ -38,7 +38,7 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.state_average import BaseMeasurement
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
-from spacerobot_ros.planning.execution.worker import Planned, PlanningTask, PlanningWorker, Refused
+from spacerobot_ros.planning.execution.worker import Planned, PlanningTask, Refused
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 
@@ -327,10 +327,11 @@ def loop_of(robot: str, method: GaitMethod | None, **parameters: Any) -> Balance
     loop = BalancedLoop(
         {"method": "optimal", "optimal.cache": 0, **parameters},
         robot=robot,
+        method=method,
         initial=InitialState(joint_positions=SHAPES[robot]),
     )
     states = round(PLANNING_TIME[robot] / TICK) - 1
-    loop.held = SlowWorker(robot_of(robot), loop.config, method, states=states)
+    loop.held = SlowWorker(robot_of(robot), loop.config, loop.method, states=states)
     loop.executive = Executive(robot_of(robot), loop.config, loop.held)
     return loop
 
@@ -386,7 +387,7 @@ def test_a_goal_that_is_changed_halfway_is_reached_without_a_stop() -> None:
         for _ in range(4):
             pair = goals(robot, rng)
             stopping = loop_of(robot, method, takeover_time=0.0)
-            method = stopping.held._method
+            method = stopping.method
             stop_and_go = flown(stopping, *pair)
             moving = loop_of(robot, method, takeover_time=PLANNING_TIME[robot])
             shares.setdefault(robot, []).append(flown(moving, *pair) / stop_and_go)
@@ -471,9 +472,6 @@ def with_wrong_masses(
     wrong = robot_of(robot).description.with_model_error(0.1, seed)
     loop.plant = VelocityPlant(SpaceRobot(wrong), TICK, initial)
     loop.measured = NoisyState(loop.plant, seed)
-    worker = PlanningWorker(robot_of(robot), loop.config, method)
-    loop.method = worker._method
-    loop.executive = Executive(robot_of(robot), loop.config, worker)
     rng = np.random.default_rng(seed)
     axis = np.array([0.0, 0.0, 1.0]) if robot == "planar_chain" else rng.normal(size=3)
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis) * rng.uniform(*trial.turns))

@@ -55,6 +55,13 @@ def stub_of(loop: Loop) -> MovingStub:
     return loop.method
 
 
+def tracker_of(loop: Loop) -> TrajectoryTracker:
+    """Return a tracker that has just begun the first schedule."""
+    tracker = TrajectoryTracker(robot_of(), loop.config)
+    tracker.start(loop.starts[0].schedule, loop.starts[0].stamp_ns, loop.config.averaging)
+    return tracker
+
+
 def phase_of(loop: Loop) -> Phase:
     return loop.executive.phase
 
@@ -397,7 +404,8 @@ def test_noise_is_averaged_over_the_last_measurements() -> None:
 def test_a_base_that_is_off_as_its_joints_lag_is_on_its_way_to_the_end() -> None:
     """The base of this robot is at an eighth of its sliders' way, to the other side."""
     loop = flying(ticks=80, replan_period=1.0)
-    check, schedule = loop.executive._tracker.path_check, loop.starts[0].schedule
+    schedule, tracker = loop.starts[0].schedule, tracker_of(loop)
+    check = tracker.path_check
     assert check.due(loop.measured.stamp_ns)
     k = round((loop.measured.stamp_ns - loop.starts[0].stamp_ns) / TICK_NS)
     lag = np.array([-0.04, 0.02, 0.03])
@@ -414,7 +422,7 @@ def test_a_base_that_is_off_as_its_joints_lag_is_on_its_way_to_the_end() -> None
 def test_noise_of_joints_is_not_taken_for_another_shape() -> None:
     loop = flying(shape_deadband=1e-3)
     shape = loop.plant.q + np.array([4e-4, 0.0, 5e-3])
-    taken = loop.executive._tracker.take_over(loop.measured.stamp_ns, shape, 0.3)
+    taken = tracker_of(loop).take_over(loop.measured.stamp_ns, shape, 0.3)
     assert taken is not None
     wanted = loop.starts[0].schedule.positions[len(loop.commands)]
     np.testing.assert_array_equal(taken.shapes[0], [wanted[0], wanted[1], shape[2]])

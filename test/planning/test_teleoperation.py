@@ -53,7 +53,7 @@ def send(loop: Loop, frame: TwistFrame = "world", link: str = HAND, **twist: Any
 
 def twist_of(loop: Loop, tick: int, link: str = HAND) -> tuple[Array, Rotation]:
     """Return the twist (6,) of a link in W by Pinocchio, and R_WE, in the middle of a tick."""
-    robot = loop.executive._robot
+    robot = loop.plant.robot
     oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
     q, rates = (loop.shapes[tick] + loop.shapes[tick + 1]) / 2, loop.commands[tick]
     pose = (loop.poses[tick] + loop.poses[tick + 1]) / 2

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -276,12 +275,20 @@ def test_actuators_and_sensors_draw_from_different_streams() -> None:
 TARGET_TICK = 0.08
 
 
+@dataclass
+class Target:
+    """The motion of a target."""
+
+    target_pose: Array = field(default_factory=lambda: np.zeros(7))
+    target_twist: Array = field(default_factory=lambda: np.zeros(6))
+
+
 class Seen:
     """What sensors of a target say, tick by tick, beside the truth; None where they say nothing."""
 
     def __init__(self, ticks: int, seed: int = 5, **errors: Any) -> None:
         config = configured(TargetSensorConfig, errors)
-        target = SimpleNamespace(target_pose=np.zeros(7), target_twist=np.zeros(6))
+        target = Target()
         self.true: list[Array] = []
         self.measured: list[Array | None] = []
         for tick in range(ticks):

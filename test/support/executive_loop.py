@@ -106,10 +106,10 @@ class ExecutiveLoop:
                 self.tick * PERIOD, state if measured else None, SHAPE, self.rates, reference
             )
             self.executive.evaluate(self.tick * PERIOD, result)
-            self._take()
+            self.take()
         return result.realised.wrench_B, result.realised.tau
 
-    def _take(self) -> None:
+    def take(self) -> None:
         while self.executive.outputs:
             match self.executive.outputs.popleft():
                 case Event() as event:
@@ -126,13 +126,13 @@ class ExecutiveLoop:
     @property
     def statuses(self) -> list[ControllerStatus]:
         """What was reported of goals so far."""
-        self._take()
+        self.take()
         return self._statuses
 
     @property
     def events(self) -> list[Event]:
         """The events so far."""
-        self._take()
+        self.take()
         return self._events
 
     @property

@@ -18,6 +18,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -43,6 +44,7 @@ from spacerobot_ros.planning.execution.worker import (
     PlanningWorker,
     Refused,
 )
+from spacerobot_ros.planning.methods.registry import build_method
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 
@@ -233,10 +235,17 @@ class Loop:
         self.config = configured(PlannerConfig, {**QUICK, **(parameters or {})})
         self.plant = VelocityPlant(robot_of(robot), TICK, initial)
         model = robot_of(believed or robot)
-        self.method = method
-        self.held = HeldWorker(model, self.config, method)
-        worker = self.held if held else PlanningWorker(model, self.config, method)
-        self.executive = Executive(model, self.config, worker)
+        self.method = method or build_method(
+            self.config.method,
+            model,
+            self.config.control_period,
+            self.config.integration_step,
+            self.config.method_options,
+            Clearance.wanted(model.description, self.config.clearance),
+        )
+        self.held = HeldWorker(model, self.config, self.method)
+        self.worker = self.held if held else PlanningWorker(model, self.config, self.method)
+        self.executive = Executive(model, self.config, self.worker)
         self.goal_file = goal_file or GoalFile("")
         self.measured = PlantState(self.plant)
         self.outputs: list[Output] = []
@@ -257,23 +266,23 @@ class Loop:
         if isinstance(self.method, StubMethod):
             goal = replace(goal, asked=frozenset({"position"}))  # All that it controls.
         self.executive.propose_goal(IdentifiedGoal(goal, f"goal-{self._goals}"))
-        self._take()
+        self.take()
         return f"goal-{self._goals}"
 
     def abort(self) -> str | None:
         sentence = self.executive.abort()
-        self._take()
+        self.take()
         return sentence
 
     def stop(self) -> None:
         self.executive.reset()
-        self._take()
+        self.take()
 
     def late(self) -> None:
         """Show the base of the state that was answered last."""
         self.measured.seen = True
         self.executive.add_base_measurement(self.measured.now)
-        self._take()
+        self.take()
 
     def set(self, **parameters: Any) -> None:
         """Change live parameters."""
@@ -285,7 +294,7 @@ class Loop:
         for _ in range(count):
             self.measured.seen = base
             setpoint = self.executive.update(self.measured.now)
-            self._take()
+            self.take()
             assert np.all(np.isfinite(setpoint.position))
             assert np.all(np.isfinite(setpoint.velocity))
             self.commands.append(setpoint.velocity.copy())
@@ -313,7 +322,8 @@ class Loop:
                 return decided[-1]
         raise AssertionError(f"not decided: {self.statuses[before:]}")
 
-    def _take(self) -> None:
+    def take(self) -> None:
+        """Take what the executive has put out."""
         for output in self.executive.outputs:
             match output:
                 case PursuedGoals() as pursued:

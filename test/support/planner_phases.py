@@ -85,7 +85,7 @@ Act = Callable[[Loop], object]
 def reset_plant(loop: Loop) -> None:
     loop.plant.reset()
     loop.executive.plant_reset()
-    loop._take()
+    loop.take()
 
 
 def jump(seconds: float) -> Act:
