@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Iterator
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import Any
@@ -12,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
+from support.page_elements import Element, Server
 
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
@@ -22,71 +21,85 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.viewer.content import COLORS
 from spacerobot_ros.viewer.goal_editor import GoalEditor
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict, planned_goal
-from spacerobot_ros.viewer.scene import reach_of, xyzw
-from spacerobot_ros.viewer.server import start_server, stop_server
+from spacerobot_ros.viewer.scene import reach_of, wxyz, xyzw
 
 POSE = np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
 LATER = 1e9
 """A wall time at which every goal has been at rest."""
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[Any]:
-    server = start_server("127.0.0.1", 0)
-    yield server
-    stop_server(server)
+POSITION, ANGLES, FINAL = "Goal (m)", "Roll, pitch, yaw (deg)", "Final joint positions"
+"""Labels of fields."""
 
 
 class Editor:
     """The editor of a page, and its user."""
 
-    def __init__(self, server: Any, robot: str) -> None:
-        server.gui.reset()
-        server.scene.reset()
+    def __init__(self, robot: str) -> None:
+        self.server = Server()
         self.inbox: SimpleQueue[Any] = SimpleQueue()
         self.refusals: list[str] = []
-        self.server = server
+        server: Any = self.server
         self.editor = GoalEditor(server, self.inbox.put, self.refusals.append)
         self.robot = load_robot(robot_file(robot))
         self.editor.show_robot(self.robot, reach_of(self.robot))
 
-    def set(self, handle: Any, value: Any) -> None:
+    def field(self, label: str) -> Element:
+        return self.server.gui.named(label)
+
+    def node(self, path: str) -> Element:
+        return self.server.scene.named(path)
+
+    def set(self, label: str, value: Any) -> None:
         """Set a value as a browser does, and let the page take note of it."""
-        handle._impl.value = value
-        event = type("Event", (), {"target": handle, "client": object()})()
-        for callback in handle._impl.update_cb:
-            found = callback(event)
-            if found is not None:
-                asyncio.run_coroutine_threadsafe(found, self.server.get_event_loop()).result(10)
+        self.field(label).use(self.server, value)
+        self.settle()
+
+    def drag(self, path: str, pose: Array) -> None:
+        """Move a gizmo as a browser does."""
+        gizmo = self.node(path)
+        gizmo.position, gizmo.wxyz = pose[:3], wxyz(pose[3:])
+        gizmo.use(self.server)
+        self.settle()
+
+    def settle(self) -> None:
         while not self.inbox.empty():
             self.inbox.get()()
 
     @property
-    def final(self) -> Any:
-        return self.editor._final
+    def ends(self) -> list[Element]:
+        """The fields of the joint positions at the end."""
+        joints = [joint.name for joint in self.robot.movable_joints]
+        shown = {each.shown.get("hint"): each for each in self.server.gui.elements}
+        return [shown[name] for name in joints if name in shown]
+
+    def says(self, words: str) -> bool:
+        found = self.server.gui.elements
+        return any(words in each.content for each in found if each.kind == "add_html")
 
     def ghost(self) -> list[Array]:
-        """Return where the moving links of the ghost are to their parents."""
-        assert self.editor._ghost is not None
-        return [np.array(frame.position) for frame in self.editor._ghost._moving]
+        """Return where the links of the ghost are to their parents."""
+        nodes = self.server.scene.elements
+        frames = [each for each in nodes if each.kind == "add_frame"]
+        return [np.array(each.position) for each in frames if "/ghost/" in each.name]
 
 
-def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> None:
-    page = Editor(server, "sliding_masses")
+def test_a_goal_ends_in_the_joint_positions_that_are_asked_for() -> None:
+    page = Editor("sliding_masses")
     q = np.array([0.05, -0.1, 0.15])
     page.editor.place(POSE, None, q, 0.0)
-    assert not page.final._enabled.visible, "no planner is there"
+    assert not page.field(FINAL).visible, "no planner is there"
     page.editor.show_parts(tool=False, planned=True)
-    assert page.final._enabled.visible
-    assert not page.final._folder.visible
+    assert page.field(FINAL).visible
+    assert not page.field("At the end").visible
     goal = page.editor.goals()["base"]
     np.testing.assert_array_equal(goal.position, POSE[:3])
     assert goal.joint_positions is None, "any"
     page.editor.settled_goals(LATER)
     # The fields begin where the robot is now.
     page.editor.update_robot(POSE, q + 0.02)
-    page.set(page.final._enabled, True)
-    assert page.final._folder.visible
+    page.set(FINAL, True)
+    assert page.field("At the end").visible
     shape = page.editor.goals()["base"].joint_positions
     assert shape is not None
     np.testing.assert_allclose(shape, q + 0.02)
@@ -94,7 +107,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     page.editor.show_check(GoalCheck(Verdict.REACHABLE, shape=q))
     page.editor.settled_goals(LATER)
     at_rest = page.ghost()
-    page.set(page.final._fields[2], -0.2)
+    page.set(page.ends[2].label, -0.2)
     shape = page.editor.goals()["base"].joint_positions
     assert shape is not None
     np.testing.assert_allclose(shape, [0.07, -0.08, -0.2])
@@ -107,16 +120,16 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for(server: Any) -> N
     np.testing.assert_allclose(moved, [0.02, 0.02, 0.35], atol=1e-9)
     # Without a planner nobody takes it.
     page.editor.show_parts(tool=False, planned=False)
-    assert not page.final._folder.visible
+    assert not page.field("At the end").visible
     assert page.editor.goals()["base"].joint_positions is None
 
 
-def test_a_goal_that_is_moved_is_sent_as_it_is_shown(server: Any) -> None:
-    page = Editor(server, "sliding_masses")
+def test_a_goal_that_is_moved_is_sent_as_it_is_shown() -> None:
+    page = Editor("sliding_masses")
     page.editor.place(POSE, None, np.zeros(3), 0.0)
     turn = Rotation.from_euler("xyz", [12.3456, -7.891, 33.3333], degrees=True)
-    page.editor._on_gizmo_moved("/goal", np.array([0.818265, -1.23456, 0.1, *turn.as_quat()]))
-    goal, fields = page.editor.goals()["base"], (page.editor._position, page.editor._angles)
+    page.drag("/goal", np.array([0.818265, -1.23456, 0.1, *turn.as_quat()]))
+    goal, fields = page.editor.goals()["base"], (page.field(POSITION), page.field(ANGLES))
     assert [each.precision for each in fields] == [4, 2], "so many decimals are seen"
     assert tuple(goal.position) == fields[0].value == (0.8183, -1.2346, 0.1)
     assert fields[1].value == (12.35, -7.89, 33.33)
@@ -124,16 +137,15 @@ def test_a_goal_that_is_moved_is_sent_as_it_is_shown(server: Any) -> None:
     np.testing.assert_allclose(angles, fields[1].value, atol=1e-9)
 
 
-def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
-    page = Editor(server, "sliding_masses")
+def test_the_ghost_is_not_drawn_where_the_robot_is() -> None:
+    page = Editor("sliding_masses")
     q = np.zeros(3)
     page.editor.place(POSE, None, q, 0.0)
-    ghost = page.editor._ghost
-    assert ghost is not None
+    ghost = page.node("/goal/ghost")
 
     def is_drawn(pose: Array = POSE, q: Array = q) -> bool:
         page.editor.update_robot(pose, q)
-        return bool(ghost.base.visible)
+        return bool(ghost.visible)
 
     assert not is_drawn()
     assert not is_drawn(POSE * [1, 1, 1, -1, -1, -1, -1]), "the same attitude"
@@ -147,27 +159,28 @@ def test_the_ghost_is_not_drawn_where_the_robot_is(server: Any) -> None:
     assert not is_drawn(q=np.array([0.0, 0.0, 0.1]))
 
 
-def test_fields_of_joints_stay_within_their_limits(server: Any) -> None:
-    page = Editor(server, "servicer")
+def test_fields_of_joints_stay_within_their_limits() -> None:
+    page = Editor("servicer")
     page.editor.show_parts(tool=False, planned=True)
     page.editor.place(POSE, None, np.full(6, 100.0), 0.0)
-    page.set(page.final._enabled, True)
+    page.set(FINAL, True)
     shape = page.editor.goals()["base"].joint_positions
     assert shape is not None
     upper = page.robot.limits("upper")
     assert np.all(shape[np.isfinite(upper)] <= upper[np.isfinite(upper)])
     assert np.all(shape > 0.9 * np.minimum(upper, 100.0)), "nearly at them"
-    labels = [field.label for field in page.final._fields]
+    labels = [field.label for field in page.ends]
     assert labels[0] == "shoulder_yaw (rad)"
     # Another robot has fields of its own, and asks for nothing.
     other = load_robot(robot_file("sliding_masses"))
     page.editor.show_robot(other, reach_of(other))
-    assert len(page.final._fields) == 3
-    assert page.final.positions is None
+    page.robot = other
+    assert len(page.ends) == 3
+    assert page.field(FINAL).value is False
 
 
-def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None:
-    page = Editor(server, "servicer")
+def test_a_goal_of_the_end_effector_that_appears_is_checked() -> None:
+    page = Editor("servicer")
     page.editor.place(POSE, None, np.zeros(6), 0.0)
     goals = page.editor.settled_goals(LATER)
     assert goals is not None
@@ -180,8 +193,8 @@ def test_a_goal_of_the_end_effector_that_appears_is_checked(server: Any) -> None
     assert set(goals) == {"base", "end_effector"}
 
 
-def test_a_robot_with_other_joints_comes_after_a_goal_was_checked(server: Any) -> None:
-    page = Editor(server, "sliding_masses")
+def test_a_robot_with_other_joints_comes_after_a_goal_was_checked() -> None:
+    page = Editor("sliding_masses")
     page.editor.place(POSE, None, np.zeros(3), 0.0)
     reachable = GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", shape=np.full(3, 0.1))
     page.editor.show_check(reachable)
@@ -190,13 +203,13 @@ def test_a_robot_with_other_joints_comes_after_a_goal_was_checked(server: Any) -
     page.editor.show_check(replace(reachable, shape=np.full(3, 0.2)))
     moved = [float(np.linalg.norm(a - b)) for a, b in zip(page.ghost(), bent, strict=True)]
     np.testing.assert_allclose(moved, 0.1, atol=1e-9)
-    server.scene.reset()
+    page.server.scene.reset()
     other = load_robot(robot_file("servicer"))
     page.editor.show_robot(other, reach_of(other))
-    assert "not checked" in page.editor._verdict.content
+    assert page.says("not checked")
     page.editor.place(POSE, None, np.zeros(6), 0.0)
     page.editor.update_robot(POSE, np.full(6, 0.1))
-    assert len(page.ghost()) == 6
+    assert len(page.ghost()) == len(other.links) - 1
 
 
 HANDS = ("left_link_7", "right_link_7")
@@ -205,9 +218,9 @@ STANDING = np.array([1.0, -2.0, 0.5, *TURNED])
 
 
 @pytest.fixture
-def two_hands(server: Any) -> Editor:
+def two_hands() -> Editor:
     """The editor of a robot with two arms, whose planner takes goals of both hands."""
-    page = Editor(server, "dual_arm")
+    page = Editor("dual_arm")
     page.editor.offer_end_effectors(HANDS)
     page.editor.place(STANDING, None, np.linspace(0.1, 0.7, 14), 0.0)
     page.editor.show_parts(tool=False, planned=True)
@@ -227,19 +240,19 @@ def where(page: Editor, link: str) -> Array:
 
 
 def choose(page: Editor, part: str, asked: str) -> None:
-    page.set(page.editor._parts._menus[part], asked)
+    page.set(part, asked)
 
 
 def gizmo(page: Editor, link: str) -> Any:
-    return page.editor._gizmos[f"/end_effector_goals/{link}"]
+    return page.node(f"/end_effector_goals/{link}")
 
 
 def test_a_goal_of_a_hand_begins_where_the_hand_is_and_leaves_the_base_free(
     two_hands: Editor,
 ) -> None:
-    page, parts = two_hands, two_hands.editor._parts
-    assert parts._folder.visible
-    assert [menu.label for menu in parts._menus.values()] == ["base", *HANDS]
+    page = two_hands
+    assert page.field("Goal for").visible
+    assert all(page.field(part).visible for part in ("base", *HANDS))
     assert set(page.editor.goals()) == {"base"}
     choose(page, HANDS[1], "position")
     goals = page.editor.goals()
@@ -249,22 +262,22 @@ def test_a_goal_of_a_hand_begins_where_the_hand_is_and_leaves_the_base_free(
     at = where(page, HANDS[1])
     assert (aim.link, aim.quaternion) == (HANDS[1], None)
     np.testing.assert_allclose(aim.position, at[:3], atol=1e-12)
-    base, hand = page.editor._gizmos["/goal"], gizmo(page, HANDS[1])
+    base, hand = page.node("/goal"), gizmo(page, HANDS[1])
     assert base.disable_axes and base.disable_sliders and base.disable_rotations  # noqa: PT018
     assert hand.visible
     assert hand.disable_rotations
     # Its numbers are those on the page, and typed ones move it.
-    np.testing.assert_allclose(page.editor._position.value, at[:3], atol=1e-4)
-    assert not page.editor._angles.visible
-    page.set(page.editor._position, (0.5, 0.25, -0.75))
+    np.testing.assert_allclose(page.field(POSITION).value, at[:3], atol=1e-4)
+    assert not page.field(ANGLES).visible
+    page.set(POSITION, (0.5, 0.25, -0.75))
     np.testing.assert_allclose(hand.position, (0.5, 0.25, -0.75))
     (aim,) = page.editor.goals()[HANDS[1]].end_effectors
     np.testing.assert_allclose(aim.position, (0.5, 0.25, -0.75))
     # With an attitude, and where the gizmo is.
     choose(page, HANDS[1], "pose")
-    assert page.editor._angles.visible
+    assert page.field(ANGLES).visible
     assert not hand.disable_rotations
-    page.set(page.editor._angles, (10.0, -20.0, 30.0))
+    page.set(ANGLES, (10.0, -20.0, 30.0))
     (aim,) = page.editor.goals()[HANDS[1]].end_effectors
     np.testing.assert_allclose(aim.position, (0.5, 0.25, -0.75))
     assert aim.quaternion is not None
@@ -275,30 +288,31 @@ def test_a_goal_of_a_hand_begins_where_the_hand_is_and_leaves_the_base_free(
     assert set(page.editor.goals()) == {"base"}
     assert not hand.visible
     assert not base.disable_axes
-    assert page.editor._angles.visible
-    np.testing.assert_allclose(page.editor._position.value, STANDING[:3])
+    assert page.field(ANGLES).visible
+    np.testing.assert_allclose(page.field(POSITION).value, STANDING[:3])
     # Asked for again it begins at the hand.
     choose(page, HANDS[1], "position")
     np.testing.assert_allclose(hand.position, at[:3], atol=1e-12)
 
 
 def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
-    page, parts = two_hands, two_hands.editor._parts
+    page = two_hands
     choose(page, HANDS[0], "pose")
-    assert not parts._numbers.visible, "one part has numbers"
+    assert not page.field("Numbers of").visible, "one part has numbers"
     choose(page, HANDS[1], "position")
     goals = page.editor.goals()
     assert set(goals) == set(HANDS)
     left, right = (goals[link].end_effectors[0] for link in HANDS)
     np.testing.assert_allclose(left.values, where(page, HANDS[0]), atol=1e-12)
     np.testing.assert_allclose(right.values, where(page, HANDS[1])[:3], atol=1e-12)
-    assert parts._numbers.visible
-    assert (parts._numbers.options, parts.shown) == (HANDS, HANDS[1])
-    page.set(parts._numbers, HANDS[0])
-    np.testing.assert_allclose(page.editor._position.value, left.position, atol=1e-4)
+    assert page.field("Numbers of").visible
+    numbers = page.field("Numbers of")
+    assert (numbers.options, numbers.value) == (HANDS, HANDS[1])
+    page.set("Numbers of", HANDS[0])
+    np.testing.assert_allclose(page.field(POSITION).value, left.position, atol=1e-4)
     choose(page, "base", "pose")
     assert set(page.editor.goals()) == {"base", *HANDS}
-    assert parts.shown == "base"
+    assert numbers.value == "base"
     goal = planned_goal(page.editor.goals())
     assert goal.base == {"position", "attitude"}
     assert [each.link for each in goal.end_effectors] == list(HANDS)
@@ -307,7 +321,7 @@ def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
     choose(page, HANDS[0], "position")
     assert set(page.editor.goals()) == {"base", *HANDS}
     # The base moves alone: hands are in the world.
-    page.editor._on_gizmo_moved("/goal", STANDING + np.eye(7)[1])
+    page.drag("/goal", STANDING + np.eye(7)[1])
     np.testing.assert_allclose(gizmo(page, HANDS[0]).position, left.position)
     choose(page, "base", "free")
     assert set(page.editor.goals()) == set(HANDS)
@@ -321,44 +335,45 @@ def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
 
 def test_the_ghost_of_a_free_base_is_where_the_plan_ends(two_hands: Editor) -> None:
     page, q = two_hands, np.linspace(0.1, 0.7, 14)
-    ghost, marks = page.editor._ghost, page.editor._marks
-    assert ghost is not None
+    ghost = page.node("/goal/ghost")
     choose(page, HANDS[0], "position")
     # Off the robot, so that the ghost's place in the gizmo is not the place in the world.
-    page.editor._move_gizmo("/goal", np.array([5.0, 5.0, 5.0, 0.1, 0.7, -0.5, 0.5]))
+    turn = Rotation.from_euler("xyz", [40.0, -20.0, 70.0], degrees=True)
+    page.drag("/goal", np.array([5.0, 5.0, 5.0, *turn.as_quat()]))
     page.editor.show_check(GoalCheck(Verdict.PLANNING, "Planning for 2 s."))
-    assert not ghost.base.visible, "nothing is predicted"
+    assert not ghost.visible, "nothing is predicted"
     end = np.array([1.5, -2.25, 0.5, *TURNED[[1, 0, 3, 2]]])
     page.editor.show_check(GoalCheck(Verdict.REACHABLE, shape=q + 0.1, base=end))
-    assert ghost.base.visible
-    R = matrix_from_quaternion(xyzw(page.editor._gizmos["/goal"].wxyz))
-    seen = page.editor._gizmos["/goal"].position + R @ ghost.base.position
+    assert ghost.visible
+    R = matrix_from_quaternion(xyzw(page.node("/goal").wxyz))
+    seen = page.node("/goal").position + R @ ghost.position
     np.testing.assert_allclose(seen, end[:3], atol=1e-12)
-    turned = R @ matrix_from_quaternion(xyzw(ghost.base.wxyz))
+    turned = R @ matrix_from_quaternion(xyzw(ghost.wxyz))
     np.testing.assert_allclose(turned, matrix_from_quaternion(end[3:]), atol=1e-12)
-    assert {mark.color for mark in marks.values()} == {COLORS[Verdict.REACHABLE]}
+    mark = page.node(f"/end_effector_goals/{HANDS[0]}/mark")
+    assert mark.color == COLORS[Verdict.REACHABLE]
     # Where the robot is then, it is not drawn; and a base with a goal is drawn there.
     page.editor.update_robot(end, q + 0.1)
-    assert not ghost.base.visible
+    assert not ghost.visible
     choose(page, "base", "pose")
     page.editor.update_robot(end, q + 0.1)
-    assert ghost.base.visible
-    np.testing.assert_allclose(ghost.base.position, 0.0, atol=1e-12)
+    assert ghost.visible
+    np.testing.assert_allclose(ghost.position, 0.0, atol=1e-12)
 
 
 def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
-    page, parts = two_hands, two_hands.editor._parts
+    page = two_hands
     choose(page, HANDS[0], "position")
     shape = np.full(14, 0.5)
     page.editor.show_parts(tool=False, planned=True)
-    page.set(page.final._enabled, True)
-    for field, position in zip(page.final._fields, shape, strict=True):
-        field._impl.value = position
+    page.set(FINAL, True)
+    for field, position in zip(page.ends, shape, strict=True):
+        field.value = position
     asked = page.editor.goals()[HANDS[0]].joint_positions
     assert asked is not None
     np.testing.assert_array_equal(asked, shape)
     page.editor.show_parts(tool=False, planned=False)
-    assert not parts._folder.visible
+    assert not page.field("Goal for").visible
     assert not gizmo(page, HANDS[0]).visible
     assert set(page.editor.goals()) == {"base"}
     page.editor.show_parts(tool=False, planned=True)
@@ -369,9 +384,9 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     assert not gizmo(page, HANDS[0]).visible
     page.editor.show(visible=True)
     assert gizmo(page, HANDS[0]).visible
-    assert not page.editor._angles.visible
+    assert not page.field(ANGLES).visible
     # Goals go to the robot, all of them.
-    page.editor._on_gizmo_moved(f"/end_effector_goals/{HANDS[0]}", STANDING)
+    page.drag(f"/end_effector_goals/{HANDS[0]}", STANDING)
     page.editor.place(STANDING, None, np.linspace(0.1, 0.7, 14), 0.0)
     np.testing.assert_allclose(
         gizmo(page, HANDS[0]).position, where(page, HANDS[0])[:3], atol=1e-12
@@ -383,7 +398,7 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     page.editor.offer_end_effectors(())
     assert page.editor.moving, "the goal is another one"
     page.editor.show_parts(tool=False, planned=True)
-    assert not parts._folder.visible
+    assert not page.field("Goal for").visible
     assert not gizmo(page, HANDS[0]).visible
     assert set(page.editor.goals()) == {"base"}
 
@@ -395,8 +410,8 @@ def base_goal(*numbers: float) -> Goal:
     return Goal.checked(list(numbers), [0.0, 0.0, 0.0, 1.0])
 
 
-def test_a_goal_that_others_send_is_shown_and_one_that_a_user_changes_stays(server: Any) -> None:
-    page = Editor(server, "sliding_masses")
+def test_a_goal_that_others_send_is_shown_and_one_that_a_user_changes_stays() -> None:
+    page = Editor("sliding_masses")
     editor = page.editor
     editor.follow({"base": base_goal(1.0, 2.0, 3.0)}, 0.0)
     assert not editor.placed, "there is no robot yet"
@@ -408,10 +423,10 @@ def test_a_goal_that_others_send_is_shown_and_one_that_a_user_changes_stays(serv
     editor.follow(sent, 2.0)
     assert editor.shows_sent_goal
     np.testing.assert_array_equal(editor.goals()["base"].position, [1.0, 2.0, 3.0])
-    assert editor._position.value == (1.0, 2.0, 3.0)
+    assert page.field(POSITION).value == (1.0, 2.0, 3.0)
     assert editor.settled_goals(LATER) is not None, "it is checked"
     # A user's change is not lost, until it is sent.
-    page.set(editor._position, (0.5, 0.0, 0.0))
+    page.set(POSITION, (0.5, 0.0, 0.0))
     assert not editor.shows_sent_goal
     editor.follow({"base": base_goal(7.0, 8.0, 9.0)}, 3.0)
     np.testing.assert_array_equal(editor.goals()["base"].position, [0.5, 0.0, 0.0])
@@ -425,8 +440,8 @@ def test_a_goal_that_others_send_is_shown_and_one_that_a_user_changes_stays(serv
     np.testing.assert_array_equal(editor.goals()["base"].position, POSE[:3])
 
 
-def test_goals_of_links_that_others_send_are_shown_with_their_parts(server: Any) -> None:
-    page = Editor(server, "three_joint_arm")
+def test_goals_of_links_that_others_send_are_shown_with_their_parts() -> None:
+    page = Editor("three_joint_arm")
     editor, link = page.editor, page.robot.links[-1].name
     editor.place(POSE, None, np.zeros(3), 0.0)
     aim = EndEffectorGoal.checked(link, [1.0, 2.0, 3.0])
@@ -441,9 +456,9 @@ def test_goals_of_links_that_others_send_are_shown_with_their_parts(server: Any)
     (shown,) = found[link].end_effectors
     np.testing.assert_array_equal(shown.position, aim.position)
     assert shown.quaternion is None
-    assert editor._parts.shown == link
-    assert editor._position.value == (1.0, 2.0, 3.0)
-    assert editor._gizmos[f"/end_effector_goals/{link}"].visible
+    assert page.field("Numbers of").value == link
+    assert page.field(POSITION).value == (1.0, 2.0, 3.0)
+    assert gizmo(page, link).visible
     both = {
         link: Goal.of_end_effectors([EndEffectorGoal.checked(link, [0, 1, 2, 0, 0, 0.6, 0.8])]),
         "base": base_goal(0.5, 0.0, 0.0),
@@ -456,22 +471,22 @@ def test_goals_of_links_that_others_send_are_shown_with_their_parts(server: Any)
     np.testing.assert_array_equal(found["base"].position, [0.5, 0.0, 0.0])
 
 
-def test_the_ghost_stands_where_the_robot_will_end(server: Any) -> None:
-    page = Editor(server, "three_joint_arm")
+def test_the_ghost_stands_where_the_robot_will_end() -> None:
+    page = Editor("three_joint_arm")
     editor = page.editor
     editor.place(POSE, None, np.zeros(3), 0.0)
-    page.set(editor._position, (1.0, 0.0, 0.0))
+    page.set(POSITION, (1.0, 0.0, 0.0))
     end = np.array([0.2, 0.1, 0.3, 0.0, 0.0, 0.6, 0.8])
     editor.show_check(GoalCheck(Verdict.PARTLY, shape=np.full(3, 0.1), base=end))
-    assert editor._ghost is not None
-    gizmo, ghost = editor._gizmos["/goal"], editor._ghost.base
+    gizmo, ghost = page.node("/goal"), page.node("/goal/ghost")
     # The ghost hangs on the gizmo, which stays at the goal.
     np.testing.assert_array_equal(gizmo.position, [1.0, 0.0, 0.0])
     R = matrix_from_quaternion(xyzw(gizmo.wxyz))
     np.testing.assert_allclose(gizmo.position + R @ ghost.position, end[:3], atol=1e-12)
     turned = Rotation.from_matrix(R) * Rotation.from_quat(xyzw(ghost.wxyz))
     np.testing.assert_allclose(turned.as_quat(), end[3:], atol=1e-12)
-    assert {solid.color for solid in editor._ghost._solids} == {COLORS[Verdict.PARTLY]}
+    solids = [each for each in page.server.scene.elements if each.kind == "add_mesh_simple"]
+    assert {each.color for each in solids} == {COLORS[Verdict.PARTLY]}
     assert len({*COLORS.values()}) == len(COLORS)
-    page.set(editor._position, (0.9, 0.0, 0.0))
+    page.set(POSITION, (0.9, 0.0, 0.0))
     np.testing.assert_allclose(ghost.position, 0.0, atol=1e-12)
