@@ -13,10 +13,9 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.lifecycle import TransitionCallbackReturn
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
-from support.control_loop import JOINTS, KD, KP, STATUS, TICK_NS, TIP, URDF, Loop, pose
+from support.control_loop import KD, KP, STATUS, TICK_NS, TIP, URDF, Loop, pose
 from support.executive_loop import STEP, Array
 from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
 from support.sentences import assert_one_sentence
@@ -49,29 +48,6 @@ def test_without_odom_the_base_is_estimated_and_then_the_thrusters_are_off(
     harness.spin_until(lambda: loop.status["state"] == "tracking", "the loop again")
     wrench, _ = loop.answer()
     np.testing.assert_allclose(wrench[:3], [KP, 0.0, 0.0], atol=1e-12)
-
-
-def test_a_pose_that_was_never_met_is_not_lost(harness: Harness) -> None:
-    node = harness.make(
-        CoordinatedControlNode, {"robot": "planar_manipulator", "tick_rate": 100.0}, name="control"
-    )
-    probe = harness.probe({STATUS: DiagnosticStatus}, latched=(STATUS,))
-    joints = probe.create_publisher(JointState, "joint_states", 10)
-    harness.matched(joints)
-    for tick in range(1, 6):
-        message = JointState(name=JOINTS, position=[0.1, 0.2], velocity=[0.0] * 2, effort=[0.0] * 2)
-        message.header.stamp.nanosec = tick * TICK_NS
-        joints.publish(message)
-        harness.settle(probe)
-    assert node.is_active
-    states = {
-        pair.value
-        for status in probe.messages[STATUS]
-        for pair in status.values
-        if pair.key == "state"
-    }
-    assert states == {"waiting"}, "nothing is stopped before anything began"
-    assert {status.level for status in probe.messages[STATUS]} == {DiagnosticStatus.OK}
 
 
 class Referenced(Loop):

@@ -179,23 +179,6 @@ def test_an_injection_that_is_no_fault_is_refused_with_a_sentence(harness: Harne
     assert not flight.plant.plant.active
 
 
-def test_time_goes_on_over_a_reset(harness: Harness) -> None:
-    flight = Commanded(harness, "joint_stuck slider_1 at 0.2 until 0.4")
-    flight.run(3)
-    flight.plant.plant.reset()
-    flight.run(10)
-    # Of ticks 3 to 12, 4 to 7 are under the fault.
-    np.testing.assert_allclose(flight.plant.plant.q, TICK * RATES * [6, 10, 10])
-
-
-def test_stamps_are_of_the_tick_they_show(harness: Harness) -> None:
-    flight = Commanded(harness, "sensor_delay odom 0.2")
-    flight.run(6)
-    assert [nanoseconds(m.header.stamp) for m in flight.probe.messages["odom"]] == [
-        k * 50_000_000 for k in range(7)
-    ]
-
-
 # Each noise is another one, so that one that is taken for another is noticed.
 NOISES = {
     "sensors.position_noise": 0.002,
@@ -223,12 +206,6 @@ def test_odom_has_the_covariances_of_its_noise(harness: Harness) -> None:
     rig.plant.plant.inject("clear")
     rig.step([0.0, 0.0, 0.0])
     assert rig.probe.last("odom").pose.covariance[7] == pytest.approx(position)
-
-
-def test_perfect_sensors_have_no_covariance(harness: Harness) -> None:
-    rig = Rig(harness)
-    rig.step([0.0, 0.0, 0.0])
-    assert not np.any(rig.probe.last("odom").pose.covariance)
 
 
 def diagnosed(probe: Probe, name: str) -> list[DiagnosticStatus]:

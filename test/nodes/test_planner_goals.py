@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,6 @@ from support.planner_flight import (
 from support.plant_rig import SLIDERS, TICK_NS
 from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
-from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.nodes.common.messages import goal_of
 from spacerobot_ros.planning import METHODS, GaitSchedule
@@ -199,27 +197,7 @@ def test_schedule_path_and_status_are_there_for_a_late_reader(flown: Flight) -> 
         assert late.last(topic) == flown.probe.last(topic)
 
 
-def test_markers_show_the_goal_and_the_path(harness: Harness) -> None:
-    flight = Flight(harness)
-    flight.probe.watch("markers", MarkerArray)
-    harness.connect()
-    flight.decide(NEAR)
-    (array,) = flight.probe.messages["markers"]
-    ghosts = [m for m in array.markers if m.ns == "goal"]
-    assert ghosts
-    for ghost in ghosts:
-        position, attitude = pose_arrays(ghost.pose)
-        np.testing.assert_allclose(position, NEAR[0])
-        assert attitude.magnitude() == 0.0
-    (line,) = (m for m in array.markers if m.type == Marker.LINE_STRIP)
-    path = flight.probe.last("planned_path")
-    assert [(p.x, p.y, p.z) for p in line.points] == [
-        (k.pose.position.x, k.pose.position.y, k.pose.position.z) for k in path.poses
-    ]
-
-
 REAL_TIME = {"time_mode": "realtime"}
-THOROUGH = {"optimal.cache": 0, "optimal.answers": 9999, "optimal.starts": 9999}
 
 
 class Gate:
@@ -279,24 +257,6 @@ def test_states_are_answered_at_rest_until_the_plan_is_there(flight: Flight, gat
     assert set(answered) <= set(states)
     assert len(answered) > 0.5 * len(states)
     assert flight.probe.count("gait_schedule") >= 1
-
-
-def test_a_node_that_ends_has_its_search_given_up(harness: Harness) -> None:
-    flight = Flight(
-        harness,
-        {"robot": "seven_joint_arm", "method": "optimal", **THOROUGH},
-        {"robot": "seven_joint_arm", **REAL_TIME},
-    )
-    flight.send(([0.0, 0.0, 0.0], [0.5, -0.3, 0.2]))
-    flight.start()
-    before = threading.active_count()
-    flight.harness.spin_until(lambda: threading.active_count() > before, "the search")
-    flight.ticks(10)
-    assert flight.states[-1] != "executing", "it searches still"
-    began = time.monotonic()
-    flight.planner.trigger_deactivate()
-    assert time.monotonic() - began < 1.6
-    flight.harness.spin_until(lambda: threading.active_count() <= before, "the thread is gone")
 
 
 def interrupted(harness: Harness, path: Path) -> Flight:

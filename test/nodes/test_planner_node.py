@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -19,13 +17,10 @@ from support.planner_flight import (
     HERE,
     NEAR,
     PLANNER,
-    PLANT,
-    TOPICS,
     TURNED,
     Flight,
     Place,
     goal_at,
-    pose_arrays,
     values_of,
 )
 from support.plant_rig import TICK_NS
@@ -33,7 +28,7 @@ from support.ros_harness import Harness, construction
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes import PlannerNode, PlantNode
+from spacerobot_ros.nodes import PlannerNode
 from spacerobot_ros.nodes.common.fly_to import action_class
 
 pytestmark = pytest.mark.usefixtures("one_plant")
@@ -218,27 +213,3 @@ def test_statuses_name_the_goal_by_its_stamp(harness: Harness) -> None:
 
 
 # -- without a stop ---------------------------------------------------------------------------
-
-
-URDF = Path(__file__).parents[2] / "urdf"
-
-
-def test_without_a_robot_it_takes_the_one_of_the_plant(harness: Harness) -> None:
-    planner = harness.make(PlannerNode, {**PLANNER, "robot": ""})
-    probe = harness.probe(TOPICS)
-    goals = probe.create_publisher(PoseStamped, "goal_pose", 10)
-    harness.connect()
-    assert planner.is_active
-    goals.publish(goal_at(NEAR))
-    harness.spin_until(
-        lambda: any("robot_description" in s.message for s in probe.messages["planner/status"]),
-        "a word that the goal waits for a robot",
-    )
-    harness.make(PlantNode, PLANT)
-    harness.spin_until(
-        lambda: values_of(probe.last("planner/status"))["state"] in ("reached", "failed"),
-        "the goal is decided",
-    )
-    assert values_of(probe.last("planner/status"))["state"] == "reached"
-    position, _ = pose_arrays(probe.last("odom").pose.pose)
-    np.testing.assert_allclose(position, NEAR[0], atol=1e-3)

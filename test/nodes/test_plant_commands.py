@@ -43,39 +43,6 @@ def test_a_command_of_the_right_stamp_steps_exactly_once(harness: Harness) -> No
     assert rig.diagnosed("commands", "refused") == 2
 
 
-@pytest.mark.slow
-def test_time_is_a_whole_number_of_ticks(harness: Harness) -> None:
-    rig = Rig(harness, {"tick_rate": 3.0})
-    for k in range(1, 5):
-        stamp = nanoseconds(rig.step([0.0, 0.0, 0.0]).header.stamp)
-        assert stamp == k * 333_333_333
-    harness.settle(rig.probe)
-    clocks = [nanoseconds(m.clock) for m in rig.probe.messages["/clock"]]
-    assert clocks == [nanoseconds(m.header.stamp) for m in rig.probe.messages["odom"]]
-
-
-@pytest.mark.parametrize(
-    ("offset_ns", "word"), [(-TICK_NS, "stale"), (-1, "stale"), (1, "ahead"), (10**12, "ahead")]
-)
-def test_a_command_of_another_stamp_is_refused_and_time_waits(
-    harness: Harness, offset_ns: int, word: str
-) -> None:
-    rig = Rig(harness)
-    rig.step([0.0, 0.0, 0.0])
-    rig.send([0.1, 0.1, 0.1], stamp_ns=rig.now_ns + offset_ns)
-    rig.wait_for_log(word)
-    harness.settle(rig.probe)
-    assert rig.probe.count("joint_states") == 2
-    rig.step([0.1, 0.0, 0.0])
-    status = rig.diagnosis("commands")
-    assert status.level == DiagnosticStatus.WARN
-    assert_one_sentence(status.message, "refused", word)
-    assert rig.diagnosed("commands", "refused") == 1
-    # The next diagnostics are about what is new.
-    rig.step([0.1, 0.0, 0.0])
-    assert rig.diagnosis("commands").level == DiagnosticStatus.OK
-
-
 def test_a_bad_command_is_a_tick_at_rest_with_a_reason(harness: Harness) -> None:
     rig = Rig(harness)
     for count, (velocity, names, reason) in enumerate(BAD_COMMANDS.values(), start=1):
@@ -91,37 +58,6 @@ def test_a_bad_command_is_a_tick_at_rest_with_a_reason(harness: Harness) -> None
         # The stack goes on.
         np.testing.assert_array_equal(rig.step([0.3, 0.2, 0.1]).velocity, [0.3, 0.2, 0.1])
         assert rig.diagnosis("commands").level == DiagnosticStatus.OK
-
-
-@pytest.mark.parametrize(
-    ("velocity", "names", "reason"),
-    [BAD_COMMANDS["NaN"], BAD_COMMANDS["unknown joint"]],
-    ids=["NaN", "unknown joint"],
-)
-def test_a_bad_command_is_logged(
-    harness: Harness, velocity: list[float], names: list[str], reason: str
-) -> None:
-    rig = Rig(harness)
-    rig.step(velocity, names)
-    rig.wait_for_log(reason)
-
-
-@pytest.mark.parametrize(
-    ("velocity", "names", "missing"),
-    [
-        ([0.2], ["slider_2"], "slider_1"),
-        ([0.5, -0.5], ["slider_3", "slider_1"], "slider_2"),
-        ([], [], "slider_1"),
-    ],
-)
-def test_a_command_that_leaves_a_joint_out_is_a_tick_at_rest(
-    harness: Harness, velocity: list[float], names: list[str], missing: str
-) -> None:
-    rig = Rig(harness)
-    rig.step([0.3, 0.2, 0.1])
-    np.testing.assert_array_equal(rig.step(velocity, names).velocity, np.zeros(3))
-    assert_one_sentence(rig.diagnosis("commands").message, f"joint '{missing}' is missing")
-    assert rig.diagnosed("commands", "refused") == 1
 
 
 # -- services ---------------------------------------------------------------------------------
@@ -241,48 +177,6 @@ def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness
     wait_for_velocity(rig, 0.2)
 
 
-@pytest.mark.parametrize("ahead_s", [0.493, 0.0, -0.1])
-def test_a_second_one_that_sends_by_turns_moves_nothing(harness: Harness, ahead_s: float) -> None:
-    """If it answers the states that are answered already, the plant latches a fault."""
-    rig = Rig(harness, {**REALTIME, "command_timeout": 0.5, "real_time_factor": 1.0})
-    rogue = harness.probe({}, name="rogue")
-    other = rogue.create_publisher(JointState, "joint_commands", 100)
-    harness.connect()
-    started(rig)
-    # The first answers every state, the second one in eight of them.
-    rig.probe.react["joint_states"] = lambda _: rig.send([0.0, 0.0, 0.0])
-
-    def intrude(state: JointState) -> None:
-        answer(state)
-        if rig.probe.count("joint_states") % 8 == 0:
-            message = command_at(rig.now_ns + round(ahead_s * 1e9))
-            message.velocity = [0.3, 0.0, 0.0]
-            other.publish(message)
-
-    answer = rig.probe.react["joint_states"]
-    rig.probe.react["joint_states"] = intrude
-    rig.wait_for_refusals(1)
-    if ahead_s == 0.0:
-        harness.spin_until(lambda: rig.plant.state is PlantState.LATCHED, "a latched fault")
-        assert rig.plant.status.reason == "second_commander"
-    assert_nothing_moves(rig)
-    moved = sum(any(m.velocity) for m in rig.probe.messages["joint_states"])
-    assert moved <= 2
-
-
-@pytest.mark.parametrize("timeout", [0.0, 1.0])
-def test_a_stamp_ahead_of_time_never_moves_a_joint(harness: Harness, timeout: float) -> None:
-    rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
-    stamp = started(rig)
-    for count, ahead in enumerate((2 * 10**9, 3600, 100), 1):
-        rig.send([0.3, 0.3, 0.3], stamp_ns=(stamp // 10**9 + ahead) * 10**9)
-        rig.wait_for_refusals(count)
-    assert rig.diagnosed("commands", "refused.early") == 3
-    assert_nothing_moves(rig, 15)
-    rig.send([0.2, 0.0, 0.0])
-    wait_for_velocity(rig, 0.2)
-
-
 def command_at(stamp_ns: int) -> JointState:
     message = JointState(name=["slider_1", "slider_2", "slider_3"], velocity=[0.1, 0.0, 0.0])
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
@@ -395,20 +289,6 @@ def test_a_lockstep_plant_does_not_wait_for_a_commander_that_is_gone(harness: Ha
     assert rig.ticks == 1
     rig.probe.destroy_publisher(rig.wrenches)
     harness.spin_until(lambda: rig.probe.count("joint_states") > 1, "a step", 3.0)
-
-
-def test_thrusters_are_off_when_their_commander_is_gone(harness: Harness) -> None:
-    rig = Manipulator(harness, actuation="effort")
-    rig.push(4.7)
-    rig.turn(0.0, 0.0)
-    rig.wait_for_state(2)
-    speed = rig.speed
-    rig.probe.destroy_publisher(rig.wrenches)
-    # The plant looks round for commanders every tenth of a second.
-    harness.spin_for(0.5)
-    rig.turn(0.0, 0.0)
-    rig.wait_for_state(3)
-    assert rig.speed == pytest.approx(speed, rel=1e-12)
 
 
 REST = [0.0, 0.0]

@@ -59,29 +59,6 @@ def test_joints_come_to_rest_when_the_commander_falls_silent(harness: Harness) -
     assert rig.diagnosed("commands", "timeouts") == 2
 
 
-def test_a_command_without_stamp_means_now(harness: Harness) -> None:
-    rig = Rig(harness, REALTIME)
-    harness.spin_until(lambda: rig.now_ns > 2_000_000_000, "two simulated seconds")
-    rig.send([0.3, 0.0, 0.0], stamp_ns=0)
-    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
-    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.0, "rest")
-    assert rig.diagnosed("commands", "refused") == 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("offset_s", "word"), [(-2, "old"), (3, "ahead"), (10**9, "ahead")])
-def test_real_time_refuses_commands_from_another_time(
-    harness: Harness, offset_s: int, word: str
-) -> None:
-    rig = Rig(harness, REALTIME)
-    harness.spin_until(lambda: rig.now_ns > 3_000_000_000, "three simulated seconds")
-    rig.send([0.3, 0.3, 0.3], stamp_ns=rig.now_ns + offset_s * 10**9)
-    rig.wait_for_refusals(1)
-    assert word in rig.diagnosis("commands").message
-    rig.wait("joint_states", rig.probe.count("joint_states") + 3)
-    assert not any(any(m.velocity) for m in rig.probe.messages["joint_states"])
-
-
 def test_real_time_holds_the_last_good_command(harness: Harness) -> None:
     rig = Rig(harness, {**REALTIME, "command_timeout": 0.0})
     rig.send([0.1, 0.0, -0.1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -22,7 +21,6 @@ from support import crossing
 from support.control_loop import Loop
 from support.odometry import pose_of, twist_of
 from support.oracles import PinocchioOracle
-from support.planner_flight import NEAR, Flight
 from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
 from support.ros_harness import LATCHED, Harness, nanoseconds
 from visualization_msgs.msg import Marker, MarkerArray
@@ -344,39 +342,3 @@ def test_beside_another_robot_a_controller_sees_every_pose(harness: Harness) -> 
         beside = loop.answer()
         np.testing.assert_array_equal(beside[0], alone[0])
         np.testing.assert_array_equal(beside[1], alone[1])
-
-
-def test_beside_another_robot_a_goal_is_reached(harness: Harness) -> None:
-    flight = Flight(harness)
-    stranger = flight.probe.create_publisher(JointState, "joint_states", 100)
-    harness.matched(stranger)
-
-    def disturb(message: JointState) -> None:
-        if list(message.name) != ["wing"]:
-            stranger.publish(joints(["wing"], (message.header.stamp.sec, 0)))
-
-    flight.probe.react["joint_states"] = disturb
-    flight.send(NEAR)
-    flight.start()
-    flight.wait("reached")
-
-
-def test_a_planner_does_not_take_the_pose_of_a_second_node_for_its_own(harness: Harness) -> None:
-    """It answers every odom at once with one of the same time, five metres away."""
-    flight = Flight(harness)
-    stranger = flight.probe.create_publisher(Odometry, "odom", 100)
-    harness.matched(stranger)
-
-    def contradict(message: Odometry) -> None:
-        if message.pose.pose.position.x < 2:
-            other = copy.deepcopy(message)
-            other.pose.pose.position.x += 5.0
-            stranger.publish(other)
-
-    flight.probe.react["odom"] = contradict
-    flight.send(NEAR)
-    flight.start()
-    flight.wait("reached")
-    last = flight.probe.messages["odom"][-4:]
-    nearest = min(abs(m.pose.pose.position.x - NEAR[0][0]) for m in last)
-    assert nearest < 0.01

@@ -83,22 +83,6 @@ def test_an_abort_of_the_plant_ends_the_goal_until_there_is_another(
     flies_again(flight, "idle", "executing", "aborted", "refused")
 
 
-def test_a_planner_that_stood_still_ends_its_goal_with_the_true_reason(harness: Harness) -> None:
-    flight = Flight(harness, {**SLOW, **BACKGROUND}, REAL_TIME)
-    flight.start()
-    flight.send(NEAR)
-    flight.wait("executing")
-    flight.ticks(10)
-    harness.executor.remove_node(flight.planner)
-    flight.ticks(120)
-    harness.executor.add_node(flight.planner)
-    status = flight.wait("aborted")
-    assert_one_sentence(status.message, "too old")
-    flight.ticks(10)  # Commands that were on their way.
-    stays(flight)
-    flies_again(flight, "idle", "executing", "aborted")
-
-
 def test_only_the_last_of_the_states_that_wait_is_answered(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -125,21 +109,6 @@ def test_only_the_last_of_the_states_that_wait_is_answered(
     waiting = [s for s in map(stamp_of, flight.probe.messages["joint_states"]) if s > seen]
     assert min(answered()) >= waiting[6]
     assert answered() == sorted(set(answered()))
-
-
-def test_a_pause_ends_nothing_and_a_goal_may_come_in_it(harness: Harness) -> None:
-    flight = Flight(harness, plant=REAL_TIME)
-    flight.start()
-    flight.send(NEAR)
-    flight.wait("executing")
-    pause(flight, True)
-    harness.spin_until(lambda: flight.plant.state is PlantState.PAUSED, "the pause")
-    harness.spin_for(0.2)
-    flight.send(OTHER)
-    harness.settle(flight.probe)
-    pause(flight, False)
-    flight.wait("reached")
-    assert max(flight.error_to(OTHER)) <= 1e-3
 
 
 def test_a_goal_on_file_is_not_resumed_while_the_plant_is_latched(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from mcap.reader import make_reader
-from nav_msgs.msg import Odometry
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import qos_profile_system_default
 from rclpy.serialization import deserialize_message
@@ -18,7 +17,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from support.planner_flight import PLANNER
 from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack, parameters_of
-from support.ros_harness import LATCHED, Harness, nanoseconds
+from support.ros_harness import LATCHED, Harness
 
 from spacerobot_ros import __version__, read_bag
 from spacerobot_ros.model import load_robot
@@ -58,30 +57,6 @@ def test_recorded_is_published_on_every_topic(stack: Stack) -> None:
     assert bag["/robot_description"][0].data == load_robot(URDF).urdf
 
 
-def test_messages_carry_simulated_time(stack: Stack) -> None:
-    stack.fly()
-    stack.stop()
-    bag = stack.close_bag()
-    assert bag.log_times == sorted(bag.log_times)
-    ticks = {k * 50_000_000 for k in range(len(bag["/clock"]))}
-    for entry in bag.by_topic["/clock"]:
-        assert entry.log_ns == entry.publish_ns == nanoseconds(entry.message.clock)
-    for topic in ("/odom", "/base_pose", "/joint_states", "/joint_commands"):
-        for entry in bag.by_topic[topic]:
-            stamp = nanoseconds(entry.message.header.stamp)
-            assert entry.publish_ns == stamp
-            assert entry.log_ns == stamp, "a state is there at its own time"
-    for topic in ("/momentum", "/planner/status", "/markers", "/robot_description"):
-        for entry in bag.by_topic[topic]:
-            assert entry.log_ns in ticks
-            assert entry.publish_ns == entry.log_ns
-    # What came before the first clock message has that one's time.
-    for topic in ("/robot_description", "/goal_pose"):
-        assert bag.by_topic[topic][0].log_ns == 0
-    momentum = [entry.log_ns for entry in bag.by_topic["/momentum"]]
-    assert momentum == [entry.log_ns for entry in bag.by_topic["/odom"]]
-
-
 def test_description_parameters_and_version_are_in_the_bag(stack: Stack) -> None:
     for node in (stack.plant, stack.planner):
         stack.recorder.describe(f"parameters/{node.get_name()}", parameters_of(node))
@@ -106,35 +81,6 @@ def test_description_parameters_and_version_are_in_the_bag(stack: Stack) -> None
             known = declared[key].value
             # An empty list is declared without a value.
             assert value == ([] if known is None else np.array(known).tolist()), key
-
-
-def test_named_objects_of_a_file_are_metadata_and_the_wait_for_a_clock_is_as_given(
-    harness: Harness, tmp_path: Path
-) -> None:
-    about = {"crew": {"pilot": "none"}, "site": {"table": "air bearing", "number": "7"}}
-    file = tmp_path / "about.json"
-    file.write_text(json.dumps(about), "utf-8")
-    bag = tmp_path / "notes.mcap"
-    talk = harness.probe({}).create_publisher(String, "/talk", 10)
-    named = {"bag": str(bag), "topics": "/talk", "describe": str(file)}
-    recorder = harness.make(RecorderNode, {**named, "clock_wait": 3600.0})
-    harness.spin_until(lambda: "/talk" in recorder.topics, "the subscription")
-    harness.matched(talk)
-    talk.publish(String(data="early"))
-    recording = recorder.recording
-    assert recording is not None
-    harness.spin_until(lambda: len(recording.early_messages) == 1, "the message")
-    now = recording._wall_time
-    recording._wall_time = lambda: now() + 3500 * 10**9
-    talk.publish(String(data="late"))
-    harness.spin_until(lambda: len(recording.early_messages) == 2, "the next message")
-    recorder.flush()
-    assert recorder.messages_recorded == 0
-    recording._wall_time = lambda: now() + 3700 * 10**9
-    harness.spin_until(lambda: recorder.messages_recorded == 2, "the end of the wait")
-    recorder.trigger_shutdown()
-    metadata = BagContent(bag).metadata
-    assert {name: metadata[name] for name in about} == about
 
 
 def test_a_recorder_of_events_alone_writes_them_without_a_clock(
@@ -218,24 +164,6 @@ def test_a_topic_that_appears_in_flight_is_recorded(stack: Stack) -> None:
     assert [m.data for m in bag["/notes"]] == ["before anybody listened", "after"]
 
 
-def test_nothing_is_recorded_while_inactive(harness: Harness, tmp_path: Path) -> None:
-    stack = Stack(harness, tmp_path / "flight.mcap")
-    stack.configure(*STREAMS, *LATCHED_TOPICS)
-    stack.fly()
-    stack.stop()
-    assert stack.recorder.messages_recorded == 0
-    first = stack.probe.count("/odom")
-    stack.recorder.trigger_activate()
-    stack.fly(0.02)
-    stack.stop()
-    second = stack.probe.count("/odom")
-    stack.recorder.trigger_deactivate()
-    stack.fly(0.0)
-    stack.stop()
-    bag = stack.close_bag()
-    assert bag["/odom"] == stack.probe.messages["/odom"][first:second]
-
-
 def test_a_bag_is_whole_while_the_flight_goes_on(stack: Stack, tmp_path: Path) -> None:
     stack.fly()
     stack.stop()
@@ -265,27 +193,6 @@ def test_a_shutdown_completes_the_bag(stack: Stack) -> None:
     stack.stop()
     assert stack.recorder.trigger_shutdown() is TransitionCallbackReturn.SUCCESS
     assert BagContent(stack.bag)["/odom"] == stack.probe.messages["/odom"]
-
-
-def test_a_recorder_that_is_up_before_the_plant_keeps_one_time(
-    harness: Harness, tmp_path: Path
-) -> None:
-    bag = tmp_path / "flight.mcap"
-    recorder = harness.make(RecorderNode, {"bag": str(bag), "flush_period": 0.05})
-    probe = harness.probe({"odom": Odometry})
-    probe.create_publisher(String, "/notes", LATCHED).publish(String(data="before the clock"))
-    harness.spin_until(lambda: "/notes" in recorder.topics, "a subscription")
-    harness.spin_for(0.3)
-    plant = harness.make(PlantNode, {**PLANT, "time_mode": "realtime", "real_time_factor": 10.0})
-    harness.spin_until(lambda: plant.tick > 30, "some ticks")
-    plant.trigger_deactivate()
-    harness.settle(probe)
-    recorder.trigger_shutdown()
-    content = BagContent(bag)
-    assert [m.data for m in content["/notes"]] == ["before the clock"]
-    # What comes before the first clock message has that one's time, and not wall time.
-    assert max(content.log_times) <= plant.time_ns
-    assert content.log_times == sorted(content.log_times)
 
 
 def test_a_recording_in_a_namespace_has_the_topics_of_it(harness: Harness, tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 from support.altered_bags import altered
 from support.command_line import CliRunner, Result
 from support.recorded_stack import Stack, has_parameters, parameters_of
@@ -24,7 +23,6 @@ from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros import fly, load_scenario, read_bag
-from spacerobot_ros.bag import RecordingError
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.flight.verification import verify_bag
@@ -167,17 +165,6 @@ def test_a_flight_with_refused_commands_is_verified(
     assert result.largest < 1e-12
 
 
-def test_a_latched_fault_rests_for_the_rest_of_the_flight(harness: Harness, tmp_path: Path) -> None:
-    parameters = {**VELOCITY, "beyond_limits": "refuse", "latched_faults": "beyond_limits"}
-    bag = Flight(harness, tmp_path / "flown.mcap", parameters, sliding).fly()
-    assert verify_bag(bag).difference is None
-    # It rests from tick 37 on: a plant that only clips would not.
-    clips = altered(bag, tmp_path / "b.mcap", parameters={"beyond_limits": '"clip"'})
-    difference = verify_bag(clips).difference
-    assert difference is not None
-    assert difference.time == pytest.approx(38 / 20)
-
-
 def test_faults_and_noise_are_flown_again(harness: Harness, tmp_path: Path) -> None:
     parameters = {
         **EFFORT,
@@ -193,24 +180,6 @@ def test_faults_and_noise_are_flown_again(harness: Harness, tmp_path: Path) -> N
     difference = verify_bag(again).difference
     assert difference is not None
     assert (difference.time, difference.field) == (0.0, "position of shoulder")
-
-
-def test_a_reset_is_refused(harness: Harness, tmp_path: Path) -> None:
-    flight = Flight(harness, tmp_path / "flown.mcap", VELOCITY, sliding)
-    client = flight.probe.create_client(Trigger, "/plant/reset")
-    flight.harness.spin_until(client.service_is_ready, "the service")
-    flown = flight._answer
-
-    def answer(tick: int) -> Sequence[Any]:
-        if tick == 20 and not called:
-            called.append(client.call_async(Trigger.Request()))
-            return []
-        return flown(tick)
-
-    called: list[Any] = []
-    flight._answer = answer
-    with pytest.raises(RecordingError, match=r"was reset at 1 s"):
-        verify_bag(flight.fly())
 
 
 REFERENCE_BAG = share_directory() / "bags" / "sliding_masses.mcap"
