@@ -114,20 +114,6 @@ def test_tumbling_keeps_momentum_and_energy(urdf: str) -> None:
     assert energy <= 1e-11
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("urdf", [without_stops(SERVICER), random_urdf(1)], ids=["servicer", "any"])
-def test_tumbling_for_long_keeps_momentum_and_energy(
-    urdf: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
-    robot = SpaceRobot.from_urdf(urdf)
-    start = tumbling(robot, np.random.default_rng(5), 10.0 if robot.total_mass > 100 else 1.0)
-    linear, angular, energy = drifts(EffortPlant(robot, 0.1, start), ticks=1000)
-    assert linear <= 1e-12
-    assert angular <= 1e-12
-    assert energy <= 1e-11
-
-
 def test_momenta_are_constant_to_the_last_bit() -> None:
     robot = robot_of(random_urdf(2))
     rng = np.random.default_rng(8)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
@@ -18,7 +17,7 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
+from spacerobot_ros.simulation import EffortPlant, VelocityPlant
 from spacerobot_ros.simulation.actuators import (
     PlantWithFaults,
     ThrusterPlant,
@@ -341,45 +340,6 @@ def test_energy_is_lost_when_a_moving_joint_jams() -> None:
     # Within the millisecond the free motion goes on, which changes the energy by nothing.
     assert before[6] - plant.momentum[6] == pytest.approx(lost, rel=1e-6)
     np.testing.assert_allclose(plant.momentum[:6], before[:6], atol=1e-12)
-
-
-@pytest.mark.slow
-def test_a_held_joint_is_like_one_that_is_fixed_in_the_urdf() -> None:
-    """Another robot, in whose URDF the joint is fixed, is the reference."""
-    text = urdf("servicer")
-    place = 0.7
-    fixed = re.sub(
-        r'<joint name="elbow_pitch" type="revolute">(.*?)<origin xyz="([^"]*)"(?: rpy="[^"]*")?/>',
-        rf'<joint name="elbow_pitch" type="fixed">\1<origin xyz="\2" rpy="0 {place} 0"/>',
-        text,
-        flags=re.DOTALL,
-    )
-    assert 'name="elbow_pitch" type="fixed"' in fixed
-    assert 'axis xyz="0 1 0"' in re.search(r'name="elbow_pitch".*?</joint>', text, re.DOTALL)[0]  # type: ignore[index]
-    whole, rigid = robot_of(text), SpaceRobot.from_urdf(fixed)
-    shape = np.array([0.1, -1.0, place, 0.2, 0.8, 0.1])
-    rates = np.array([0.1, -0.1, 0.0, 0.2, 0.1, -0.1])
-    others = np.array([0, 1, 3, 4, 5])
-    start = {"linear_momentum": np.array([3.0, -2.0, 1.0]), "angular_momentum": np.full(3, 5.0)}
-    held = pushed(
-        EffortPlant(
-            whole, TICK, InitialState(joint_positions=shape, joint_velocities=rates, **start)
-        ),
-        "joint_stuck elbow_pitch",
-    )
-    reference = EffortPlant(
-        rigid,
-        TICK,
-        InitialState(joint_positions=shape[others], joint_velocities=rates[others], **start),
-    )
-    rng = np.random.default_rng(0)
-    for effort, wrench in thrusts(rng, 6, 40):
-        held.step(effort, 3 * wrench)
-        reference.step(effort[others], 3 * wrench)
-    np.testing.assert_allclose(held.q[others], reference.q, atol=1e-10)
-    np.testing.assert_allclose(held.pose, reference.pose, atol=1e-10)
-    np.testing.assert_allclose(held.twist, reference.twist, atol=1e-10)
-    assert held.q[2] == place
 
 
 # -- thrusters --------------------------------------------------------------------------------

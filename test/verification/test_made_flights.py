@@ -596,59 +596,6 @@ def test_a_missing_command_is_named(tmp_path: Path) -> None:
     assert "no message on /joint_commands is stamped 0.5 s" in str(difference)
 
 
-def without_number(message: JointState) -> JointState:
-    message.velocity[1] = math.nan
-    return message
-
-
-def test_a_refused_command_is_named_with_the_reason(tmp_path: Path) -> None:
-    bag = altered(REFERENCE, tmp_path / "b.mcap", "/joint_commands", 120, without_number)
-    difference = verify_bag(bag).difference
-    assert difference is not None
-    assert difference.time == pytest.approx(121 * TICK)
-    assert "the command on /joint_commands stamped 12 s is rejected: a value is not finite" in str(
-        difference
-    )
-
-
-def test_a_latched_fault_is_named_with_its_time(tmp_path: Path) -> None:
-    latching = {"latched_faults": '"not_finite"'}
-    bag = altered(
-        REFERENCE, tmp_path / "b.mcap", "/joint_commands", 120, without_number, parameters=latching
-    )
-    difference = verify_bag(bag).difference
-    assert difference is not None
-    assert difference.time == pytest.approx(121 * TICK)
-    assert "a fault latched at 12 s; rearming is not recorded" in str(difference)
-
-
-@pytest.mark.parametrize("tick", [0, 33])
-def test_faults_that_were_injected_are_injected_again(tmp_path: Path, tick: int) -> None:
-    """Into a flight that was sound: it differs from the tick on in which the fault begins."""
-    lines = {
-        round(tick * TICK * 1e9) + 7: "joint_slow slider_2 0.5",
-        round((tick + 40) * TICK * 1e9): "joint_broken nothing",
-    }
-    difference = verify_bag(altered(REFERENCE, tmp_path / "b.mcap", injected=lines)).difference
-    assert difference is not None
-    assert difference.time == pytest.approx((tick + 1) * TICK)
-    assert difference.field == "position of slider_2"
-    way = difference.recorded - difference.expected
-    assert way == pytest.approx(difference.recorded - states_at(tick)[1] - way, rel=1e-6)
-    assert (
-        verify_bag(
-            altered(REFERENCE, tmp_path / "c.mcap", injected={0: "joint_stuck slider_2 at 900"})
-        ).difference
-        is None
-    )
-
-
-def states_at(tick: int) -> list[float]:
-    """Return the recorded joint positions of a tick."""
-    positions = read_bag(REFERENCE)["/joint_states"].field("position")
-    return [float(x) for x in positions[tick]]
-
-
 def test_a_joint_that_the_robot_does_not_have_is_refused(tmp_path: Path) -> None:
     text = b'joint name="slider_2"', b'joint name="slider_two"'
     with pytest.raises(SpaceRobotError) as refusal:

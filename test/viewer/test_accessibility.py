@@ -23,6 +23,16 @@ pytestmark = [
 
 SERVICER = ("--params-file", str(ROOT / "config" / "servicer.yaml"))
 SIZES = {"desktop": (1280, 900), "phone": (390, 780)}
+CUT = """
+[...document.querySelectorAll("button, label, [role=tab], .mantine-Text-root, div")]
+  .filter(each => each.checkVisibility() && !each.closest("canvas"))
+  .filter(each => [...each.childNodes].some(part => part.nodeType === 3 && part.data.trim()))
+  .filter(each => each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0)
+  .filter(each => getComputedStyle(each).overflowX !== "visible")
+  .map(each => each.textContent.trim().slice(0, 60))
+"""
+"""Texts that are wider than the element that clips them."""
+
 LOOK_BACK = '[role=slider][aria-label="Look back to (s)"]'
 
 
@@ -45,6 +55,8 @@ def test_the_live_page(dark: bool, nodes: Processes, tmp_path: Path) -> None:
                 page.press(tab)
                 page.draw()
                 assert problems(window) == [], (size, tab)
+                assert window.evaluate(CUT) == [], (size, tab)
+                assert window.evaluate("document.documentElement.scrollWidth") <= width
                 keep_picture(window, f"page-{tab}-{'dark' if dark else 'light'}-{size}")
 
 
