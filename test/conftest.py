@@ -128,6 +128,23 @@ def worker_domain() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def interpreted(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Have quick tests run models in CasADi's virtual machine: to compile takes longer."""
+    with pytest.MonkeyPatch.context() as patch:
+        if "not slow" in request.config.option.markexpr:
+            patch.setenv("SPACEROBOT_COMPILE", "0")
+        yield
+
+
+@pytest.fixture(scope="module")
+def compiled() -> Iterator[None]:
+    """Compile models, which lanes do not do without."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("SPACEROBOT_COMPILE", raising=False)
+        yield
+
+
 @pytest.fixture
 def ros_domain() -> Iterator[int]:
     """Return the number of a ROS domain that is this test's own."""

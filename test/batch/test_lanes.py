@@ -47,6 +47,8 @@ from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.config import SensorConfig
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 NUMBERS = (
     *("pose", "twist", "q", "qdot", "momentum", "measured_pose", "measured_q"),
     *("peak_rate", "peak_effort", "peak_wrench", "impulse"),

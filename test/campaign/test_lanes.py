@@ -28,6 +28,8 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import share_directory
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 DISPERSED: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},
     "inertia.*": {"norm": {"loc": 1.0, "scale": 0.03}},

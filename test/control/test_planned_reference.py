@@ -41,7 +41,8 @@ PLACE = np.array([0.3, -0.2, 0.1])
 
 
 def docked(goal: Goal | None = None, **controller: Any) -> Flight:
-    scenario = load_scenario("free_flyer").with_overrides("coordinated_control", controller)
+    quick = {"plan.intervals": 15, **controller}
+    scenario = load_scenario("free_flyer").with_overrides("coordinated_control", quick)
     return fly_scenario(scenario if goal is None else scenario.with_other_goal(goal))
 
 
@@ -73,6 +74,15 @@ def test_a_planned_docking_takes_less_propellant_in_the_same_time() -> None:
     # Feedback takes the rest.
     assert 0.7 * planned.propellant < planned.planned_propellant < planned.propellant
     assert (straight.paths, straight.planned_propellant) == ((), None)
+    thrust = straight.commands["base_wrench"].values
+    assert np.linalg.norm(thrust[:, :3], axis=1).max() < 0.4 * (1 + 1e-9)
+    # The near side of the panel is the plane y = 0.69 m, along all of the way.
+    corners = 0.15 * np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)])
+    for flight in (planned, straight):
+        turns = Rotation.from_quat(flight.pose[:, 3:])
+        edges = np.max([flight.pose[:, 1] + turns.apply(each)[:, 1] for each in corners], axis=0)
+        assert flight.clearance is not None
+        assert flight.clearance.nearest.distance == pytest.approx(0.69 - edges.max(), abs=2e-3)
 
 
 def test_a_goal_behind_a_panel_is_reached_round_it() -> None:
@@ -127,7 +137,8 @@ class Follower:
 
     def __init__(self, **config: Any) -> None:
         scenario = load_scenario("free_flyer")
-        self.config = replace(scenario.controller, tick_rate=50.0, **config)
+        plan = replace(scenario.controller.plan, intervals=15)
+        self.config = replace(scenario.controller, **{"plan": plan, "tick_rate": 50.0, **config})
         robot = SpaceRobot.from_file(robot_file("jet_cube"))
         self.executive = ControlExecutive(build_controller(robot, self.config), self.config)
         self.time, self.places = 0.0, list[np.ndarray]()
@@ -251,7 +262,7 @@ def ball(place: np.ndarray) -> RobotDescription:
 
 def test_a_motion_is_blocked_when_it_first_comes_too_near() -> None:
     """To a ball in the middle of its way, through which it flies half a metre deep."""
-    rig = Follower()
+    rig = Follower(plan=load_scenario("free_flyer").controller.plan)
     rig.answer()
     aim = PLACE + np.array([1.6, 0.3, -0.2])
     rig.executive.submit("base", IdentifiedGoal(Goal.from_rotvec(aim, [0.2, 0.1, 0.4])))

@@ -17,6 +17,8 @@ from spacerobot_ros.environments import episodes
 from spacerobot_ros.environments.tasks import Reorient, Task
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
+pytestmark = pytest.mark.usefixtures("compiled")
+
 ARM, REACH, OWN = "spacerobot/ReorientArm-v0", "spacerobot/Reach-v0", "spacerobot/Task-v0"
 
 CAMPAIGN = """

@@ -113,32 +113,13 @@ def test_a_part_that_is_not_asked_for_is_kept() -> None:
     assert turned.succeeded
     np.testing.assert_allclose(turned.pose[-1, :3], [0.4, -0.2, 0.1], atol=2e-3)
     sliders = SpaceRobot.from_file(robot_file("sliding_masses"))
-    moved = fly(sliders, position=[0.42, -0.2, 0.1], method="lie_bracket", parameters=start)
+    quick = {"planner.lie_bracket.t1": 10.0, "planner.lie_bracket.cycle_period": 2.0}
+    moved = fly(sliders, position=[0.42, -0.2, 0.1], method="lie_bracket", parameters=start | quick)
     assert moved.succeeded
     turn = Rotation.from_quat(attitude).inv() * Rotation.from_quat(moved.pose[-1, 3:])
     assert turn.magnitude() < 2e-3
     assert moved.goal is not None
     np.testing.assert_allclose(moved.goal.quaternion, attitude, atol=1e-12)
-
-
-def test_a_body_without_a_joint_docks_past_a_panel_by_its_thrusters() -> None:
-    """As it is, and with a thruster that never opens, which takes longer."""
-    flown = [fly_scenario(load_scenario(name)) for name in ("free_flyer", "faults/closed_nozzle")]
-    corners = 0.15 * np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)])
-    for flight in flown:
-        assert flight.succeeded, flight.message
-        error = Rotation.from_quat(flight.pose[-1, 3:]).inv() * Rotation.from_rotvec([0, 0, 3.1])
-        assert np.linalg.norm(flight.pose[-1, :3] - [2.0, 0.4, 0.1]) < 5e-3
-        assert error.magnitude() < 1e-2
-        thrust = flight.commands["base_wrench"].values
-        assert np.linalg.norm(thrust[:, :3], axis=1).max() < 0.4 * (1 + 1e-9)
-        # The near side of the panel is the plane y = 0.69 m, along all of the way.
-        turns = Rotation.from_quat(flight.pose[:, 3:])
-        edges = np.max([flight.pose[:, 1] + turns.apply(each)[:, 1] for each in corners], axis=0)
-        assert flight.clearance is not None
-        assert flight.clearance.nearest.distance == pytest.approx(0.69 - edges.max(), abs=2e-3)
-    assert flown[1].manoeuvre_time > flown[0].manoeuvre_time
-    assert all(each.propellant > 0.003 for each in flown if each.propellant is not None)
 
 
 def statuses(flight: Flight) -> list[tuple[float, ControllerStatus]]:

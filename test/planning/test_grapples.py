@@ -48,7 +48,8 @@ HERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 def boomed(**options: Any) -> ThrustPlanner:
     robot = SpaceRobot.from_urdf(BOOMED)
     propulsion = Propulsion.within(0.8, 0.1)
-    return ThrustPlanner(robot, propulsion, ThrustOptions(**options), "end_effector")
+    chosen = ThrustOptions(**{"intervals": 20, **options})
+    return ThrustPlanner(robot, propulsion, chosen, "end_effector")
 
 
 def slab(place: tuple[float, ...], v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> BodyMotion:

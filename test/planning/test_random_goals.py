@@ -34,7 +34,7 @@ FOLDER = Path(__file__).parents[2] / "urdf"
 
 
 @pytest.fixture(autouse=True)
-def _interpreted() -> None:
+def _interpreted(compiled: None) -> None:
     """Compile, in place of the folder's choice: these flights are long."""
 
 
