@@ -118,11 +118,11 @@ class Elements:
         self.elements.clear()
 
     def named(self, label: str) -> Element:
-        """Return the element that is no tab with a label or path."""
+        """Return the element that is no tab with a label, title or path."""
         (found,) = (
             each
             for each in self.elements
-            if label in (each.shown.get("label"), each.shown.get("name")) and each.kind != "add_tab"
+            if label in map(each.shown.get, ("label", "title", "name")) and each.kind != "add_tab"
         )
         return found
 

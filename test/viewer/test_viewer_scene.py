@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial import ConvexHull
+from support.page_elements import Element, Server
+from support.random_robots import random_chain_urdf
 from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision.geometry import collision_visuals
@@ -27,23 +27,33 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.viewer import scene
 from spacerobot_ros.viewer.content import GoalErrors
-from spacerobot_ros.viewer.page import CAMERA, Page, Plots, _Plot, view_beside_panel
-from spacerobot_ros.viewer.server import ViewerConfig, start_server, stop_server
+from spacerobot_ros.viewer.page import CAMERA, Page, Plots, view_beside_panel
+from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import Measured, Momenta, StackState
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[Any]:
-    server = start_server("127.0.0.1", 0)
-    yield server
-    stop_server(server)
+@pytest.fixture
+def server() -> Any:
+    return Server()
+
+
+def solids(server: Any) -> list[Element]:
+    return [each for each in server.scene.elements if each.kind == "add_mesh_simple"]
+
+
+def texts(server: Any) -> list[Element]:
+    return [each for each in server.gui.elements if each.kind == "add_html"]
+
+
+def paths_in(server: Any) -> list[str]:
+    return [each.name for each in server.scene.elements]
 
 
 def pose_of(server: Any, name: str) -> Array:
     """Return the pose (4, 4) in the world of a node, from those of all above it."""
     pose, parts = np.eye(4), name.strip("/").split("/")
     for depth in range(1, len(parts) + 1):
-        handle = server.scene.get_handle_by_name("/" + "/".join(parts[:depth]))
+        handle = server.scene.named("/" + "/".join(parts[:depth]))
         local = np.eye(4)
         local[:3, :3] = matrix_from_quaternion(scene.xyzw(handle.wxyz))
         local[:3, 3] = handle.position
@@ -53,7 +63,6 @@ def pose_of(server: Any, name: str) -> Array:
 
 @pytest.mark.parametrize("name", ["servicer", "sliding_masses", "surveyor"])
 def test_links_are_drawn_where_pinocchio_has_them(server: Any, name: str) -> None:
-    server.scene.reset()
     robot = load_robot(robot_file(name))
     said: list[str] = []
     drawing = scene.RobotDrawing(server.scene, "/robot", robot, on_note=said.append)
@@ -69,30 +78,30 @@ def test_links_are_drawn_where_pinocchio_has_them(server: Any, name: str) -> Non
     pin.framesForwardKinematics(model, data, full)
     drawing.place(full[:7])
     drawing.set_joint_positions(q)
-    paths = drawing._node_paths(robot)
+    drawing.show_names(visible=True)
+    labels = [each for each in server.scene.elements if each.kind == "add_label"]
+    paths = {each.text: each.name.removesuffix("/name") for each in labels}
     for link in robot.links:
         expected = data.oMf[model.getFrameId(link.name)].homogeneous
         np.testing.assert_allclose(pose_of(server, paths[link.name]), expected, atol=1e-6)
-    assert len(drawing._solids) == sum(len(link.shapes) for link in robot.links)
+    assert len(solids(server)) == sum(len(link.shapes) for link in robot.links)
     assert said == []
     drawing.paint((1, 2, 3))
-    assert {solid.color for solid in drawing._solids} == {(1, 2, 3)}
+    assert {solid.color for solid in solids(server)} == {(1, 2, 3)}
 
 
 def test_a_mesh_that_is_not_there_is_said_and_the_rest_is_drawn(server: Any) -> None:
-    server.scene.reset()
     robot = load_robot(robot_file("servicer"))
     lost = '<visual><geometry><mesh filename="package://none/lost.stl"/></geometry></visual>'
     text = robot.urdf.replace("<visual>", f"{lost}<visual>", 1)
     said: list[str] = []
-    drawing = scene.RobotDrawing(server.scene, "/robot", parse_robot(text), on_note=said.append)
+    scene.RobotDrawing(server.scene, "/robot", parse_robot(text), on_note=said.append)
     assert len(said) == 1
     assert "lost.stl" in said[0]
-    assert len(drawing._solids) == sum(len(link.shapes) for link in robot.links)
+    assert len(solids(server)) == sum(len(link.shapes) for link in robot.links)
 
 
 def test_a_robot_without_shapes_is_seen(server: Any) -> None:
-    server.scene.reset()
     text = (
         '<robot name="bare"><link name="a"/><link name="b"/><joint name="j" type="fixed">'
         '<parent link="a"/><child link="b"/><origin xyz="1 2 2"/></joint></robot>'
@@ -103,21 +112,20 @@ def test_a_robot_without_shapes_is_seen(server: Any) -> None:
         'ixz="0" iyz="0"/></inertial></link>',
     )
     robot = parse_robot(text)
-    drawing = scene.RobotDrawing(server.scene, "/robot", robot)
-    assert len(drawing._solids) == 3, "two balls and the bar between them"
+    scene.RobotDrawing(server.scene, "/robot", robot)
+    assert len(solids(server)) == 3, "two balls and the bar between them"
     assert scene.reach_of(robot) == pytest.approx(3.0)
 
 
 def test_a_line_connects_the_points_that_it_is_given(server: Any) -> None:
-    server.scene.reset()
     line = scene.Lines(server.scene, "/path", (1, 2, 3))
     points = np.cumsum(np.random.default_rng(1).normal(size=(100, 3)), axis=0)
     for count in (0, 1, 2, 3, 33, 34, 70, 100, 5, 1, 2):
         line.draw(points[:count])
-        handle = server.scene.get_handle_by_name("/path")
+        handle = server.scene.named("/path")
         assert handle.visible == (count >= 2)
         if count >= 2:
-            assert handle.colors.tolist() == [1, 2, 3], "one for all segments"
+            assert handle.colors == (1, 2, 3), "one for all segments"
             np.testing.assert_allclose(handle.points[:, 0], points[: count - 1], atol=1e-5)
             np.testing.assert_allclose(handle.points[:, 1], points[1:count], atol=1e-5)
 
@@ -133,7 +141,7 @@ def test_a_robot_far_from_the_origin_is_looked_at_and_has_a_grid_below(server: A
     position, look_at = view_beside_panel(at, reach * CAMERA, 1.6)
     np.testing.assert_allclose(server.initial_camera.look_at, look_at)
     np.testing.assert_allclose(server.initial_camera.position, position)
-    grid = server.scene.get_handle_by_name("/grid")
+    grid = server.scene.named("/grid")
     assert np.abs(grid.position[:2] - at[:2]).max() < grid.width / 4
     np.testing.assert_allclose(np.remainder(grid.position[:2], grid.section_size), 0.0, atol=1e-9)
     assert at[2] - 2 * reach < grid.position[2] < at[2]
@@ -141,21 +149,20 @@ def test_a_robot_far_from_the_origin_is_looked_at_and_has_a_grid_below(server: A
     later = replace(first, time_s=9.0, pose=first.pose + np.append(onward, np.zeros(4)))
     page.update(StackState(later, age_s=0.0), 2.0)
     np.testing.assert_allclose(server.initial_camera.look_at, look_at)
-    camera = type("Camera", (), {})()
-    page._aim_camera(camera)
-    np.testing.assert_allclose(camera.look_at, look_at + onward)
+    server.gui.named("Look at the robot").use(server)
+    page.update(StackState(later, age_s=0.0), 3.0)
+    np.testing.assert_allclose(server.camera.look_at, look_at + onward)
+    np.testing.assert_allclose(server.initial_camera.look_at, look_at)
 
 
 def test_curves_of_many_joints_differ(server: Any) -> None:
-    names = tuple(f"joint_{number}" for number in range(30))
-    server.gui.reset()
-    plot = _Plot(server.gui, "Joints", names, 1e-3, signed=True)
-    looks = {(each["stroke"], each.get("dash")) for each in plot.handle.series[1:-1]}
+    robot = parse_robot(random_chain_urdf(np.random.default_rng(1), 30))
+    Plots(server.gui).show_robot(robot)
+    looks = {(each["stroke"], each.get("dash")) for each in server.gui.named("Joints").series[1:-1]}
     assert len(looks) == 30
 
 
 def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> None:
-    server.gui.reset()
     plots, zeros = Plots(server.gui), np.zeros(3)
     plots.show_robot(load_robot(robot_file("sliding_masses")))
     actual = np.array([1.0, 0.0, 0.0, 0.0, 2.0, 0.0])
@@ -164,7 +171,7 @@ def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> No
         measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
         plots.add(StackState(measured, momenta=Momenta(actual + size * off, actual)), {})
     plots.draw()
-    handle = plots._momentum.handle
+    handle = server.gui.named("Momentum drift")
     assert [series["label"] for series in handle.series[1:]] == [
         "1e-6 kg m/s",
         "1e-6 kg m²/s",
@@ -175,17 +182,15 @@ def test_rounding_is_no_peak_and_numbers_of_a_flight_are_seen(server: Any) -> No
     # The axis goes to 1 where everything is less, and from below zero where numbers have signs.
     ends = handle.scales["1e-6 kg m/s"]["range"]
     assert (ends["min"]["soft"], ends["max"]["soft"]) == (0.0, 1.0)
-    assert plots._shape is not None
-    ends = plots._shape.handle.scales["m"]["range"]
+    ends = server.gui.named("Joints").scales["m"]["range"]
     assert (ends["min"]["soft"], ends["max"]["soft"]) == (-0.01, 0.01)
 
 
 def test_the_momentum_budget_is_plotted_while_a_controller_reports_it(server: Any) -> None:
-    server.gui.reset()
     plots, zeros = Plots(server.gui), np.zeros(3)
     robot = load_robot(robot_file("sliding_masses"))
     plots.show_robot(robot)
-    handle = plots._budget.handle
+    handle = server.gui.named("Momentum budget (N m s)")
     assert not handle.visible
     parts = {"base": 0.5, "arm": 0.25, "wheels": 2.0, "sum": 1.75}
     command = CommandReport("model_based", False, 1.0, 0.0, 0.0, 0.0, 0.0, momentum=parts)
@@ -196,7 +201,8 @@ def test_the_momentum_budget_is_plotted_while_a_controller_reports_it(server: An
         plots.add(state, {})
         plots.show_budget(state)
         assert handle.visible is (controller is not None)
-        assert ("2.000 N m s" in plots._budget_text.content) is (controller is not None)
+        said = any("2.000 N m s" in each.content for each in texts(server))
+        assert said is (controller is not None)
     plots.draw()
     assert [series["label"] for series in handle.series[1:]] == [*parts, "shown"]
     assert [column.tolist() for column in handle.data[:-1]] == [[2.0], [0.5], [0.25], [2.0], [1.75]]
@@ -205,7 +211,6 @@ def test_the_momentum_budget_is_plotted_while_a_controller_reports_it(server: An
 
 
 def test_momenta_are_compared_with_what_they_should_be(server: Any) -> None:
-    server.gui.reset()
     plots, zeros, actual = Plots(server.gui), np.zeros(3), np.arange(6.0)
     plots.show_robot(load_robot(robot_file("sliding_masses")))
     pushed = Momenta(actual, actual - [0, 0, 2, 0, 3, 0])
@@ -213,13 +218,12 @@ def test_momenta_are_compared_with_what_they_should_be(server: Any) -> None:
         measured = Measured(time_s, np.eye(7)[6], zeros, zeros, zeros)
         plots.add(StackState(measured, momenta=momenta), {})
     plots.draw()
-    handle = plots._momentum.handle
+    handle = server.gui.named("Momentum drift")
     np.testing.assert_allclose(handle.data[1], [0.0, 1e6 * np.sqrt(5), 2e6])
     np.testing.assert_allclose(handle.data[2], [0.0, 1e6 * np.sqrt(50), 3e6])
 
 
 def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
-    server.gui.reset()
     plots, zeros = Plots(server.gui), np.zeros(6)
     plots.show_robot(load_robot(robot_file("servicer")))
     hand = Goal.of_end_effectors([EndEffectorGoal("hand", np.ones(3))])
@@ -231,7 +235,8 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
         plots.draw()
 
     def handles() -> dict[str, Any]:
-        every = [plot.handle for plot in plots._errors.values()]
+        every = [each for each in server.gui.elements if each.kind == "add_uplot"]
+        every = [each for each in every if each.title.startswith("Error of")]
         return {each.title: each for each in every if each.visible}
 
     def shown() -> list[str]:
@@ -242,7 +247,7 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
 
     add(0.0, {})
     assert shown() == []
-    assert plots._no_errors.visible
+    assert [each.visible for each in texts(server) if "No goal is" in each.content] == [True]
     add(1.0, {"hand": hand}, hand=(0.5,))
     assert shown() == ["Error of hand"], "the base is free"
     add(2.0, {"hand": hand}, hand=(0.25,))
@@ -258,7 +263,7 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     handle = handles()["Error of base"]
     assert [axis["scale"] for axis in handle.axes[1:]] == ["mm", "mrad"]
     # A logarithmic axis begins at a micrometre.
-    plots._logarithmic.value = True
+    server.gui.named("Logarithmic").value = True
     add(4.0, {"base": base}, base=(0.0, 2.0))
     assert handle.scales["mm"] == {"distr": 3}
     assert numbers("base")[1] == [3000.0, 1e-3]
@@ -297,11 +302,10 @@ def test_plumes_point_against_the_thrust() -> None:
 
 
 def test_a_target_is_drawn_from_its_first_state_on_and_outlasts_a_new_robot(server: Any) -> None:
-    server.scene.reset()
     page = Page(server, ViewerConfig())
     page.show_robot(None)
     page.show_target(load_robot(share_directory() / "config" / "targets" / "block.urdf"))
-    frame = server.scene.get_handle_by_name("/target")
+    frame = server.scene.named("/target")
     assert not frame.visible
     page.update(StackState(), 1.0)
     assert not frame.visible
@@ -310,12 +314,12 @@ def test_a_target_is_drawn_from_its_first_state_on_and_outlasts_a_new_robot(serv
     np.testing.assert_allclose(frame.position, [1.0, -2.0, 3.0])
     np.testing.assert_allclose(frame.wxyz, [0.5, 0.5, -0.1, 0.7])
     page.show_robot(load_robot(robot_file("sliding_masses")))
-    again = server.scene.get_handle_by_name("/target")
+    again = server.scene.named("/target")
     assert again is not frame
     assert not again.visible
-    assert server.scene.get_handle_by_name("/target/0") is not None
+    assert "/target/0" in paths_in(server)
     page.show_robot(None)
-    assert server.scene.get_handle_by_name("/target") is None
+    assert "/target" not in paths_in(server)
     page.update(StackState(target=np.array([1.0, -2.0, 3.0, 0.0, 0.0, 0.0, 1.0])), 3.0)
 
 
@@ -330,10 +334,8 @@ def test_other_obstacles_take_the_place_of_those_of_the_robot(server: Any) -> No
         return parse_world(f'<robot name="w"><link name="w"/>{links}{joints}</robot>')
 
     def drawn() -> list[bool]:
-        found = (server.scene.get_handle_by_name(f"/obstacles/{number}") for number in range(3))
-        return [each is not None for each in found]
+        return [f"/obstacles/{number}" in paths_in(server) for number in range(3)]
 
-    server.scene.reset()
     page, robot = Page(server, ViewerConfig()), load_robot(robot_file("planar_chain"))
     page.show_obstacles(world("a", "b", "c"))
     assert drawn() == [False] * 3
@@ -350,24 +352,14 @@ def test_other_obstacles_take_the_place_of_those_of_the_robot(server: Any) -> No
     assert drawn() == [True, False, False]
 
 
-def test_collision_shapes_are_shown_on_request(
-    server: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    server.scene.reset()
+def test_collision_shapes_are_shown_on_request(server: Any) -> None:
     robot = parse_robot(without_collisions(load_robot(robot_file("surveyor")).urdf))
     page = Page(server, ViewerConfig())
     page.show_robot(robot)
-    shapes: list[Any] = []
-    draw = scene._draw_solid
-
-    def drawn_solid(scene: Any, path: str, *given: Any) -> Any:
-        handle = draw(scene, path, *given)
-        shapes.extend([handle] if "/collision" in path else [])
-        return handle
-
-    monkeypatch.setattr(scene, "_draw_solid", drawn_solid)
-    page._layers["Collision shapes"].value = True
-    page._show_layers()
+    layer = server.gui.named("Collision shapes")
+    layer.use(server, True)
+    page.update(StackState(), 1.0)
+    shapes = [each for each in solids(server) if "/collision" in each.name]
     assert len(shapes) == sum(len(link.collisions or link.shapes) for link in robot.links)
     assert all(each.visible for each in shapes)
     # A mesh is drawn as its convex hull, whose faces point outward: its volume is that of the hull.
@@ -377,26 +369,20 @@ def test_collision_shapes_are_shown_on_request(
         whole = ConvexHull(visual.mesh.vertices).volume
         assert volume == pytest.approx(whole, rel=1e-5), visual.shape.kind
     assert {visual.shape.kind for visual in collision_visuals(robot)} >= {"mesh"}
-    page._layers["Collision shapes"].value = False
-    page._show_layers()
+    layer.use(server, False)
+    page.update(StackState(), 2.0)
     assert not any(each.visible for each in shapes)
     # Another robot is drawn with its own.
-    page._layers["Collision shapes"].value = True
-    shapes.clear()
-    page.show_robot(load_robot(robot_file("three_joint_arm")))
-    assert len(shapes) == len(collision_visuals(load_robot(robot_file("three_joint_arm"))))
+    layer.use(server, True)
+    robot = load_robot(robot_file("three_joint_arm"))
+    page.show_robot(robot)
+    shapes = [each for each in solids(server) if "/collision" in each.name]
+    assert len(shapes) == len(collision_visuals(robot))
 
 
-def test_obstacles_are_drawn_where_they_rest() -> None:
-    drawn: dict[str, tuple[Any, dict[str, Any]]] = {}
-
-    def add(path: str, vertices: Any, faces: Any, **look: Any) -> None:
-        assert len(faces)
-        drawn[path] = vertices, look
-
-    place: Any = SimpleNamespace(add_mesh_simple=add)
-    scene.draw_obstacles(place, "/obstacles", None)
-    assert drawn == {}
+def test_obstacles_are_drawn_where_they_rest(server: Any) -> None:
+    scene.draw_obstacles(server.scene, "/obstacles", None)
+    assert not solids(server)
     world = parse_world(
         '<robot name="w"><link name="w"/><link name="post"><visual>'
         '<origin xyz="0.5 0 0"/><geometry><box size="1 2 3"/></geometry>'
@@ -404,8 +390,8 @@ def test_obstacles_are_drawn_where_they_rest() -> None:
         '<joint name="j" type="fixed"><parent link="w"/><child link="post"/>'
         '<origin xyz="1 -2 4" rpy="0 0 1.5707963267948966"/></joint></robot>'
     )
-    scene.draw_obstacles(place, "/obstacles", world)
-    ((path, (vertices, look)),) = drawn.items()
-    assert (path, look["color"]) == ("/obstacles/0", (51, 102, 255))
-    np.testing.assert_allclose(vertices.min(axis=0), [0.0, -2.0, 2.5], atol=1e-12)
-    np.testing.assert_allclose(vertices.max(axis=0), [2.0, -1.0, 5.5], atol=1e-12)
+    scene.draw_obstacles(server.scene, "/obstacles", world)
+    (post,) = solids(server)
+    assert (post.name, post.color) == ("/obstacles/0", (51, 102, 255))
+    np.testing.assert_allclose(post.vertices.min(axis=0), [0.0, -2.0, 2.5], atol=1e-12)
+    np.testing.assert_allclose(post.vertices.max(axis=0), [2.0, -1.0, 5.5], atol=1e-12)
