@@ -309,6 +309,7 @@ def test_rows_of_other_software_are_named(tmp_path: Path, caplog: pytest.LogCapt
     assert any("were flown with different software" in line for line in caplog.messages)
 
 
+@pytest.mark.usefixtures("compiled")
 def test_a_task_of_lanes_leaves_what_others_fly_unless_all_of_it_is_asked_for() -> None:
     """What is flown at once is sent back before flights that take long."""
     settings = {"planner.attitude_tolerance": 0.002, "planner.max_corrections": 3}
