@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
+from time import time_ns
 from typing import Any
 
 import numpy as np
@@ -13,20 +15,23 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from nav_msgs.msg import Odometry, Path
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from support.ros_harness import LATCHED, Harness
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-from viewer.test_viewer_node import Stack as Page
+from viewer.test_viewer_node import Clock, Stack, said_on, viewer_of
 
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.model import load_robot
-from spacerobot_ros.nodes import ViewerNode
-from spacerobot_ros.nodes.viewer.listener import Listener
+from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Role
+from spacerobot_ros.nodes.viewer import listener
+from spacerobot_ros.nodes.viewer.listener import LatestMessage, Listener
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
-from spacerobot_ros.viewer.state import StackState
+from spacerobot_ros.viewer.reachability import make_question
+from spacerobot_ros.viewer.state import Measured, StackState
 
 ROBOT = load_robot(robot_file("free_flyer"))
 NAMES = ROBOT.joint_names
@@ -375,24 +380,172 @@ def test_a_plan_that_does_not_fit_has_no_motion(viewed: Viewed, fault: str) -> N
 def test_a_node_is_silent_after_the_time_that_is_given(
     harness: Harness, timeout: float, is_silent: bool
 ) -> None:
-    viewer = harness.make(ViewerNode, {"port": 0, "watchdog_timeout": timeout})
+    _, page = viewer_of(harness, watchdog_timeout=timeout)
     probe = harness.probe({"heartbeat": DiagnosticStatus})
     beats = harness.matched(probe.create_publisher(DiagnosticStatus, "heartbeat", 10), 2)
     beats.publish(DiagnosticStatus(name="/planner", message="active", hardware_id="commander"))
-    page: Any = viewer._page
     if is_silent:
-        harness.spin_until(lambda: "/planner" in page._status.content, "it is said to be silent")
+        harness.spin_until(lambda: "/planner" in said_on(page), "it is said to be silent")
         return
     harness.spin_until(lambda: probe.count("heartbeat"), "the heartbeat is heard")
     harness.spin_for(2.0)  # Longer than by default.
-    assert "/planner" not in page._status.content
+    assert "/planner" not in said_on(page)
 
 
 def test_a_goal_that_nobody_takes_is_reported(harness: Harness) -> None:
-    stack = Page(harness)
+    stack = Stack(harness)
     names = tuple(load_robot(robot_file("sliding_masses")).joint_names)
     stack.describe()
-    stack.until(lambda: stack.move(0.25, names) or stack.page.editor.placed, "a goal is shown")
+    stack.until(lambda: stack.move(0.25, names) or stack.placed, "a goal is shown")
     harness.remove(stack.probe)
-    stack.press(stack.page._buttons._fly)
-    stack.until(lambda: "The goal was not received" in stack.log(), "it says so")
+    stack.press("Fly")
+    stack.until(lambda: "The goal was not received" in stack.said(), "it says so")
+
+
+# -- nodes that are gone --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Return the time of listeners, which stands still until a test lets it go on."""
+    clock = Clock(runs=False)
+    monkeypatch.setattr(listener, "time", clock)
+    return clock
+
+
+def beat(viewed: Viewed, name: str, pulse: HeartbeatState, role: Role | None) -> None:
+    hardware = "" if role is None else role.value
+    viewed.say("heartbeat", DiagnosticStatus(name=name, message=pulse.value, hardware_id=hardware))
+
+
+def test_nodes_that_are_gone_are_shown_no_longer(clock: Clock, viewed: Viewed) -> None:
+    look = viewed.look
+
+    def pass_time(seconds: int) -> None:
+        for _ in range(seconds):
+            clock.ahead += 1.0
+            look()
+
+    viewed.report("plant/status", PlantStatus(PlantState.RUNNING, "A command."), "/robot")
+    idle = PlannerStatus(PlannerState.IDLE)
+    viewed.report("planner/status", idle, "/planner")
+    assert look().planner is not None
+    beat(viewed, "/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
+    beat(viewed, "/other_viewer", HeartbeatState.INACTIVE, None)
+    assert "/planner" not in look().silent
+    assert look().inactive == (), "viewers come and go"
+    pass_time(10)
+    assert look().silent["/planner"] == 10.0
+    assert look().absent == {"planner"}
+    seen = replace(look(), measured=Measured(0.0, np.eye(7)[6], *np.zeros((3, 3))))
+    goal = Goal.checked([1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+    answer = make_question(seen, {"base": goal}, load_robot(robot_file("sliding_masses")), {})
+    assert answer == "The planner is offline."
+    assert look().planner == idle, "it may come back"
+    pass_time(51)
+    assert look().planner is None
+    assert "/planner" not in look().silent
+    beat(viewed, "/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
+    assert look().planner == idle, "it had only stood still"
+    assert look().absent == frozenset()
+    beat(viewed, "/planner", HeartbeatState.INACTIVE, Role.COMMANDER)
+    assert look().inactive == ("/planner",)
+    assert look().absent == {"planner"}
+    beat(viewed, "/planner", HeartbeatState.BUSY, Role.COMMANDER)
+    pass_time(100)
+    assert look().planner == idle, "it plans"
+    beat(viewed, "/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
+    look()
+    clock.ahead += 1000.0
+    assert look().planner == idle, "the viewer had stood still"
+
+
+def test_a_replay_shows_what_nodes_reported_until_a_plant_begins(
+    clock: Clock, viewed: Viewed
+) -> None:
+    look = viewed.look
+    viewed.report("plant/status", PlantStatus(PlantState.RUNNING, "A command."), "/robot")
+    idle = PlannerStatus(PlannerState.IDLE)
+    viewed.report("planner/status", idle, "/planner")
+    beat(viewed, "/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
+    status = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
+    viewed.report("replay/status", status, "/replay")
+    beat(viewed, "/replay", HeartbeatState.ACTIVE, Role.REPLAY)
+    beat(viewed, "/live_plant", HeartbeatState.ACTIVE, Role.PLANT)
+    assert look().replay == status
+    assert look().plant is not None
+    beat(viewed, "/replay", HeartbeatState.INACTIVE, Role.REPLAY)
+    assert look().replay is None
+    assert look().plant is None, "it was recorded"
+    assert look().planner == idle
+    beat(viewed, "/replay", HeartbeatState.ACTIVE, Role.REPLAY)
+    assert look().replay == status
+
+
+def test_a_commander_is_busy_and_not_a_plant(viewed: Viewed) -> None:
+    for role in (Role.PLANT, Role.COMMANDER):
+        beat(viewed, "/x", HeartbeatState.BUSY, role)
+        assert viewed.look().busy is (role is Role.COMMANDER)
+
+
+# -- momenta --------------------------------------------------------------------------------------
+
+Sent = dict[str, list[tuple[int, float]]]
+
+
+@pytest.fixture
+def sent(monkeypatch: pytest.MonkeyPatch) -> Sent:
+    """Return what listeners take from topics: times, ns, and numbers."""
+    sent: Sent = {}
+
+    class Topic(LatestMessage[Any]):
+        def __init__(self, _node: Node, _kind: Any, topic: str) -> None:
+            self.topic, self.sent_ns = topic, 0
+
+        def take(self) -> Float64MultiArray | None:
+            if not sent.get(self.topic):
+                return None
+            self.sent_ns, value = sent[self.topic].pop(0)
+            return Float64MultiArray(data=[value] * 7)
+
+    monkeypatch.setattr(listener, "LatestMessage", Topic)
+    return sent
+
+
+def test_a_message_is_taken_with_the_time_of_its_publication(harness: Harness) -> None:
+    streams = Node("streams", context=harness.context)
+    newest = LatestMessage(streams, Float64MultiArray, "momentum")
+    publisher = harness.matched(
+        harness.probe({}).create_publisher(Float64MultiArray, "momentum", 9)
+    )
+    before = time_ns()
+    publisher.publish(Float64MultiArray(data=[0.5]))
+    harness.spin_until(lambda: newest.take() is not None, "it is taken")
+    assert abs(newest.sent_ns - before) < 60 * 10**9
+    streams.destroy_node()
+
+
+def test_momenta_are_compared_with_those_of_their_tick(sent: Sent, viewed: Viewed) -> None:
+    def pair() -> tuple[float, float | None]:
+        momenta = viewed.look().momenta
+        assert momenta is not None
+        should_be = momenta.expected
+        return float(momenta.actual[0]), None if should_be is None else float(should_be[0])
+
+    sent |= {"momentum": [(1000, 1.0)], "momentum_expected": [(1001, 1.0)]}
+    assert pair() == (1.0, 1.0)
+    # The next tick is published while this one is taken: its second part comes in time, or not.
+    sent |= {"momentum": [(2000, 2.0)], "momentum_expected": [(1002, 1.0), (2001, 2.0)]}
+    assert pair() == (2.0, 2.0)
+    sent |= {"momentum": [(3000, 3.0)], "momentum_expected": []}
+    assert pair() == (2.0, 2.0)
+    sent |= {"momentum": [(4000, 4.0)], "momentum_expected": [(4001, 4.0)]}
+    assert pair() == (4.0, 4.0)
+    # Or the first part is not delivered yet when the second is: ticks are milliseconds apart.
+    sent |= {"momentum": [(10_005_000, 5.0)], "momentum_expected": [(20_005_001, 6.0)]}
+    assert pair() == (4.0, 4.0)
+    sent |= {"momentum": [(20_005_000, 6.0)]}
+    assert pair() == (6.0, 6.0)
+    # Another plant has no thrusters: nothing is expected of its momenta.
+    sent |= {"momentum": [(10**10, 5.0)]}
+    assert pair() == (5.0, None)

@@ -47,6 +47,11 @@ def page(server: Any) -> Page:
     return page
 
 
+def said(server: Server) -> str:
+    """Return the first text of the page, which is that of the state."""
+    return next(each.content for each in server.gui.elements if each.kind == "add_html")
+
+
 FIRST = StackState(
     measured=measured(1.0, 1.0, 2.0, 0.5),
     tool=np.array([3.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0]),
@@ -174,7 +179,7 @@ def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) 
     slider.use(server, 250.2)
     page.update(last, 400.0)
     page.update(last, 401.0)
-    robot, status = server.scene.named("/robot"), page._status.content
+    robot, status = server.scene.named("/robot"), said(server)
     np.testing.assert_allclose(robot.position, [250.0, 0.0, 0.0])
     assert back.visible
     assert "Looking back 149.5 s. The robot is now at t = 399.50 s." in status
@@ -187,7 +192,7 @@ def test_a_user_looks_back_at_the_last_five_minutes(server: Server, page: Page) 
     back.use(server)
     page.update(replace(FIRST, measured=measured(600.0, 600.0, 0.0, 0.0)), 602.0)
     assert robot.position[0] == 600.0
-    assert "Looking back" not in page._status.content
+    assert "Looking back" not in said(server)
     assert farthest_flown(server) > 595.0
 
 
@@ -208,7 +213,7 @@ def test_the_end_of_the_past_is_the_present(server: Server, page: Page) -> None:
     page.update(ended, 12.0)
     page.update(ended, 13.0)
     assert server.scene.named("/robot").position[0] == 5.0
-    assert ENDED in page._status.content
+    assert ENDED in said(server)
     page.show_robot(ROBOT)
     page.update(ended, 14.0)
     assert server.scene.named("/robot").position[0] == 12.0, "another robot has no such past"
@@ -304,9 +309,11 @@ def test_a_robot_with_thrusters_is_followed_until_a_user_says_otherwise(
 def test_the_panel_does_not_cover_the_robot(
     aspect: float, phone: bool, server: Server, page: Page
 ) -> None:
-    camera: Any = type("Camera", (), {"aspect": aspect})()
+    camera = server.camera
+    camera.aspect = aspect
     page.update(FIRST, 1.0)
-    page._aim_camera(camera)
+    server.gui.named("Look at the robot").use(server)
+    page.update(FIRST, 2.0)
     at, away = np.array([1.0, 2.0, 0.5]), camera.position - camera.look_at
     np.testing.assert_allclose(away, (1.75 if phone else 1.0) * REACH * CAMERA)
     # The panel covers the lower 60 % on a phone, else the right 400 of at least 1200 pixels.
@@ -353,18 +360,18 @@ def test_news_stay_ten_seconds_or_until_the_stack_has_ended(server: Server, page
     page.update(FLYING, 1.0)
     page.announce(again)
     page.update(FLYING, 9.0)
-    assert "It is restarted." in page._status.content
+    assert "It is restarted." in said(server)
     page.update(FLYING, 11.5)
-    assert "It is restarted." not in page._status.content
+    assert "It is restarted." not in said(server)
     page.announce(again)
     page.update(FLYING, 12.0)
-    assert "It is restarted." in page._status.content
+    assert "It is restarted." in said(server)
     ended = replace(
         FLYING, absent=frozenset({"plant", "planner"}), silent={"/plant": 3.0, "/planner": 3.0}
     )
     page.update(ended, 13.0)
-    assert ENDED in page._status.content
-    assert "It is restarted." not in page._status.content
+    assert ENDED in said(server)
+    assert "It is restarted." not in said(server)
 
 
 def test_what_a_node_publishes_and_logs_is_one_line_with_its_time(

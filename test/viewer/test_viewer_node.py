@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
-import json
-import socket
+import math
+import re
 import time
-from dataclasses import replace
+from html import unescape
 from typing import Any
 
 import numpy as np
 import pytest
-import viser
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log as RosoutLog
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
+from support.page_elements import Element, Server
 from support.ros_harness import LATCHED, Harness, Probe
 
 from spacerobot_ros.bag.playback import ReplayStatus
@@ -31,13 +31,51 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
-from spacerobot_ros.viewer.reachability import GoalCheck, Verdict, make_question
-from spacerobot_ros.viewer.state import Measured, StackState
+from spacerobot_ros.viewer.reachability import GoalCheck, GoalChecker, GoalQuestion, Verdict
+from spacerobot_ros.viewer.state import Measured
 
 URDF = load_robot(robot_file("sliding_masses")).urdf
 GOAL = Goal.checked([1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 HERE = Measured(0.0, np.eye(7)[6], *np.zeros((3, 3)))
 ARM = load_robot(robot_file("three_joint_arm"))
+
+
+class Clock:
+    """The time of a viewer in the place of the module's: ``ahead`` of it, or at rest there."""
+
+    def __init__(self, *, runs: bool) -> None:
+        self.runs, self.ahead = runs, 0.0
+
+    def monotonic(self) -> float:
+        return self.ahead + self.runs * time.monotonic()
+
+    def time_ns(self) -> int:
+        return time.time_ns()
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock(runs=True)
+    for module in ("node", "listener"):
+        monkeypatch.setattr(f"spacerobot_ros.nodes.viewer.{module}.time", clock)
+    return clock
+
+
+class Served(Server):
+    """The server of a page that no browser shows."""
+
+    def __init__(self, host: str, port: int, _title: str) -> None:
+        super().__init__()
+        self.get_host, self.get_port = lambda: host, lambda: port
+        self.drawn = 0
+        """How often the page was drawn."""
+
+    def atomic(self) -> Any:
+        self.drawn += 1
+        return super().atomic()
+
+    def stop(self) -> None:
+        pass
 
 
 class Stack:
@@ -61,13 +99,8 @@ class Stack:
         self.odom = create(Odometry, "/odom", 10)
         self.joints = create(JointState, "/joint_states", 10)
         self.momentum = create(Float64MultiArray, "/momentum", 10)
-        overrides = {"port": 0, "update_rate": 60.0, **parameters}
-        self.viewer = harness.add(
-            ViewerNode(
-                context=harness.context,
-                parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
-            )
-        )
+        self.viewer, self.page = viewer_of(harness, **{"update_rate": 60.0, **parameters})
+        self.gui, self.scene = self.page.gui, self.page.scene
         harness.connect()
 
     def _answer(self, name: str) -> Any:
@@ -81,7 +114,10 @@ class Stack:
 
     def describe(self, urdf: str = URDF) -> None:
         self.description.publish(String(data=urdf))
-        plant = PlantStatus(PlantState.RUNNING, "A command is active.")
+        self.report(PlantState.RUNNING, "A command is active.")
+
+    def report(self, state: PlantState, message: str) -> None:
+        plant = PlantStatus(state, message)
         values = [KeyValue(key=k, value=v) for k, v in plant.to_values().items()]
         self.status.publish(DiagnosticStatus(name="/robot", values=values, message=plant.message))
 
@@ -96,38 +132,72 @@ class Stack:
         )
         return False
 
+    def node(self, path: str) -> Element | None:
+        """Return what is drawn at a path, if it is."""
+        return next((each for each in self.scene.elements if each.name == path), None)
+
     @property
-    def page(self) -> Any:
-        return self.viewer._page
+    def robot(self) -> Element | None:
+        return self.node("/robot")
 
-    def head(self) -> str:
-        return str(self.page._status.content)
+    @property
+    def at(self) -> float:
+        """Where the robot is drawn, along x in m."""
+        return math.nan if self.robot is None else float(self.robot.position[0])
 
-    def log(self) -> str:
-        return " | ".join(notice.message for notice in self.page._log._notices)
+    @property
+    def placed(self) -> bool:
+        """Whether the page shows a goal."""
+        return self.node("/goal") is not None
+
+    def said(self) -> str:
+        """Return all texts of the page."""
+        return said_on(self.page)
 
     def until(self, predicate: Any, what: str) -> None:
         self.harness.spin_until(predicate, what)
 
-    def press(self, handle: Any, value: str | float | None = None) -> None:
-        """Do what a click in a browser does: call what waits for it, in the page's loop."""
-        if value is not None:
-            handle._impl.value = value
-        event = type("Event", (), {"target": handle, "client": object(), "client_id": 0})()
-        for callback in handle._impl.update_cb:
-            asyncio.run_coroutine_threadsafe(
-                callback(event), self.viewer._server.get_event_loop()
-            ).result(10)
+    def draw(self) -> None:
+        """Wait until the page has been drawn anew, with what has come until now."""
+        before = self.page.drawn
+        self.until(lambda: self.page.drawn > before + 1, "the page is drawn")
+
+    def press(self, label: str, value: Any = None) -> None:
+        """Press a button of the page, or set a field."""
+        self.gui.named(label).use(self.page, value)
+
+    def choose(self, label: str) -> None:
+        """Press one of the buttons of a group."""
+        groups = (each for each in self.gui.elements if each.kind == "add_button_group")
+        (group,) = (each for each in groups if label in each.options)
+        group.use(self.page, label)
 
     def drag(self, pose: np.ndarray) -> None:
         """Move the gizmo of the base as a browser does."""
-        gizmo = self.page.editor._gizmos["/goal"]
-        target = type("Target", (), {"position": pose[:3], "wxyz": pose[[6, 3, 4, 5]]})()
-        event = type("Event", (), {"target": target, "phase": "update", "client": object()})()
-        for callback in gizmo._impl_aux.update_cb:
-            asyncio.run_coroutine_threadsafe(
-                callback(event), self.viewer._server.get_event_loop()
-            ).result(10)
+        gizmo = self.scene.named("/goal")
+        gizmo.position, gizmo.wxyz = pose[:3], pose[[6, 3, 4, 5]]
+        gizmo.use(self.page)
+
+
+def viewer_of(
+    harness: Harness, *, namespace: str = "", **parameters: Any
+) -> tuple[ViewerNode, Served]:
+    """Return a viewer and the server of its page."""
+    served: list[Served] = []
+
+    def serve(*given: Any) -> Served:
+        served.append(Served(*given))
+        return served[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("spacerobot_ros.nodes.viewer.node.start_server", serve)
+        viewer = harness.make(ViewerNode, {"port": 0, **parameters}, namespace=namespace)
+    return viewer, served[0]
+
+
+def said_on(page: Server) -> str:
+    found = (each.content for each in page.gui.elements if each.kind == "add_html")
+    return unescape(" | ".join(found))
 
 
 def names_of(urdf_robot: Any) -> tuple[str, ...]:
@@ -136,36 +206,37 @@ def names_of(urdf_robot: Any) -> tuple[str, ...]:
 
 def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness) -> None:
     stack = Stack(harness)
-    page = stack.page
-    stack.until(lambda: "No state received yet" in stack.head(), "the page says so")
-    stack.press(page._buttons._fly)
-    stack.until(lambda: "no goal to send" in stack.log(), "nothing is sent")
+    stack.until(lambda: "No state received yet" in stack.said(), "the page says so")
+    stack.press("Fly")
+    stack.until(lambda: "no goal to send" in stack.said(), "nothing is sent")
     stack.describe()
-    stack.until(lambda: page._drawing is not None, "the robot")
+    stack.until(lambda: stack.robot is not None, "the robot")
     names = names_of(load_robot(robot_file("sliding_masses")))
+
+    def drawn() -> Element:
+        assert stack.robot is not None
+        return stack.robot
 
     def moved() -> bool:
         stack.move(0.25, names)
-        return bool(page.editor.placed and page._drawing.base.visible)
+        return bool(stack.placed and drawn().visible)
 
     stack.until(moved, "the robot is where it is")
-    assert page._drawing.base.position[0] == 0.25
-    stack.until(lambda: "running" in stack.head(), "its status")
+    assert drawn().position[0] == 0.25
+    stack.until(lambda: "running" in stack.said(), "its status")
     assert stack.probe.count("/goal_pose") == 0, "opening the page sends nothing"
     # A goal by the gizmo, one by the fields, and none that is no pose.
     stack.drag(np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
-    stack.press(page._buttons._fly)
+    stack.press("Fly")
     stack.until(lambda: stack.probe.count("/goal_pose") == 1, "a goal")
     p = stack.probe.last("/goal_pose").pose.position
     assert (p.x, p.y, p.z) == (1.0, 2.0, 3.0)
     stack.drag(np.array([np.nan, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
-    page.editor._position._impl.value = (float("nan"), 0.0, 0.0)
-    stack.press(page.editor._position)
-    stack.until(lambda: "is not finite" in stack.log(), "a refusal")
-    assert page.editor._position.value == (1.0, 2.0, 3.0)
-    page.editor._position._impl.value = (0.5, 0.0, 0.0)
-    stack.press(page.editor._position)
-    stack.press(page._buttons._fly)
+    stack.press("Goal (m)", (float("nan"), 0.0, 0.0))
+    stack.until(lambda: "is not finite" in stack.said(), "a refusal")
+    assert stack.gui.named("Goal (m)").value == (1.0, 2.0, 3.0)
+    stack.press("Goal (m)", (0.5, 0.0, 0.0))
+    stack.press("Fly")
     stack.until(lambda: stack.probe.count("/goal_pose") == 2, "another goal")
     assert stack.probe.last("/goal_pose").pose.position.x == 0.5
     stamps = [m.header.stamp for m in stack.probe.messages["/goal_pose"]]
@@ -176,49 +247,40 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
         ("Rearm", "/robot/rearm"),
         ("Reset", "/robot/reset"),
     ):
-        stack.press(page._buttons._plant, label)
+        stack.choose(label)
         stack.until(lambda service=service: service in stack.called, service)
     for label in ("Pause", "Resume"):
-        stack.press(page._buttons._time, label)
+        stack.choose(label)
     stack.until(lambda: len(stack.called) == 5, "both")
     assert stack.called[3:] == ["/robot/pause True", "/robot/pause False"]
-    stack.until(lambda: "Done: /robot/pause." in stack.log(), "its answer")
-    stack.press(page._buttons._goal, "Abort goal")
+    stack.until(lambda: "Done: /robot/pause." in stack.said(), "its answer")
+    stack.choose("Abort goal")
     stack.until(
-        lambda: "No planner or controller offers the service 'abort' now." in stack.log(), "nobody"
+        lambda: "No planner or controller offers the service 'abort' now." in stack.said(), "nobody"
     )
-    stack.press(page.faults._clear)
+    stack.press("Clear faults")
     stack.until(lambda: stack.probe.count("/fault_injection") == 1, "clear")
     assert stack.probe.last("/fault_injection").data == "clear"
-    stack.press(page.faults._inject)
-    stack.until(lambda: "The fault '- -' is refused" in stack.log(), "no fault is known yet")
+    stack.press("Inject")
+    stack.until(lambda: "The fault '- -' is refused" in stack.said(), "no fault is known yet")
 
 
-def test_the_page_is_as_its_parameters_say(
-    harness: Harness, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    themes: list[bool] = []
-    monkeypatch.setattr(
-        viser.GuiApi, "configure_theme", lambda _, dark_mode, **__: themes.append(dark_mode)
-    )
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+def test_the_page_is_as_its_parameters_say(harness: Harness) -> None:
     stack = Stack(
-        harness, port=port, update_rate=40.0, dark=True, world_frame="orbit", check_goals=False
+        harness, port=4321, update_rate=40.0, dark=True, world_frame="orbit", check_goals=False
     )
-    assert stack.viewer.url == f"http://127.0.0.1:{port}/"
-    assert themes == [True]
+    assert stack.viewer.url == "http://127.0.0.1:4321/"
+    assert [theme["dark_mode"] for theme in stack.gui.themes] == [True]
     assert "drawn 40 times a second" in stack.viewer.start_message()
     assert 25_000_000 in {timer.timer_period_ns for timer in stack.viewer.timers}
-    page, names = stack.page, names_of(load_robot(robot_file("sliding_masses")))
+    names = names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
-    stack.until(lambda: stack.move(0.25, names) or page.editor.placed, "a goal is shown")
+    stack.until(lambda: stack.move(0.25, names) or stack.placed, "a goal is shown")
     stack.drag(np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
-    stack.press(page._buttons._fly)
+    stack.press("Fly")
     stack.until(lambda: stack.probe.count("/goal_pose") == 1, "a goal")
     assert stack.probe.last("/goal_pose").header.frame_id == "orbit"
-    stack.until(lambda: "check_goals" in page.editor._verdict.content, "why it is not checked")
+    stack.until(lambda: "check_goals" in stack.said(), "why it is not checked")
 
 
 def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) -> None:
@@ -232,43 +294,43 @@ def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) ->
     planner.publish(DiagnosticStatus(name="/planner", values=values, message=status.message))
     harness.connect()
     stack.describe()
-    final = stack.page.editor._final
+    ends, fields = stack.gui.named("Final joint positions"), stack.gui.named("At the end")
 
     def fly(count: int) -> None:
-        stack.press(stack.page._buttons._fly)
+        stack.press("Fly")
         stack.until(lambda: stack.probe.count("/goal_pose") == count, "a goal")
 
-    stack.until(lambda: stack.move(0.0, names) or final._enabled.visible, "a planner is there")
-    stack.until(lambda: stack.move(0.0, names) or stack.page.editor.placed, "a goal is shown")
+    stack.until(lambda: stack.move(0.0, names) or ends.visible, "a planner is there")
+    stack.until(lambda: stack.move(0.0, names) or stack.placed, "a goal is shown")
     # Somebody may have had an earlier goal end in joint positions, which the page does not show.
     fly(1)
     stack.until(lambda: len(shapes) == 1, "any")
     assert list(shapes[0].name) == []
-    stack.press(final._enabled, True)
-    stack.until(lambda: final._folder.visible, "the fields")
-    stack.press(final._fields[1], -0.25)
+    ends.use(stack.page, True)
+    stack.until(lambda: fields.visible, "the fields")
+    (second,) = (each for each in stack.gui.elements if each.shown.get("hint") == names[1])
+    second.use(stack.page, -0.25)
     fly(2)
     stack.until(lambda: len(shapes) == 2, "its shape")
     assert list(shapes[1].name) == list(names)
     assert list(shapes[1].position) == [0.0, -0.25, 0.0]
-    stack.press(final._enabled, False)
-    stack.until(lambda: not final._folder.visible, "no fields")
+    ends.use(stack.page, False)
+    stack.until(lambda: not fields.visible, "no fields")
     fly(3)
     stack.until(lambda: len(shapes) == 3, "any again")
     assert list(shapes[2].name) == []
 
 
 @pytest.mark.slow
-def test_a_viewer_survives_what_is_wrong(harness: Harness) -> None:
+def test_a_viewer_survives_what_is_wrong(clock: Clock, harness: Harness) -> None:
     stack = Stack(harness)
-    page = stack.page
     stack.describe("<robot name='broken'><link")
-    stack.until(lambda: "robot_description:" in stack.log(), "a refusal")
-    assert page._drawing is None
+    stack.until(lambda: "robot_description:" in stack.said(), "a refusal")
+    assert stack.robot is None
     sliders = names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
-    stack.until(lambda: page._drawing is not None, "the robot")
-    stack.until(lambda: stack.move(0.1, sliders) or page.editor.placed, "its state")
+    stack.until(lambda: stack.robot is not None, "the robot")
+    stack.until(lambda: stack.move(0.1, sliders) or stack.placed, "its state")
     # Numbers and messages that are none.
     strange = Odometry()
     strange.pose.pose.position.x = float("nan")
@@ -279,25 +341,24 @@ def test_a_viewer_survives_what_is_wrong(harness: Harness) -> None:
     stack.momentum.publish(Float64MultiArray(data=[1.0]))
     stack.momentum.publish(Float64MultiArray(data=[float("nan")] * 7))
     stack.status.publish(DiagnosticStatus(name="/robot"))
-    stack.until(lambda: stack.move(0.2, sliders) or page._last.pose[0] == 0.2, "the next state")
+    stack.until(lambda: stack.move(0.2, sliders) or stack.at == 0.2, "the next state")
     # Another robot comes in its place; its joints are others.
-    before = page._drawing
+    before = stack.robot
     stack.describe(ARM.urdf)
-    stack.until(lambda: page._drawing is not before, "another robot")
-    assert not page.editor.placed
+    stack.until(lambda: stack.robot not in (before, None), "another robot")
+    assert not stack.placed
     arm = names_of(ARM)
-    stack.until(lambda: stack.move(0.3, arm) or page.editor.placed, "its state")
+    stack.until(lambda: stack.move(0.3, arm) or stack.placed, "its state")
     stack.drag(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     # Time goes by.
-    stack.viewer._listener._came_at -= 5.0
-    stack.until(lambda: "No state for 5 s." in stack.head(), "silence is said")
-    stack.until(lambda: stack.move(0.4, arm) or "No state" not in stack.head(), "and its end")
+    clock.ahead += 5.0
+    stack.until(lambda: "No state for 5 s." in stack.said(), "silence is said")
+    stack.until(lambda: stack.move(0.4, arm) or "No state" not in stack.said(), "and its end")
     assert stack.viewer.is_active
 
 
 def test_a_replay_has_a_time_line(harness: Harness) -> None:
     stack = Stack(harness)
-    page = stack.page
     status = stack.probe.create_publisher(DiagnosticStatus, "/replay/status", LATCHED)
     harness.matched(status)
 
@@ -307,47 +368,45 @@ def test_a_replay_has_a_time_line(harness: Harness) -> None:
         status.publish(DiagnosticStatus(name="/replay", values=values))
         return False
 
-    stack.until(lambda: tell(4.0) or page._time_line._slider is not None, "the time line")
-    line = page._time_line
-    stack.until(lambda: line._slider.value == 4.0, "where it is")
-    assert (line._slider.min, line._slider.max) == (0.0, 20.0)
-    assert line._folder.visible
-    assert not page._buttons._fly.visible, "a recording takes no goals"
-    assert page.editor._none_taken.visible
-    assert not any(h.visible for h in (page.faults._inject, page.faults._value))
-    stack.press(line._slider, 7.5)
+    slider = stack.gui.named("Time (s)")
+    stack.until(lambda: tell(4.0) or slider.value == 4.0, "where it is")
+    assert (slider.min, slider.max) == (0.0, 20.0)
+    folders = (each for each in stack.gui.elements if each.kind == "add_folder")
+    assert [each.visible for each in folders if each.label == "Replay"] == [True]
+    hidden = [not stack.gui.named(label).visible for label in ("Fly", "Inject", "Value")]
+    assert all(hidden), "a recording takes no goals and no faults"
+    texts = (each for each in stack.gui.elements if each.kind == "add_html" and each.visible)
+    assert any("A recording does not accept goals." in each.content for each in texts)
+    slider.use(stack.page, 7.5)
     stack.until(lambda: stack.probe.count("/replay/seek") == 1, "the jump")
     assert stack.probe.last("/replay/seek").data == 7.5
     tell(4.1)
     harness.settle(stack.probe)
-    assert line._slider.value == 7.5, "it does not fight the user's hand"
-    stack.press(line._buttons, "Hold")
+    assert slider.value == 7.5, "it does not fight the user's hand"
+    stack.choose("Hold")
     stack.until(
-        lambda: "No replay offers the service 'pause' now." in stack.log(), "nobody is there"
+        lambda: "No replay offers the service 'pause' now." in stack.said(), "nobody is there"
     )
 
 
 def test_the_parameters_of_a_plant_decide_on_its_faults(harness: Harness) -> None:
+    plant = harness.add(Node("robot", context=harness.context))
+    plant.declare_parameter("actuation", "effort")
+    plant.declare_parameter("thrusters", "")
     stack = Stack(harness)
     stack.describe()
-    stack.until(lambda: stack.page._drawing is not None, "the robot")
-    values = {"actuation": json.dumps("effort"), "thrusters": json.dumps("")}
-    stack.viewer._remote_values["plant"] = values
-    stack.viewer._show_plant()
-    kinds = stack.page.faults._kind.options
-    assert "thruster_off" in kinds
-    assert "nozzle_open" not in kinds
-    stack.viewer._remote_values["plant"] = {**values, "thrusters": json.dumps("none.yaml")}
-    stack.viewer._show_plant()
-    stack.until(lambda: "none.yaml" in stack.log(), "what is wrong with it")
-    stack.page.faults._kind._impl.value = "joint_slow"
-    stack.press(stack.page.faults._kind)
-    stack.until(lambda: stack.page.faults._value.visible, "its factor")
-    stack.page.faults._value._impl.value = float("nan")
-    stack.press(stack.page.faults._inject)
-    stack.until(lambda: "not a finite number" in stack.log(), "a refusal")
-    stack.page.faults._value._impl.value = 0.5
-    stack.press(stack.page.faults._inject)
+    fault, value = stack.gui.named("Fault"), stack.gui.named("Value")
+    stack.until(lambda: "thruster_off" in fault.options, "faults of the plant")
+    assert "nozzle_open" not in fault.options
+    plant.set_parameters([Parameter("thrusters", value="none.yaml")])
+    stack.until(lambda: "none.yaml" in stack.said(), "what is wrong with it")
+    fault.use(stack.page, "joint_slow")
+    stack.until(lambda: value.visible, "its factor")
+    value.value = float("nan")
+    stack.press("Inject")
+    stack.until(lambda: "not a finite number" in stack.said(), "a refusal")
+    value.value = 0.5
+    stack.press("Inject")
     stack.until(lambda: stack.probe.count("/fault_injection") == 1, "a fault")
     assert stack.probe.last("/fault_injection").data.split()[0] == "joint_slow"
 
@@ -370,192 +429,83 @@ def test_an_address_that_others_reach_is_warned_of_and_a_wrong_one_is_refused(
 def test_a_robot_that_changes_after_a_check_is_shown(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stack = Stack(harness)
-    page, sliders = stack.page, names_of(load_robot(robot_file("sliding_masses")))
-    stack.describe()
-    stack.until(lambda: stack.move(0.1, sliders) or page.editor.placed, "a goal")
-    page.editor.show_check(GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", shape=np.zeros(3)))
-    # A plan for the robot of before is not to be answered any more.
     cancelled: list[bool] = []
+    answers = [GoalCheck(Verdict.REACHABLE, "Reachable in 1 s.", shape=np.zeros(3))]
 
-    def cancel() -> bool:
-        cancelled.append(True)
-        return False
+    class Checker(GoalChecker):
+        """Answers what the test says, and asks no process."""
 
-    monkeypatch.setattr(stack.viewer._checker, "cancel", cancel)
+        def ask(self, question: GoalQuestion) -> None:
+            pass
+
+        def cancel(self) -> bool:
+            cancelled.append(True)
+            return False
+
+        def latest_answer(self) -> GoalCheck | None:
+            return answers[0] if answers else None
+
+    monkeypatch.setattr("spacerobot_ros.nodes.viewer.node.GoalChecker", Checker)
+    stack = Stack(harness)
+    sliders = names_of(load_robot(robot_file("sliding_masses")))
+    stack.describe()
+    stack.until(lambda: stack.move(0.1, sliders) or "Reachable in 1 s." in stack.said(), "a check")
+    # A plan for the robot of before is not to be answered any more.
+    answers.clear()
+    cancelled.clear()
     stack.describe(load_robot(robot_file("servicer")).urdf)
     servicer = names_of(load_robot(robot_file("servicer")))
-    stack.until(lambda: not page.editor.placed, "its scene is empty")
+    stack.until(lambda: not stack.placed, "its scene is empty")
     assert cancelled
-    stack.until(lambda: stack.move(0.3, servicer) or page.editor.placed, "its state")
-    stack.until(lambda: stack.move(0.4, servicer) or page._last.pose[0] == 0.4, "and the next")
+    stack.until(lambda: stack.move(0.3, servicer) or stack.placed, "its state")
+    stack.until(lambda: stack.move(0.4, servicer) or stack.at == 0.4, "and the next")
     assert stack.viewer.is_active
 
 
-def test_nodes_that_are_gone_are_shown_no_longer(harness: Harness) -> None:
-    stack = Stack(harness)
-    listener = stack.viewer._listener
-    create = stack.probe.create_publisher
-    planner = create(DiagnosticStatus, "/planner/status", LATCHED)
-    replay = create(DiagnosticStatus, "/replay/status", LATCHED)
-    heart = create(DiagnosticStatus, "/heartbeat", 20)
-    harness.connect()
-    stack.describe()
-    stack.until(lambda: stack.viewer._robot is not None, "a robot")
-
-    def beat(name: str, pulse: HeartbeatState, role: Role | None) -> None:
-        hardware = "" if role is None else role.value
-        heart.publish(DiagnosticStatus(name=name, message=pulse.value, hardware_id=hardware))
-
-    def pass_time(seconds: float) -> None:
-        """Have the last heartbeats be so much older."""
-        listener._beats = {n: replace(b, at=b.at - seconds) for n, b in listener._beats.items()}
-
-    def look() -> StackState:
-        harness.settle(stack.probe)
-        return listener.state()
-
-    idle = PlannerStatus(PlannerState.IDLE)
-    values = [KeyValue(key=k, value=v) for k, v in idle.to_values().items()]
-    planner.publish(DiagnosticStatus(name="/planner", values=values))
-    stack.until(lambda: listener.state().planner is not None, "a planner")
-    beat("/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
-    beat("/other_viewer", HeartbeatState.INACTIVE, None)
-    assert "/planner" not in look().silent
-    assert look().inactive == (), "viewers come and go"
-    pass_time(10.0)
-    assert look().silent["/planner"] >= 10.0
-    assert look().absent == {"planner"}
-    seen = replace(look(), measured=HERE)
-    answer = make_question(seen, {"base": GOAL}, load_robot(robot_file("sliding_masses")), {})
-    assert answer == "The planner is offline."
-    assert look().planner == idle, "it may come back"
-    pass_time(60.0)
-    assert look().planner is None
-    assert "/planner" not in look().silent
-    beat("/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
-    assert look().planner == idle, "it had only stood still"
-    assert look().absent == frozenset()
-    beat("/planner", HeartbeatState.INACTIVE, Role.COMMANDER)
-    assert look().inactive == ("/planner",)
-    assert look().absent == {"planner"}
-    beat("/planner", HeartbeatState.BUSY, Role.COMMANDER)
-    pass_time(1000.0)
-    assert look().planner == idle, "it plans"
-    beat("/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
-    look()
-    listener._last_call -= 1000.0
-    pass_time(1000.0)
-    assert look().planner == idle, "the viewer had stood still"
-
-    # A replay shows what nodes reported that are not there; then a plant begins.
-    status = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
-    values = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
-    replay.publish(DiagnosticStatus(name="/replay", values=values))
-    stack.until(lambda: listener.state().replay is not None, "a replay")
-    beat("/replay", HeartbeatState.ACTIVE, Role.REPLAY)
-    beat("/live_plant", HeartbeatState.ACTIVE, Role.PLANT)
-    assert look().replay == status
-    assert look().plant is not None
-    beat("/replay", HeartbeatState.INACTIVE, Role.REPLAY)
-    assert look().replay is None
-    assert look().plant is None, "it was recorded"
-    assert look().planner == idle
-    beat("/replay", HeartbeatState.ACTIVE, Role.REPLAY)
-    assert look().replay == status
-
-
 def test_the_log_has_the_warnings_of_its_own_stack(harness: Harness) -> None:
-    viewers = [
-        harness.add(
-            ViewerNode(
-                context=harness.context,
-                namespace=namespace,
-                parameter_overrides=[Parameter("port", value=0)],
-            )
-        )
-        for namespace in ("/a/b", "")
-    ]
-    for viewer in viewers:
-        for name in ("a.b.planner", "a.bc.planner", "other.planner"):
-            viewer._on_log(RosoutLog(level=30, name=name, msg=f"{name} warns."))
-    logs = [[notice.source for notice in each._page._log._notices] for each in viewers]
+    pages = [viewer_of(harness, namespace=namespace)[1] for namespace in ("/a/b", "")]
+    probe = harness.probe({})
+    log = harness.matched(probe.create_publisher(RosoutLog, "/rosout", 10), 2)
+    for name in ("a.b.planner", "a.bc.planner", "other.planner"):
+        log.publish(RosoutLog(level=30, name=name, msg=f"{name} warns."))
+    harness.spin_until(lambda: "other.planner warns." in said_on(pages[1]), "the last warning")
+    harness.spin_until(lambda: "a.b.planner warns." in said_on(pages[0]), "that of its stack")
+    logs = [re.findall(r"\S+(?= warns\.)", said_on(page).replace(">", " ")) for page in pages]
     assert logs == [["a.b.planner"], ["other.planner", "a.bc.planner", "a.b.planner"]]
 
 
-def test_a_commander_that_is_busy_is_waited_for(harness: Harness) -> None:
+def test_a_commander_that_is_busy_is_waited_for(clock: Clock, harness: Harness) -> None:
     stack = Stack(harness)
-    viewer, state = stack.viewer, StackState()
-    viewer._unanswered_goal = "7.000000001", 100.0
-    viewer._send_goals(replace(state, busy=True), 99.0)
-    viewer._send_goals(replace(state, busy=True), 130.0)
-    paused = PlantStatus(PlantState.PAUSED, "Time stands still.")
-    viewer._send_goals(replace(state, plant=paused), 131.0)
-    viewer._send_goals(replace(state, plant=paused), 136.5)
-    viewer._send_goals(state, 137.0)
-    assert "answered" not in stack.log(), "it may just have planned"
-    viewer._send_goals(state, 142.0)
-    assert "No planner or controller has responded to the goal: send it again." in stack.log()
-    # Heartbeats of a plant that is busy are of no commander.
     heart = stack.probe.create_publisher(DiagnosticStatus, "/heartbeat", 20)
     harness.connect()
-    for role in (Role.PLANT, Role.COMMANDER):
-        beat = DiagnosticStatus(
-            name="/x", message=HeartbeatState.BUSY.value, hardware_id=role.value
-        )
-        heart.publish(beat)
+    names = names_of(load_robot(robot_file("sliding_masses")))
+    stack.describe()
+    stack.until(lambda: stack.move(0.0, names) or stack.placed, "a goal is shown")
+    stack.press("Fly")
+    stack.until(lambda: "Goal sent." in stack.said(), "it is sent")
+
+    def beat(pulse: HeartbeatState) -> None:
+        role = Role.COMMANDER.value
+        heart.publish(DiagnosticStatus(name="/x", message=pulse.value, hardware_id=role))
         harness.settle(stack.probe)
-        assert viewer._listener.state().busy is (role is Role.COMMANDER)
 
+    def is_missed(seconds: float) -> bool:
+        """Whether an answer is missed after a time."""
+        clock.ahead += seconds
+        stack.draw()
+        clock.ahead += 0.5  # The log is drawn twice a second.
+        stack.draw()
+        return "responded to the goal: send it again." in stack.said()
 
-def test_momenta_are_compared_with_those_of_their_tick(harness: Harness) -> None:
-    stack = Stack(harness)
-    listener: Any = stack.viewer._listener
-    expected = stack.probe.create_publisher(Float64MultiArray, "/momentum_expected", 10)
-    harness.connect()
-    sent: dict[str, list[tuple[int, float]]] = {"momentum": [], "expected": []}
-
-    class Topic:
-        """Gives the messages that a test has put in, at the time that it says they were sent."""
-
-        def __init__(self, name: str) -> None:
-            self.name, self.sent_ns = name, 0
-
-        def take(self) -> Float64MultiArray | None:
-            if not sent[self.name]:
-                return None
-            self.sent_ns, value = sent[self.name].pop(0)
-            return Float64MultiArray(data=[value] * 7)
-
-    stack.momentum.publish(Float64MultiArray(data=[0.5] * 7))
-    expected.publish(Float64MultiArray(data=[0.5] * 6))
-    harness.settle(stack.probe)
-    before = time.time_ns()
-    listener.state()
-    assert 0 < before - listener._expected.sent_ns < 60 * 10**9, "when they were published"
-    assert listener._expected.sent_ns > listener._momentum.sent_ns
-    listener._momentum, listener._expected = Topic("momentum"), Topic("expected")
-
-    def pair() -> tuple[float, float | None]:
-        momenta = listener.state().momenta
-        assert momenta is not None
-        should_be = momenta.expected
-        return float(momenta.actual[0]), None if should_be is None else float(should_be[0])
-
-    sent |= {"momentum": [(1000, 1.0)], "expected": [(1001, 1.0)]}
-    assert pair() == (1.0, 1.0)
-    # The next tick is published while this one is taken: its second part comes in time, or not.
-    sent |= {"momentum": [(2000, 2.0)], "expected": [(1002, 1.0), (2001, 2.0)]}
-    assert pair() == (2.0, 2.0)
-    sent |= {"momentum": [(3000, 3.0)], "expected": []}
-    assert pair() == (2.0, 2.0)
-    sent |= {"momentum": [(4000, 4.0)], "expected": [(4001, 4.0)]}
-    assert pair() == (4.0, 4.0)
-    # Or the first part is not delivered yet when the second is: ticks are milliseconds apart.
-    sent |= {"momentum": [(10_005_000, 5.0)], "expected": [(20_005_001, 6.0)]}
-    assert pair() == (4.0, 4.0)
-    sent |= {"momentum": [(20_005_000, 6.0)]}
-    assert pair() == (6.0, 6.0)
-    # Another plant has no thrusters: nothing is expected of its momenta.
-    sent |= {"momentum": [(10**10, 5.0)]}
-    assert pair() == (5.0, None)
+    beat(HeartbeatState.BUSY)
+    stack.draw()
+    assert not is_missed(30.0)
+    beat(HeartbeatState.ACTIVE)
+    stack.report(PlantState.PAUSED, "Time stands still.")
+    stack.until(lambda: "Time stands still." in stack.said(), "it is paused")
+    assert not is_missed(5.5)
+    assert not is_missed(5.5)
+    stack.report(PlantState.RUNNING, "It goes on.")
+    stack.until(lambda: "It goes on." in stack.said(), "it runs")
+    assert not is_missed(0.0), "it may just have planned"
+    assert is_missed(6.0)
