@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -26,7 +26,7 @@ from spacerobot_ros.bag import RecordedRobot, read_bag
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.trials import PlanningProblem, try_method
 from spacerobot_ros.flight.verification import verify_bag
-from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
+from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import JointLimits
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -161,10 +161,11 @@ def test_robots_are_listed_with_their_joints_and_masses() -> None:
 
 def limited(limits: JointLimits) -> SpaceRobot:
     """Return the planar chain with these limits of its first joint."""
-    description = load_robot(robot_file("planar_chain"))
-    first, *others = description.joints
-    changed = (replace(first, limits=limits), *others)
-    return SpaceRobot(description._with_tree(description.links, changed))
+    text = robot_file("planar_chain").read_text("utf-8")
+    numbers = f'lower="{limits.lower}" upper="{limits.upper}" '
+    numbers += f'velocity="{limits.velocity}" effort="{limits.effort}"'
+    text = text.replace("continuous", "revolute", 1)
+    return SpaceRobot(parse_robot(re.sub("<limit [^>]*/>", f"<limit {numbers}/>", text, count=1)))
 
 
 @pytest.mark.parametrize(

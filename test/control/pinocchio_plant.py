@@ -70,6 +70,12 @@ class PinocchioPlant:
         )
         return np.concatenate([h.linear, h.angular])
 
+    def kinetic_energy(self) -> float:
+        """Return the kinetic energy: that of the centre of mass, and the work of the rest, J."""
+        x = self._stacked()
+        q, velocity = self._configuration(x), x[7 + self._n :]
+        return float(pin.computeKineticEnergy(self.model, self.data, q, velocity))
+
     def acceleration(self, actuation: Actuation) -> tuple[Array, Array]:
         """Return the rates of the base twist ``[v; omega]_B`` (6,) and of qdot (n,)."""
         rate = self._rate(self._stacked(), self._efforts(actuation))[7 + self._n :]

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from control.flights import load, planar_start, plant_of, random_state
-from control.pinocchio_plant import PinocchioPlant
 from support.executive_loop import KP, SHAPE, TIP, ExecutiveLoop, goal_at
 from support.executive_loop import PERIOD as LOOP_PERIOD
 from support.random_robots import random_robot_urdf
@@ -45,16 +44,6 @@ def moving(rng: np.random.Generator, robot: SpaceRobot) -> ControlState:
 
 def to_rest(robot: SpaceRobot) -> Detumbling:
     return Detumbling(robot, None, math.inf, math.inf, 0.0, PERIOD)
-
-
-def energy(plant: PinocchioPlant) -> float:
-    """Return the kinetic energy: that of the centre of mass, and the work of the rest, J."""
-    import pinocchio as pin
-
-    x = plant._stacked()
-    n = len(plant.state.q)
-    q = plant._configuration(x)
-    return float(pin.computeKineticEnergy(plant.model, plant.data, q, x[7 + n :]))
 
 
 # -- rates ------------------------------------------------------------------------------------
@@ -146,11 +135,11 @@ def test_momenta_and_rates_decay_and_energy_only_falls(seed: int) -> None:
     robot, rng = random_robot(seed), np.random.default_rng(seed)
     state, law = moving(rng, robot), to_rest(robot)
     plant = plant_of(robot, state, PERIOD / 2)
-    began, rates, last = plant.momentum(), state.qdot, energy(plant)
+    began, rates, last = plant.momentum(), state.qdot, plant.kinetic_energy()
     first = last
     for _ in range(50):
         plant.step(law.command(plant.state), PERIOD)
-        now = energy(plant)
+        now = plant.kinetic_energy()
         assert now < last
         last = now
     # One second at 2/s, the commands held for a period.
@@ -222,7 +211,7 @@ def test_a_flight_that_late_measurements_make_unstable_ends_at_rest() -> None:
     assert aborted.goal_id == "far"
     assert aborted.message.startswith("Aborted: control is lost, ")
     assert flight.fastest < 6.0
-    assert energy(flight.plant) < 1e-3
+    assert flight.plant.kinetic_energy() < 1e-3
 
 
 def test_the_same_flight_without_these_limits_is_lost() -> None:
@@ -266,12 +255,12 @@ def test_a_robot_that_holds_after_a_rearm_takes_no_energy(law: str) -> None:
     flight.plant.state, flight.past = start, [start]
     flight.executive.plant_stopped("latched")
     flight.executive.on_plant_obeying()
-    momentum, first, most = flight.plant.momentum(), energy(flight.plant), 0.0
+    momentum, first, most = flight.plant.momentum(), flight.plant.kinetic_energy(), 0.0
     for _ in range(100):
         flight.fly(PERIOD)
-        most = max(most, energy(flight.plant))
+        most = max(most, flight.plant.kinetic_energy())
     assert most <= first
-    assert energy(flight.plant) < 0.95 * first
+    assert flight.plant.kinetic_energy() < 0.95 * first
     if law == "computed_torque":  # The motors alone.
         np.testing.assert_allclose(flight.plant.momentum(), momentum, atol=1e-6)
     assert flight.executive.state.value == "holding"

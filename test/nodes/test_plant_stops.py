@@ -1,23 +1,31 @@
-"""Goals of planner and controller when the plant does not obey, and states of other times."""
+"""Goals when the plant does not obey, states of other times, and a plant in real time."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import Log
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.publisher import Publisher
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
+from support.bad_commands import BAD_COMMANDS
 from support.control_loop import Loop, pose
 from support.planner_flight import NEAR, PLANNER, Flight, stamp_of
-from support.ros_harness import LATCHED, Harness, Probe
+from support.plant_rig import TICK, TICK_NS, Rig
+from support.ros_harness import DEEP, LATCHED, Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
 
+from spacerobot_ros.messages.diagnostics import timing_record
 from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
+from spacerobot_ros.simulation.time_modes import RealTime
 
 pytestmark = pytest.mark.usefixtures("one_plant")
 
@@ -227,3 +235,261 @@ def test_control_characters_of_a_status_reach_no_status_and_no_log(
     texts = [status.message, *(line.msg for line in logs.messages["/rosout"])]
     texts += [text for pair in status.values for text in (pair.key, pair.value)]
     assert all(text.isprintable() for text in texts)
+
+
+# -- real time ------------------------------------------------------------------------------------
+
+
+REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 1.0}
+
+
+def test_time_runs_at_the_real_time_factor(harness: Harness) -> None:
+    rig = Rig(harness, {**REALTIME, "diagnostics_period": 0.0})
+    rig.wait("/clock", 20)
+    began = rig.probe.count("/clock")
+    rig.wait("/clock", began + 120)
+    clocks = [nanoseconds(m.clock) / 1e9 for m in rig.probe.messages["/clock"][began:]]
+    arrivals = rig.probe.arrivals["/clock"][began:]
+    factor = (clocks[-1] - clocks[0]) / (arrivals[-1] - arrivals[0])
+    assert 5.0 < factor < 13.0
+    np.testing.assert_allclose(np.diff(clocks), TICK)
+
+
+def test_joints_come_to_rest_when_the_commander_falls_silent(harness: Harness) -> None:
+    rig = Rig(harness, REALTIME)
+    stamp = rig.now_ns
+    rig.send([0.3, -0.2, 0.1])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.0, "rest")
+    rest = nanoseconds(rig.probe.last("joint_states").header.stamp)
+    # A tick carries the command for as long as it is not older than the timeout at its start.
+    assert stamp + 1_000_000_000 < rest <= stamp + 1_000_000_000 + 2 * TICK_NS
+    moving = [m for m in rig.probe.messages["joint_states"] if any(m.velocity)]
+    for message in moving:
+        np.testing.assert_array_equal(message.velocity, [0.3, -0.2, 0.1])
+    at_rest = rig.probe.last("joint_states")
+    np.testing.assert_allclose(
+        at_rest.position, np.array([0.3, -0.2, 0.1]) * TICK * len(moving), rtol=1e-12
+    )
+    rig.wait_for_log("No command on 'joint_commands' for 1 s")
+    assert rig.diagnosed("commands", "timeouts") == 1
+    # It moves again with the next command, and is counted again.
+    rig.send([0.3, 0.0, 0.0])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion again")
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.0, "rest again")
+    assert rig.diagnosed("commands", "timeouts") == 2
+
+
+def test_real_time_holds_the_last_good_command(harness: Harness) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": 0.0})
+    rig.send([0.1, 0.0, -0.1])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.1, "motion")
+    for count, (velocity, names, reason) in enumerate(BAD_COMMANDS.values(), start=1):
+        rig.send(velocity, names)
+        rig.wait_for_refusals(count)
+        warned = [
+            status.message
+            for array in rig.probe.messages["/diagnostics"]
+            for status in array.status
+            if status.name == "plant: commands" and status.level == DiagnosticStatus.WARN
+        ]
+        assert_one_sentence(warned[-1], "refused", reason)
+    np.testing.assert_array_equal(rig.probe.last("joint_states").velocity, [0.1, 0.0, -0.1])
+
+
+@pytest.mark.parametrize("timeout", [1.0, 0.0])
+def test_reset_brings_moving_joints_to_rest_in_real_time(harness: Harness, timeout: float) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
+    rig.send([0.3, 0.0, 0.0])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
+    assert rig.trigger("plant/reset").success
+    harness.spin_until(lambda: rig.probe.last("joint_states").position[0] == 0.0, "the start")
+    rig.wait("joint_states", rig.probe.count("joint_states") + 5)
+    assert rig.probe.last("joint_states").position[0] == 0.0
+
+
+@pytest.mark.parametrize("timeout", [1.0, 0.0])
+def test_joints_are_at_rest_after_a_deactivation(harness: Harness, timeout: float) -> None:
+    rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
+    rig.send([0.3, 0.0, 0.0])
+    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
+    assert rig.plant.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
+    harness.settle(rig.probe)
+    before = rig.probe.count("joint_states")
+    rig.activate()
+    rig.wait("joint_states", before + 6)
+    # The first state is the one that was left.
+    for message in rig.probe.messages["joint_states"][before + 1 :]:
+        assert list(message.velocity) == [0.0] * 3
+
+
+def test_deactivation_stops_time_and_publication(harness: Harness) -> None:
+    rig = Rig(harness, REALTIME)
+    rig.wait("joint_states", 5)
+    assert rig.plant.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
+    harness.settle(rig.probe)
+    before, stamp = rig.probe.count("joint_states"), rig.now_ns
+    harness.spin_for(0.2)
+    assert rig.probe.count("joint_states") == before
+    rig.activate()
+    rig.wait("joint_states", before + 3)
+    stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"][before:]]
+    assert stamps[:3] == [stamp, stamp + TICK_NS, stamp + 2 * TICK_NS]
+
+
+def test_pause_stops_real_time_and_nothing_is_made_up_afterwards(harness: Harness) -> None:
+    rig = Rig(harness, REALTIME)
+    rig.wait("joint_states", 5)
+    rig.pause(True)
+    harness.settle(rig.probe)
+    before = rig.probe.count("joint_states")
+    harness.spin_for(0.2)
+    assert rig.probe.count("joint_states") == before
+    rig.pause(False)
+    rig.wait("joint_states", before + 2)
+    assert rig.diagnosed("commands", "deadlines_missed") == 0
+    stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"]]
+    assert set(np.diff(stamps)) == {TICK_NS}
+
+
+def test_a_busy_machine_misses_deadlines_and_no_tick(harness: Harness) -> None:
+    rig = Rig(harness, {**REALTIME, "real_time_factor": 100.0})
+
+    def hog(_: Any) -> None:
+        del rig.probe.react["odom"]
+        began = time.monotonic()
+        while time.monotonic() - began < 0.05:
+            pass  # 100 ticks of wall time in which no callback runs.
+
+    rig.wait("joint_states", 5)
+    rig.probe.react["odom"] = hog
+    harness.spin_until(
+        lambda: (
+            rig.probe.count("/diagnostics")
+            and any(
+                pair.key == "deadlines_missed" and int(pair.value) >= 50
+                for pair in rig.probe.last("/diagnostics").status[0].values
+            )
+        ),
+        "missed deadlines in the diagnostics",
+    )
+    stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"]]
+    assert set(np.diff(stamps)) == {TICK_NS}
+
+
+@pytest.mark.parametrize("period", [pytest.param(20.0, marks=pytest.mark.slow), 0.0])
+def test_diagnostics_come_once_a_second_whatever_simulated_time_says(
+    harness: Harness, period: float
+) -> None:
+    rig = Rig(harness, {**REALTIME, "real_time_factor": 1.0, "diagnostics_period": period})
+    before = rig.probe.count("/diagnostics")
+    rig.wait("/diagnostics", before + 3)
+    gaps = np.diff(rig.probe.arrivals["/diagnostics"][before:])
+    # On a busy machine a timer may be late, and no diagnostics come early.
+    assert gaps.min() > 0.9
+    assert gaps.max() < 2.5
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_a_paused_plant_goes_on_to_report(harness: Harness, mode: str) -> None:
+    rig = Rig(harness, {**REALTIME, "time_mode": mode, "diagnostics_period": 1000.0})
+    status = harness.probe({"plant/status": DiagnosticStatus}, latched=("plant/status",), name="s")
+    rig.pause(True)
+    harness.settle(rig.probe, status)
+    before, states = rig.probe.count("/diagnostics"), rig.probe.count("joint_states")
+    assert rig.trigger("plant/abort").success
+    harness.spin_until(
+        lambda: "stopped on request" in status.last("plant/status").message, "the abort"
+    )
+    assert status.last("plant/status").level == DiagnosticStatus.ERROR
+    rig.wait("/diagnostics", before + 2)
+    shown = rig.probe.last("/diagnostics").status[0]
+    assert shown.level == DiagnosticStatus.ERROR
+    assert "stopped on request" in shown.message
+    assert rig.probe.count("joint_states") == states, "time stands still"
+
+
+def test_commanders_of_a_remapped_topic_are_counted(harness: Harness) -> None:
+    remapped = ["--ros-args", "-r", "joint_commands:=/arm/commands"]
+    plant = harness.make(PlantNode, {"robot": "sliding_masses", **REALTIME}, cli_args=remapped)
+    harness.spin_until(lambda: "no node publishes" in plant.status.message, "that nobody commands")
+    harness.matched(harness.probe({}).create_publisher(JointState, "/arm/commands", 10))
+    harness.spin_until(lambda: "no node publishes" not in plant.status.message, "the commander")
+    assert plant.status.reason == "no_command"
+
+
+MS = 1_000_000
+
+
+def values(status: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in status.values}
+
+
+def test_what_is_late_is_counted_with_the_worst() -> None:
+    time = RealTime(10 * MS)
+    time.start(0, 0)
+    # Ticks are due at 20, 30, 40 ms; the third is taken 4 ms after the fourth is due.
+    for tick, now in ((1, 20), (2, 39), (3, 54)):
+        time.count_tick(now * MS, tick)
+    # The states of 10, 20, 30 ms are to be answered by 20, 30, 40 ms.
+    for now, stamp in ((19, 10), (33, 20), (47, 30)):
+        time.count_command(now * MS, stamp * MS)
+    status = timing_record("/plant", "robot", time)
+    assert status.level == 1
+    assert status.values == {
+        "tick_rate_Hz": "55.5556",
+        "ticks": "3",
+        "ticks_late": "1",
+        "worst_tick_ms": "4.000",
+        "commands": "3",
+        "commands_late": "2",
+        "worst_command_ms": "7.000",
+        "command_age_s": "0",
+    }
+    assert timing_record("/plant", "robot", time).level == 0, "nothing new is late"
+
+
+def real_time_plant(harness: Harness, **parameters: Any) -> PlantNode:
+    return harness.make(
+        PlantNode,
+        {"robot": "sliding_masses", "diagnostics_period": 0.1, "tick_rate": 50.0, **parameters},
+        autostart=False,
+    )
+
+
+def test_a_plant_in_real_time_tells_its_timing(harness: Harness) -> None:
+    plant = real_time_plant(harness)
+    assert plant.trigger_configure() is TransitionCallbackReturn.SUCCESS
+    probe = harness.probe({"/diagnostics": DiagnosticArray, "joint_states": JointState})
+    commands = probe.create_publisher(JointState, "joint_commands", DEEP)
+
+    def answer(state: JointState) -> None:
+        commands.publish(
+            JointState(header=state.header, name=state.name, velocity=[0.01, 0.0, 0.0])
+        )
+
+    probe.react["joint_states"] = answer
+    harness.connect()
+    plant.trigger_activate()
+    harness.spin_until(lambda: probe.count("joint_states") > 40, "forty ticks")
+    plant.trigger_deactivate()
+    status = {s.name: values(s) for s in probe.last("/diagnostics").status}
+    timing = status["plant: timing"]
+    ticks = int(timing["ticks"])
+    assert 30 <= ticks <= 45
+    # Every state is answered, the first one too, whose stamp is zero: nothing is out of order.
+    assert status["plant: commands"]["refused"] == "0"
+    assert int(timing["commands"]) in (ticks - 2, ticks - 1)
+    assert set(status["plant: strokes"]) == set(plant.plant.robot.joint_names)
+    left = float(status["plant: strokes"]["slider_2"])
+    assert left == pytest.approx(plant.plant.robot.upper[1], abs=1e-9), "it has not moved"
+
+
+def test_lockstep_has_no_deadlines(harness: Harness) -> None:
+    plant = real_time_plant(harness, time_mode="lockstep")
+    assert plant.trigger_configure() is TransitionCallbackReturn.SUCCESS
+    probe = harness.probe({"/diagnostics": DiagnosticArray})
+    harness.connect()
+    plant.trigger_activate()
+    harness.spin_until(lambda: probe.count("/diagnostics"), "the first diagnostics")
+    assert not any("timing" in s.name for s in probe.last("/diagnostics").status)

@@ -3,25 +3,48 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from mcap.reader import make_reader
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.qos import qos_profile_system_default
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_system_default
 from rclpy.serialization import deserialize_message
 from rclpy.service_introspection import ServiceIntrospectionState
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from support.made_bags import joint_states
 from support.planner_flight import PLANNER
-from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack, parameters_of
-from support.ros_harness import LATCHED, Harness
+from support.recorded_stack import (
+    LATCHED_TOPICS,
+    PLANT,
+    STREAMS,
+    BagContent,
+    Stack,
+    message_class,
+    parameters_of,
+)
+from support.ros_harness import LATCHED, Harness, Probe, construction
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros import __version__, read_bag
+from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
+from spacerobot_ros.nodes.recorder import loss_events
 
 URDF = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
 
@@ -234,3 +257,279 @@ def test_the_recorder_tells_of_its_bag(harness: Harness, tmp_path: Path) -> None
     bag = stack.close_bag()
     # It records what it says, and so is a few messages further by now.
     assert bag.count - 20 <= int(said["messages"]) <= bag.count
+
+
+# -- files on disk --------------------------------------------------------------------------------
+
+
+def test_a_recording_is_split_by_time_and_flushed_as_often_as_it_is_to(
+    harness: Harness, tmp_path: Path
+) -> None:
+    publisher = harness.probe({}).create_publisher(String, "/talk", 10)
+    parameters = {"topics": "/talk", "clock_wait": 0.0, "flush_period": 0.375}
+    bag = str(tmp_path / "flight.mcap")
+    # The third message comes more than a nanosecond after the first.
+    recorder = harness.make(RecorderNode, {**parameters, "bag": bag, "max_duration": 1e-9})
+    assert 375_000_000 in {timer.timer_period_ns for timer in recorder.timers}
+    harness.matched(publisher)
+    for n in range(3):
+        publisher.publish(String(data=f"{n}"))
+        harness.spin_until(lambda n=n: recorder.messages_recorded > n, "it is recorded")  # type: ignore[misc]
+        recorder.flush()
+    recorder.trigger_deactivate()
+    recorder.trigger_cleanup()
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 1
+    assert [m.data for path in files for _, m in read_bag(path).messages("/talk")] == list("012")
+
+
+class Lost(NamedTuple):
+    """As rclpy tells it."""
+
+    total_count_change: int
+
+
+def test_lost_messages_are_published_and_stay_in_the_bag(harness: Harness, tmp_path: Path) -> None:
+    probe = harness.probe({"/diagnostics": DiagnosticArray})
+    publisher = probe.create_publisher(String, "/talk", 10)
+    # Its watchdog has diagnostics of its own.
+    parameters = {"bag": str(tmp_path / "flight.mcap"), "watchdog_timeout": 0.0}
+    recorder = harness.make(RecorderNode, parameters)
+    harness.matched(publisher)
+    assert recorder.recording is not None
+    assert recorder.recording.lost.total() == 0
+    assert recorder.count_publishers("/diagnostics") == 0
+    for count in (3, 4):
+        events = loss_events(recorder.recording, "/talk")
+        events.message_lost(Lost(count))
+    harness.spin_until(lambda: probe.messages["/diagnostics"], "the loss is published")
+    (status,) = probe.last("/diagnostics").status
+    assert status.level == DiagnosticStatus.WARN
+    assert [(pair.key, pair.value) for pair in status.values] == [("/talk", "7")]
+    recorder.trigger_deactivate()
+    recorder.trigger_cleanup()
+    assert read_bag(tmp_path / "flight.mcap").metadata["recorder"]["messages_lost"] == "7"
+
+
+ERROR = 40  # of rcl_interfaces/msg/Log
+
+
+def errors(probe: Probe) -> list[str]:
+    return [m.msg for m in probe.messages["/rosout"] if m.level >= ERROR]
+
+
+def test_a_device_is_refused_in_a_sentence(harness: Harness) -> None:
+    stack = Stack(harness, Path("/dev/full"))
+    assert stack.recorder.trigger_configure() is not TransitionCallbackReturn.SUCCESS
+    assert_one_sentence(str(stack.recorder.fault), "/dev/full", "it is a device")
+    stack.probe.watch("/planner/status", message_class("diagnostic_msgs/msg/DiagnosticStatus"))
+    harness.connect()
+    stack.fly()
+
+
+def test_a_bag_that_cannot_be_made_is_refused_in_a_sentence(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    for bag in (tmp_path, tmp_path / "file" / "flight.mcap"):
+        with pytest.raises(SpaceRobotError) as refusal:
+            RecorderNode(**construction(ros_context, {"bag": str(bag)}))
+        assert_one_sentence(str(refusal.value), str(bag))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("compression", "zip"), ("flush_period", 0.0), ("flush_period", "often"), ("topics", 3)],
+)
+def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
+    ros_context: rclpy.Context, tmp_path: Path, name: str, value: Any
+) -> None:
+    parameters = {"bag": str(tmp_path / "flight.mcap"), name: value}
+    with pytest.raises(SpaceRobotError) as refusal:
+        RecorderNode(**construction(ros_context, parameters))
+    assert_one_sentence(str(refusal.value), f"'{name}'", str(value))
+    assert not (tmp_path / "flight.mcap").exists()
+
+
+def test_a_recorder_that_is_to_refuse_a_bag_that_is_there_does(
+    ros_context: rclpy.Context, tmp_path: Path
+) -> None:
+    bag = tmp_path / "flight.mcap"
+    bag.write_bytes(b"the record of the crash")
+    parameters = {"bag": str(bag), "when_exists": "refuse"}
+    with pytest.raises(SpaceRobotError) as refusal:
+        RecorderNode(**construction(ros_context, parameters))
+    assert_one_sentence(str(refusal.value), str(bag), "File exists")
+    assert bag.read_bytes() == b"the record of the crash"
+
+
+def test_a_bag_that_goes_is_reported_within_a_second(
+    harness: Harness, ros_domain: int, tmp_path: Path
+) -> None:
+    kinds = {"/diagnostics": DiagnosticArray, "/events": DiagnosticStatus}
+    probe = harness.probe(kinds)
+    bag = tmp_path / "folder" / "flight.mcap"
+    with subprocess.Popen(
+        [
+            *(sys.executable, "-m", "spacerobot_ros.nodes.recorder", "--ros-args"),
+            *("-p", f"bag:={bag}", "-p", "flush_period:=60.0"),
+        ],
+        cwd=Path(__file__).parents[2],
+        env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            change = probe.create_client(ChangeState, "recorder/change_state")
+            while not probe.messages["/events"]:  # Until these have met: paused, and on again.
+                for transition in (
+                    Transition.TRANSITION_DEACTIVATE,
+                    Transition.TRANSITION_ACTIVATE,
+                ):
+                    request = ChangeState.Request(transition=Transition(id=transition))
+                    assert harness.call(change, request).success
+            bag.unlink()
+            bag.parent.rmdir()
+            gone = time.monotonic()
+            harness.spin_until(lambda: probe.messages["/diagnostics"], "it is reported")
+            seconds = time.monotonic() - gone
+            harness.spin_until(
+                lambda: any(
+                    "recording_failed" in [pair.value for pair in event.values]
+                    for event in probe.messages["/events"]
+                ),
+                "the event",
+            )
+        finally:
+            process.send_signal(signal.SIGINT)
+            errors = process.communicate(timeout=20)[1]
+    (status,) = probe.last("/diagnostics").status
+    assert status.level == DiagnosticStatus.ERROR
+    assert "was lost during recording: it was removed or moved" in status.message
+    assert seconds < 1.0
+    assert process.returncode == 1
+    assert "was lost during recording" in errors
+    assert "Traceback" not in errors
+
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+KEPT, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
+S = 10**9
+
+
+class Recorded:
+    """A recorder of chosen topics, and a probe that publishes on them."""
+
+    def __init__(self, harness: Harness, bag: Path, **parameters: Any) -> None:
+        self.harness, self.bag, self.sent = harness, bag, 0
+        self.probe = harness.probe({})
+        self.parameters = {"bag": str(bag), "watchdog_timeout": 0.0, "tf_period": 0.0, **parameters}
+
+    def start(self, *topics: str) -> None:
+        self.recorder = self.harness.make(
+            RecorderNode, {**self.parameters, "topics": " ".join(topics)}
+        )
+        self.harness.spin_until(lambda: self.recorder.topics == set(topics), "subscriptions")
+        self.harness.connect()
+
+    def publish(self, publisher: Any, message: Any) -> None:
+        """Publish a message, and wait until it is recorded."""
+        recording = self.recorder.recording
+        assert recording is not None
+        publisher.publish(message)
+        self.sent += 1
+        self.harness.spin_until(
+            lambda: recording.messages + len(recording.early_messages) >= self.sent,
+            "it is recorded",
+        )
+
+    def close(self) -> dict[str, list[tuple[float, float]]]:
+        """Close the bag; return log and publish times in s by topic."""
+        self.recorder.trigger_shutdown()
+        found: dict[str, list[tuple[float, float]]] = {}
+        with self.bag.open("rb") as file:
+            for _, channel, record in make_reader(file).iter_messages(log_time_order=False):
+                times = record.log_time / S, record.publish_time / S
+                found.setdefault(channel.topic, []).append(times)
+        return found
+
+
+def test_every_publisher_of_a_topic_is_heard_as_it_offers(harness: Harness, tmp_path: Path) -> None:
+    """A reader that asks for more than a publisher offers hears nothing of that one."""
+    recorded = Recorded(harness, tmp_path / "a.mcap", clock_wait=0.0)
+    offers = {
+        "/reliability": [(RELIABLE, VOLATILE), (BEST_EFFORT, VOLATILE)],
+        "/durability": [(RELIABLE, KEPT), (RELIABLE, VOLATILE)],
+        "/kept": [(BEST_EFFORT, KEPT)],
+    }
+    publishers = [
+        recorded.probe.create_publisher(
+            String, topic, QoSProfile(depth=7, reliability=reliability, durability=durability)
+        )
+        for topic, offered in offers.items()
+        for reliability, durability in offered
+    ]
+    recorded.start(*offers)
+    for publisher in publishers:
+        recorded.publish(publisher, String(data="heard"))
+    assert {topic: len(times) for topic, times in recorded.close().items()} == {
+        topic: len(offered) for topic, offered in offers.items()
+    }
+    (qos,) = read_bag(recorded.bag).qos("/kept")
+    assert (qos.reliability, qos.durability) == ("best_effort", "transient_local")
+
+
+def test_messages_carry_the_clock_and_their_stamps(harness: Harness, tmp_path: Path) -> None:
+    recorded = Recorded(harness, tmp_path / "a.mcap")
+    create = recorded.probe.create_publisher
+    clock, joints = create(Clock, "/clock", 10), create(JointState, "/joint_states", 10)
+    talk, urdf = create(String, "/talk", 10), create(String, "/a/robot_description", LATCHED)
+    recorded.start("/clock", "/joint_states", "/talk", "/a/robot_description")
+    for second in (1, 2, 2):
+        message = Clock()
+        message.clock.sec = second
+        recorded.publish(clock, message)
+        recorded.publish(joints, joint_states(second - 0.5, ["a"], [1.0], [2.0]))
+        recorded.publish(talk, String(data=f"at {second}"))
+        recorded.publish(urdf, String(data=f"<robot name='{second}'/>"))
+    assert recorded.close() == {
+        "/clock": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+        "/joint_states": [(1.0, 0.5), (2.0, 1.5), (2.0, 1.5)],
+        "/talk": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+        "/a/robot_description": [(1.0, 1.0), (2.0, 2.0), (2.0, 2.0)],
+    }
+    # The first one only; the others are messages like all.
+    with recorded.bag.open("rb") as file:
+        attachments = [(a.name, a.data) for a in make_reader(file).iter_attachments()]
+    assert attachments == [("a.robot_description.urdf", b"<robot name='1'/>")]
+
+
+def test_without_a_clock_messages_keep_their_stamps(harness: Harness, tmp_path: Path) -> None:
+    recorded = Recorded(harness, tmp_path / "a.mcap", clock_wait=0.0)
+    joints = recorded.probe.create_publisher(JointState, "/joint_states", 10)
+    recorded.start("/joint_states")
+    stamps = [0.5, 1.5, 1.5, 1.25]
+    for second in stamps:
+        recorded.publish(joints, joint_states(second, ["a"], [1.0], [2.0]))
+    times = recorded.close()["/joint_states"]
+    assert [publish for _, publish in times] == stamps
+    assert all(abs(log - time.time()) < 60 for log, _ in times)
+
+
+def test_a_file_of_named_objects_is_in_the_bag_or_refused(harness: Harness, tmp_path: Path) -> None:
+    file = tmp_path / "about.json"
+    file.write_text(json.dumps({"one": {"a": 1, "b": "x"}, "two": {}}))
+    recorded = Recorded(harness, tmp_path / "a.mcap", describe=str(file))
+    recorded.probe.create_publisher(String, "/talk", 10)
+    recorded.start("/talk")
+    recorded.close()
+    metadata = read_bag(recorded.bag).metadata
+    assert (metadata["one"], metadata["two"]) == ({"a": "1", "b": "x"}, {})
+    refused_bag = tmp_path / "refused.mcap"
+    parameters = {**recorded.parameters, "bag": str(refused_bag)}
+    refusing = harness.make(RecorderNode, parameters, autostart=False)
+    for text in ("[1]", "{", '{"one": 5}'):
+        file.write_text(text)
+        refusing.trigger_configure()
+        assert_one_sentence(str(refusing.fault), "'describe'")
+        assert not refused_bag.exists()

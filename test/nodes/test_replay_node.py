@@ -174,9 +174,7 @@ def test_a_late_reader_gets_what_is_latched(harness: Harness, bag: Path) -> None
 
 def test_pause_step_and_resume(harness: Harness, bag: Path) -> None:
     played = Played(harness, bag, paused=True, topics="/stream", wait=0.0)
-    harness.spin_until(
-        lambda: all(p.get_subscription_count() for p in played.node._outputs), "it is heard"
-    )
+    harness.connect()
     pause = played.probe.create_client(SetBool, "/replay/pause")
     resume = played.probe.create_client(Trigger, "/replay/resume")
     step = played.probe.create_client(Trigger, "/replay/step")

@@ -237,14 +237,14 @@ class Fragile(FlightNode):
     said = ""
 
     def configure(self) -> None:
-        self.create_subscription(JointState, "joints", self._raise, 10)
-        self.create_subscription(JointState, "raw", self._raise, 10, raw=True)
-        self.create_service(Trigger, "~/break", lambda request, response: self._raise(request))
+        self.create_subscription(JointState, "joints", self.fail, 10)
+        self.create_subscription(JointState, "raw", self.fail, 10, raw=True)
+        self.create_service(Trigger, "~/break", lambda request, response: self.fail(request))
 
     def on_failure(self, sentence: str, error: Exception) -> None:
         self.said = sentence
 
-    def _raise(self, _: Any) -> None:
+    def fail(self, _: Any) -> None:
         raise OverflowError(34, "Numerical result out of range")
 
 
@@ -262,7 +262,7 @@ def test_an_exception_of_a_callback_deactivates_the_node_which_says_why(
         assert not answer.success
         assert answer.message == node.said
     elif what == "timer":
-        node.create_timer(0.001, lambda: node._raise(None))
+        node.create_timer(0.001, lambda: node.fail(None))
     else:
         publisher.publish(JointState())
     harness.spin_until(lambda: node.said, "the failure")
