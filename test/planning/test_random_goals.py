@@ -33,11 +33,6 @@ from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 FOLDER = Path(__file__).parents[2] / "urdf"
 
 
-@pytest.fixture(autouse=True)
-def _interpreted(compiled: None) -> None:
-    """Compile, in place of the folder's choice: these flights are long."""
-
-
 # -- numbers that methods state, and defaults of tolerances: against other ways to get them ------
 
 
