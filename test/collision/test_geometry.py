@@ -266,8 +266,10 @@ sys.modules["coal"] = None
 logging.basicConfig(format="%(message)s")
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.simulation.clearance import ClearanceMonitor
 text, shapes = json.load(sys.stdin)
-geometry = CollisionGeometry(parse_robot(text))
+geometry = CollisionGeometry(robot := parse_robot(text))
+assert ClearanceMonitor.of(robot, ("base_link", "upper_arm")) is None
 poses = geometry.poses(np.array(shapes))
 bounds = [geometry.distances(k, poses).tolist() for k in range(len(geometry.pairs))]
 pairs = list(zip(geometry.pairs.tolist(), bounds))
@@ -295,7 +297,8 @@ def test_without_coal_distances_are_bounds(tmp_path: Path) -> None:
     # The next command warns of it no more.
     assert [each.stderr for each in ended] == [
         "Distances between links are lower bounds from enclosing spheres, capsules and boxes, "
-        "because the package coal is not installed: `pip install '.[collision]'` in the clone.\n",
+        "because the package coal is not installed: `pip install '.[collision]'` in the clone.\n"
+        "The plant cannot measure clearance without the package coal.\n",
         "",
     ]
     is_exact, ignored_pairs, bounds = json.loads(ended[0].stdout)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import math
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,6 @@ from support.oracles import Array, PinocchioOracle, assert_agrees, random_motion
 from support.oracles.orbit import relative_motion
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair, ObstaclePair
-from spacerobot_ros.collision import distances as distances_module
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
@@ -405,21 +401,8 @@ def test_the_nearest_pair_is_that_of_all_distances(name: str) -> None:
     assert (each.min(axis=0) < 0).any()
 
 
-def test_without_coal_or_pairs_a_plant_measures_no_clearance(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
-) -> None:
-    sliders = load_robot(robot_file("sliding_masses"))
-    assert ClearanceMonitor.of(sliders, ()) is None
-    monkeypatch.setitem(sys.modules, "coal", None)
-    monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(tmp_path / "cache"))
-    distances_module._coal.cache_clear()
-    try:
-        with caplog.at_level(logging.WARNING):
-            assert ClearanceMonitor.of(parse_robot(URDF), ("base", "left", "right")) is None
-    finally:
-        monkeypatch.undo()
-        distances_module._coal.cache_clear()
-    assert "The plant cannot measure clearance without the package coal." in caplog.messages
+def test_without_pairs_a_plant_measures_no_clearance() -> None:
+    assert ClearanceMonitor.of(load_robot(robot_file("sliding_masses")), ()) is None
 
 
 def ball_at(x: float, name: str = "ball") -> str:
