@@ -1,25 +1,36 @@
-"""Commands of a plant: taken, limited, refused, and latched."""
+"""Commands of a plant: taken, limited, refused, and latched; what it publishes of its state."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
+import numpy.typing as npt
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
+from support import crossing
 from support.bad_commands import BAD_COMMANDS
-from support.control_loop import JOINTS
+from support.control_loop import JOINTS, Loop
 from support.odometry import pose_of, twist_of
 from support.oracles import PinocchioOracle
 from support.planner_flight import values_of
-from support.plant_rig import STATE, TICK, TICK_NS, Rig
-from support.ros_harness import Harness, nanoseconds
+from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
+from support.ros_harness import LATCHED, Harness, nanoseconds
 from support.sentences import assert_one_sentence
+from visualization_msgs.msg import Marker, MarkerArray
 
+from spacerobot_ros.messages.builders import path_message
+from spacerobot_ros.nodes import PlantNode
+from spacerobot_ros.planning import BasePath
 from spacerobot_ros.simulation.status import PlantState
 
 # -- commands ---------------------------------------------------------------------------------
@@ -344,3 +355,319 @@ def test_faults_from_before_the_decision_stay(harness: Harness) -> None:
     shoulder, elbow = rig.probe.last("joint_states").velocity
     assert abs(shoulder) > 1e-3
     assert elbow == 0.0
+
+
+# -- states ---------------------------------------------------------------------------------------
+
+
+Array = npt.NDArray[np.float64]
+
+ROBOTS = Path(__file__).parents[2] / "urdf"
+
+
+def momentum_by_pinocchio(robot: str, odom: Odometry, joints: JointState) -> tuple[Array, float]:
+    """Return the total momenta (world) and the kinetic energy of a published state."""
+    oracle = PinocchioOracle((ROBOTS / f"{robot}.urdf").read_text("utf-8"), list(joints.name))
+    r, quaternion = pose_of(odom)
+    oracle.set_configuration(np.array(joints.position), quaternion, r)
+    twist = np.concatenate(twist_of(odom))
+    oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(np.array(joints.velocity)))
+    p, L, energy = oracle.momentum_W()
+    return np.concatenate([p, L]), energy
+
+
+# -- what is published ------------------------------------------------------------------------
+
+
+def test_activation_publishes_the_state_of_tick_0_and_the_clock_first(harness: Harness) -> None:
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat()
+    rig = Rig(
+        harness,
+        {
+            "initial_position": [1.0, -2.0, 3.0],
+            "initial_orientation": turn.tolist(),
+            "initial_joint_positions": [0.5, -0.25, 0.125],
+            "world_frame": "map",
+        },
+        activate=False,
+    )
+    harness.settle(rig.probe)
+    assert not set(rig.probe.order) & set(STATE), "published before activation"
+    rig.activate()
+    harness.settle(rig.probe)
+    print(rig.probe.order)
+    states = [topic for topic in rig.probe.order if topic in STATE]
+    assert sorted(states) == sorted(STATE), "every topic once"
+    assert states[0] == "/clock"
+    assert nanoseconds(rig.probe.last("/clock").clock) == 0
+
+    odom, base_pose = rig.probe.last("odom"), rig.probe.last("base_pose")
+    assert (odom.header.frame_id, odom.child_frame_id) == ("map", "base_link")
+    assert base_pose.header.frame_id == "map"
+    assert base_pose.pose == odom.pose.pose
+    position, quaternion = pose_of(odom)
+    np.testing.assert_array_equal(position, [1.0, -2.0, 3.0])
+    np.testing.assert_allclose(quaternion, turn, atol=1e-15)
+    np.testing.assert_array_equal(np.concatenate(twist_of(odom)), np.zeros(6))
+
+    joints = rig.probe.last("joint_states")
+    assert list(joints.name) == SLIDERS
+    assert list(joints.position) == [0.5, -0.25, 0.125]
+    assert list(joints.velocity) == [0.0] * 3
+    assert list(joints.effort) == [0.0] * 3
+
+    momentum = rig.probe.last("momentum")
+    (dimension,) = momentum.layout.dim
+    assert dimension.label.split() == [
+        "linear_x", "linear_y", "linear_z", "angular_x", "angular_y", "angular_z", "kinetic_energy",
+    ]  # fmt: skip
+    assert (dimension.size, dimension.stride, momentum.layout.data_offset) == (7, 7, 0)
+    np.testing.assert_array_equal(momentum.data, np.zeros(7))
+    for message in (odom, base_pose, joints):
+        assert nanoseconds(message.header.stamp) == 0
+
+
+def test_the_description_is_there_for_a_late_reader(harness: Harness) -> None:
+    Rig(harness)
+    late = harness.probe({"robot_description": String}, latched=("robot_description",), name="late")
+    harness.spin_until(lambda: late.count("robot_description"), "the robot description")
+    # With the pairs of the SRDF beside it.
+    received = ElementTree.fromstring(late.last("robot_description").data)
+    carried = received.findall("disable_collisions")
+    assert [dict(each.attrib) for each in carried] == [
+        {"link1": f"mass_{i}", "link2": f"mass_{j}"} for i, j in ((1, 2), (1, 3), (2, 3))
+    ]
+    for each in carried:
+        received.remove(each)
+    text = ElementTree.tostring(received, encoding="unicode")
+    file = (ROBOTS / "sliding_masses.urdf").read_text("utf-8")
+    assert ElementTree.canonicalize(text, strip_text=True) == ElementTree.canonicalize(
+        file, strip_text=True
+    )
+
+
+def test_states_agree_with_pinocchio_while_everything_moves(harness: Harness) -> None:
+    rig = Rig(
+        harness,
+        {
+            "robot": "planar_manipulator",
+            "linear_momentum": [1.0, -2.0, 0.5],
+            "angular_momentum": [0.2, 0.1, -3.0],
+            "end_effector_frame": "end_effector",
+        },
+        topics={"end_effector_pose": PoseStamped},
+    )
+    names = list(rig.probe.last("joint_states").name)
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        rig.step(rng.uniform(-0.3, 0.3, len(names)).tolist(), names)
+    harness.settle(rig.probe)
+    oracle = PinocchioOracle((ROBOTS / "planar_manipulator.urdf").read_text("utf-8"), names)
+    for k in range(6):
+        odom, joints = (rig.probe.messages[t][k] for t in ("odom", "joint_states"))
+        published = np.array(rig.probe.messages["momentum"][k].data)
+        momenta, energy = momentum_by_pinocchio("planar_manipulator", odom, joints)
+        np.testing.assert_allclose(published[:6], momenta, atol=1e-12)
+        np.testing.assert_allclose(published[:6], [1, -2, 0.5, 0.2, 0.1, -3], atol=1e-12)
+        assert published[6] == pytest.approx(energy, rel=1e-12)
+        r, quaternion = pose_of(odom)
+        oracle.set_configuration(np.array(joints.position), quaternion, r)
+        R_WE, r_WE = oracle.frame_W("end_effector")
+        tip = rig.probe.messages["end_effector_pose"][k]
+        assert tip.header.frame_id == "world"
+        assert tip.header.stamp == odom.header.stamp
+        p, o = tip.pose.position, tip.pose.orientation
+        np.testing.assert_allclose([p.x, p.y, p.z], r_WE, atol=1e-12)
+        np.testing.assert_allclose(
+            Rotation.from_quat([o.x, o.y, o.z, o.w]).as_matrix(), R_WE, atol=1e-12
+        )
+
+
+def test_markers_stand_where_the_links_are(harness: Harness) -> None:
+    rig = Rig(
+        harness,
+        {"marker_period": 2 * TICK, "initial_position": [0.0, 0.0, 1.0]},
+        topics={"markers": MarkerArray},
+    )
+    for _ in range(4):
+        rig.step([0.4, 0.0, 0.0])
+    harness.settle(rig.probe)
+    arrays = rig.probe.messages["markers"]
+    assert [nanoseconds(a.markers[0].header.stamp) // TICK_NS for a in arrays] == [0, 2, 4]
+    spheres = [m for m in arrays[-1].markers if m.type == Marker.SPHERE]
+    assert [m.ns for m in spheres] == ["mass_1", "mass_2", "mass_3"]
+    odom, joints = rig.probe.last("odom"), rig.probe.last("joint_states")
+    r, quaternion = pose_of(odom)
+    for axis, marker in enumerate(spheres):
+        place = r + Rotation.from_quat(quaternion).apply(np.eye(3)[axis] * joints.position[axis])
+        p = marker.pose.position
+        np.testing.assert_allclose([p.x, p.y, p.z], place, atol=1e-14)
+        assert marker.header.frame_id == "world"
+
+
+def test_a_namespace_moves_all_but_the_clock_and_the_diagnostics(harness: Harness) -> None:
+    harness.make(
+        PlantNode,
+        {"robot": "sliding_masses", "time_mode": "lockstep", "diagnostics_period": 0.05},
+        namespace="/craft",
+    )
+    topics = {f"/craft/{name}" if name[0] != "/" else name: kind for name, kind in STATE.items()}
+    probe = harness.probe({**topics, "/diagnostics": DiagnosticArray})
+    # A newcomer is shown the state that waits.
+    harness.spin_until(lambda: set(topics) <= set(probe.order), "the state in the namespace")
+    publisher = harness.matched(probe.create_publisher(JointState, "/craft/joint_commands", 10))
+    publisher.publish(JointState(name=SLIDERS, velocity=[0.5, 0.0, 0.0]))
+    harness.spin_until(
+        lambda: probe.last("/craft/joint_states").velocity[0] == 0.5, "a step in the namespace"
+    )
+    harness.spin_until(lambda: probe.count("/diagnostics"), "diagnostics")
+    assert probe.last("/diagnostics").status[0].name == "craft/plant: commands"
+
+
+# -- lockstep with latecomers -----------------------------------------------------------------
+
+
+def test_a_late_reader_gets_the_state_that_waits(harness: Harness) -> None:
+    plant = harness.make(PlantNode, {"robot": "sliding_masses", "time_mode": "lockstep"})
+    assert plant.is_active
+    late = harness.probe(STATE)
+    harness.spin_until(lambda: all(late.count(topic) for topic in STATE), "the waiting state")
+    assert nanoseconds(late.last("joint_states").header.stamp) == 0
+    # It is the same tick still, and goes on from it.
+    publisher = late.create_publisher(JointState, "joint_commands", 10)
+    harness.matched(publisher)
+    publisher.publish(JointState(name=SLIDERS, velocity=[0.2, 0.0, 0.0]))
+    harness.spin_until(
+        lambda: nanoseconds(late.last("joint_states").header.stamp) > 0, "the next tick"
+    )
+    assert nanoseconds(late.last("joint_states").header.stamp) == TICK_NS
+
+
+def test_a_reader_that_comes_during_a_pause_gets_the_state_after_it(harness: Harness) -> None:
+    rig = Rig(harness)
+    rig.pause(True)
+    late = harness.probe(STATE, name="late")
+    harness.connect()
+    # Time for the plant to look for newcomers several times.
+    harness.spin_for(0.35)
+    rig.pause(False)
+    harness.spin_until(lambda: late.count("joint_states"), "the waiting state after the pause")
+
+
+def test_a_status_is_published_before_the_states_that_it_is_true_of(harness: Harness) -> None:
+    rig = Rig(harness, topics={"plant/status": DiagnosticStatus})
+    rig.step([0.1, 0.0, 0.0])
+    harness.settle(rig.probe)
+    # From here on: right after discovery the order of topics is not kept.
+    before = len(rig.probe.order)
+    rig.plant.trigger_deactivate()
+    rig.activate()
+    rig.trigger("plant/reset")
+    rig.wait("odom", 4)
+    states = [t for t in rig.probe.order[before:] if t in ("plant/status", "odom")]
+    assert states == ["plant/status", "plant/status", "odom", "plant/status", "odom"]
+
+
+def test_clearances_are_published_with_events_of_contacts(harness: Harness) -> None:
+    topics = {"clearance": DiagnosticStatus, "events": DiagnosticStatus}
+    parameters = {
+        "robot": "",
+        "robot_description": crossing.URDF,
+        "initial_joint_positions": [-0.06, -0.12],
+        "clearance_period": 2 * TICK,
+    }
+    rig = Rig(harness, parameters, topics=topics)
+    shapes = [[-0.06, -0.12]]
+    for _ in range(7):
+        state = rig.step([0.02 / TICK, 0.04 / TICK], ["y", "x"])
+        shapes.append([state.position[state.name.index(name)] for name in ("y", "x")])
+    truth = crossing.distance(np.array(shapes))
+    assert (truth[::2] <= 0).tolist() == [False, True, True, False]
+    rig.wait("clearance", 4)
+    found = [{pair.key: pair.value for pair in m.values} for m in rig.probe.messages["clearance"]]
+    assert [float(each["time"]) for each in found] == pytest.approx(
+        [0, 2 * TICK, 4 * TICK, 6 * TICK]
+    )
+    np.testing.assert_allclose([float(each["distance"]) for each in found], truth[::2], atol=1e-6)
+    assert {(each["first"], each["second"]) for each in found} == {("left", "right")}
+    levels = [m.level for m in rig.probe.messages["clearance"]]
+    assert levels == [b"\0", b"\2", b"\2", b"\0"]
+    events = [{p.key: p.value for p in m.values} for m in rig.probe.messages["events"]]
+    contacts = {e["event"]: float(e["time"]) for e in events if e["event"].startswith("contact")}
+    assert contacts == pytest.approx({"contact": 2 * TICK, "contact_ended": 6 * TICK})
+
+
+CRATE = """<robot name="crate"><link name="world"/><link name="crate"><collision><geometry>
+  <box size="0.2 0.3 0.4"/></geometry></collision></link><joint name="held" type="fixed">
+  <parent link="world"/><child link="crate"/><origin xyz="0.1 0 0"/></joint></robot>"""
+
+
+def test_a_contact_ends_with_its_obstacle(harness: Harness) -> None:
+    """The robot has no pair of links that may touch: without the crate nothing is measured."""
+    parameters = {"clearance_period": 2 * TICK}
+    rig = Rig(harness, parameters, topics={"plant/status": DiagnosticStatus})
+    obstacles = rig.probe.create_publisher(String, "obstacles", LATCHED)
+    harness.connect()
+
+    def contacts() -> str:
+        last = rig.probe.messages["plant/status"][-1]
+        return next((pair.value for pair in last.values if pair.key == "contacts"), "")
+
+    obstacles.publish(String(data=CRATE))
+    harness.settle(rig.probe)
+    for _ in range(4):
+        rig.step([0.01, 0.02, -0.01])
+    harness.spin_until(lambda: "crate" in contacts(), "a contact")
+    obstacles.publish(String(data=""))
+    harness.spin_until(lambda: not contacts(), "its end")
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [{"robot_description": crossing.URDF, "clearance_period": 0.0}, {"robot": "sliding_masses"}],
+)
+def test_clearances_are_not_published_where_there_are_none(
+    harness: Harness, parameters: dict[str, Any]
+) -> None:
+    """By a period of 0, and for a robot none of whose links may touch."""
+    rig = Rig(harness, parameters, topics={"clearance": DiagnosticStatus})
+    assert rig.probe.count_publishers("clearance") == 0
+
+
+LAST = 2**31 - 1
+
+
+def joints(names: list[str], stamp: tuple[int, int] = (1, 0), value: float = 0.5) -> JointState:
+    values = [value] * len(names)
+    message = JointState(name=names, position=values, velocity=values, effort=values)
+    message.header.stamp.sec, message.header.stamp.nanosec = stamp
+    return message
+
+
+def test_a_path_that_ends_beyond_all_stamps_ends_at_the_last() -> None:
+    path = BasePath(np.array([0.0, 5.0]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
+    message = deserialize_message(path_message(path, LAST * 1_000_000_000, "world"), PathMessage)
+    assert [pose.header.stamp.sec for pose in message.poses] == [LAST, LAST]
+
+
+# -- states of others -------------------------------------------------------------------------
+
+
+def test_beside_another_robot_a_controller_sees_every_pose(harness: Harness) -> None:
+    """The other's joint_states come between odom and joint_states, with the same stamp."""
+    loop = Loop(harness)
+    stranger = loop.probe.create_publisher(JointState, "joint_states", 10)
+    harness.matched(stranger)
+    alone = loop.answer()
+    send = loop.odom.publish
+    for number in range(3):
+
+        def publish(message: Odometry, late: int = number % 2) -> None:
+            send(message)
+            stamp = message.header.stamp
+            stranger.publish(joints(["wing"], (stamp.sec, stamp.nanosec + late)))
+
+        loop.odom.publish = publish
+        beside = loop.answer()
+        np.testing.assert_array_equal(beside[0], alone[0])
+        np.testing.assert_array_equal(beside[1], alone[1])
