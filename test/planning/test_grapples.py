@@ -117,7 +117,7 @@ def planner_hand(motion: ThrustMotion, time: float) -> Array:
 def servicer() -> ThrustPlanner:
     robot = SpaceRobot.from_file(robot_file("servicer"))
     propulsion = Propulsion.of_table(thrusters_of_urdf(robot.description), 0.2)
-    return ThrustPlanner(robot, propulsion, ThrustOptions(), "end_effector")
+    return ThrustPlanner(robot, propulsion, ThrustOptions(intervals=15), "end_effector")
 
 
 FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])

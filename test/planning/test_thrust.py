@@ -220,7 +220,7 @@ def test_options_bound_the_motion_of_joints_and_the_levels() -> None:
     goal = ThrustGoal(beyond(START, np.array([0.4, 0.1, 0.0]), np.zeros(3)), shape=np.array([-1.2]))
 
     def planned(**options: Any) -> ThrustMotion:
-        given = ThrustOptions(time_factor=1.0, clearance=0.0, **options)
+        given = ThrustOptions(**{"time_factor": 1.0, "clearance": 0.0, "intervals": 16, **options})
         return ThrustPlanner(robot, Propulsion.within(3.0, 1.0), given).plan(start, goal)
 
     def fastest(motion: ThrustMotion) -> tuple[float, float, float]:
