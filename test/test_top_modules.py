@@ -9,7 +9,7 @@ import sys
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -176,7 +176,8 @@ def test_data_files_are_in_the_checkout_or_installed(
     )
     (share / "urdf").mkdir(parents=True)
     assert find() == share
-    index: Any = SimpleNamespace(get_package_share_directory=lambda name: str(tmp_path / name))
+    index: Any = ModuleType("ament_index_python.packages")
+    index.get_package_share_directory = lambda name: str(tmp_path / name)
     monkeypatch.setitem(sys.modules, "ament_index_python.packages", index)
     assert find() == share
     (tmp_path / "spacerobot_ros" / "urdf").mkdir(parents=True)
