@@ -303,7 +303,8 @@ def stamps(states: list[Odometry]) -> np.ndarray:
 
 
 def test_a_goal_in_flight_is_flown_from_where_the_robot_is_without_a_stop() -> None:
-    with Stack("free_flyer", nodes=("plant", "coordinated_control", mine)) as stack:
+    quick = {"coordinated_control": {"plan.intervals": 15}}
+    with Stack("free_flyer", ("plant", "coordinated_control", mine), quick) as stack:
         node = stack.nodes["mine"]
         states: list[Odometry] = []
         reached: list[str] = []
