@@ -192,6 +192,23 @@ def test_position_and_attitude_of_an_arm_that_can_reach_both() -> None:
 
 
 @pytest.mark.slow
+def test_a_rotation_by_many_loops_is_planned_in_halves() -> None:
+    """A loop of booms rotates their satellite by little: no single search finds so many."""
+    turn = Rotation.from_rotvec([1.2, -2.1, 1.3])
+    urdf = FOLDER / "solar_booms.urdf"
+    robot = SpaceRobot.from_file(urdf)
+    schedule = plan(urdf, rotvec=turn.as_rotvec(), control_period=PERIOD, cache=0)
+    oracle = PinocchioOracle(urdf.read_text(), robot.joint_names)
+    reached = momentum_attitude(oracle, schedule)
+    assert (reached.inv() * turn).magnitude() <= 1e-6
+    assert_within(schedule, robot.velocity_limit, robot.velocity_limit / 0.5)
+    assert np.abs(schedule.positions).max() <= robot.upper.max() + 1e-9
+    rests = ~schedule.velocities[1:-1].any(axis=1)
+    assert rests.any()
+    assert schedule.duration < 1000.0
+
+
+@pytest.mark.slow
 def test_least_effort_takes_the_time_it_is_given_and_less_acceleration() -> None:
     turn = [0.1, -0.1, 0.2]
     fast = plan("three_joint_arm", rotvec=turn, start=ARM_START, **QUICK)

@@ -451,7 +451,7 @@ class OptimalGait(GaitMethod):
         first, last = plans
         notes: Notes = {**first.notes, **last.notes}
         for name in ("starts", "solution_time"):
-            notes[name] = sum(float(each.notes.get(name, 0.0)) for each in plans)  # type: ignore[arg-type]
+            notes[name] = float(sum(np.atleast_1d(each.notes.get(name, 0.0))[0] for each in plans))
         return _Plan(shapes, notes, last.final_velocity)
 
     def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> Manoeuvre:
