@@ -31,7 +31,7 @@ from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal
-from spacerobot_ros.planning.methods.thrust.motion import FrameSample, ThrustMotion
+from spacerobot_ros.planning.methods.thrust.motion import Samples, ThrustMotion
 from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 
@@ -81,31 +81,26 @@ class PlannedReference(ReferenceProfile):
 
     def _leg_at(self, time: float) -> tuple[ThrustMotion, float]:
         """Return the leg at a time since the start, s, and its beginning."""
-        k = min(self.waypoints_passed(time), len(self._legs) - 1)
+        k = self.waypoints_passed(time)
         return self._legs[k], self._ends[k] - self._legs[k].duration
 
     def waypoints_passed(self, time: float) -> int:
         """Return the number of waypoints reached ``time`` s after the start."""
         return bisect_right(self._ends[:-1], time)
 
-    def configurations(self) -> tuple[Array, Array, BasePoses]:
-        """Return times (K,) since the start, joint positions (K, n) and base poses of the plan."""
-        found = [leg.path() for leg in self._legs]
-        times = [
-            np.linspace(end - leg.duration, end, len(shapes))
-            for end, leg, (shapes, _) in zip(self._ends, self._legs, found, strict=True)
-        ]
-        base = zip(*(poses for _, poses in found), strict=True)
-        return (
-            np.concatenate(times),
-            np.vstack([shapes for shapes, _ in found]),
-            BasePoses(*map(np.vstack, base)),
-        )
+    def configurations(self) -> Samples:
+        """Return the plan at many instants."""
+        paths = [leg.path() for leg in self._legs]
+        begins = np.subtract(self._ends, [leg.duration for leg in self._legs])
+        times = [begin + path.times for begin, path in zip(begins, paths, strict=True)]
+        base = zip(*(path.base for path in paths), strict=True)
+        shapes = np.vstack([path.shapes for path in paths])
+        return Samples(shapes, BasePoses(*map(np.vstack, base)), np.concatenate(times))
 
     @property
     def path(self) -> BasePath:
         """Planned base poses over the time since the start."""
-        times, _, base = self.configurations()
+        _, base, times = self.configurations()
         return BasePath(times, *base)
 
     @property
@@ -123,11 +118,11 @@ class PlannedReference(ReferenceProfile):
         if time >= self.duration:
             return self.goal
         leg, begins = self._leg_at(time)
-        sample, goal = leg.at(time - begins), self.goal
-        hand = sample.end_effector
+        sample = leg.at(time - begins)
+        hand = None if self.goal.end_effector is None else sample.end_effector
         return Reference(
-            None if goal.base is None else _pose(sample.base),
-            None if goal.end_effector is None or hand is None else _pose(hand),
+            PoseReference(*sample.base),
+            None if hand is None else PoseReference(*hand),
             JointReference(sample.q, sample.qdot, sample.qddot),
             of_one_motion=True,
         )
@@ -178,9 +173,8 @@ class GrappleReference(PlannedReference):
         end = motion.at(motion.duration)
         assert end.end_effector is not None
         joints = None if start.joints is None else JointReference.at_rest(end.q)
-        base = _pose(end.base)
-        goal = Reference(base, _pose(end.end_effector), joints)
-        super().__init__(start, goal, limits, motion)
+        base, hand = PoseReference(*end.base), PoseReference(*end.end_effector)
+        super().__init__(start, Reference(base, hand, joints), limits, motion)
         self.motion, self.grapple = motion, grapple
         frame = grapple.motion.grapple([motion.duration])
         beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 3))
@@ -188,10 +182,9 @@ class GrappleReference(PlannedReference):
 
     def relative(self, times: Array) -> RelativeMotionOverTime:
         """Return the motion of the end-effector relative to the grapple frame at one time, (1,)."""
-        time = min(float(times[0]), self.duration)
-        frame, hand = self.grapple.motion.grapple([time]), self.motion.at(time).end_effector
+        hand = self.at(float(times[0])).end_effector
         assert hand is not None
-        return RelativeMotionOverTime.between(frame, _pose(hand).motion)
+        return RelativeMotionOverTime.between(self.grapple.motion.grapple(times), hand.motion)
 
     def at(self, time: float) -> Reference:
         """Return the reference at ``time`` s after the start."""
@@ -200,10 +193,6 @@ class GrappleReference(PlannedReference):
         frame = self.grapple.motion.grapple([time])
         base = PoseReference.of_motion(frame.with_relative_motion(self._base))
         return Reference(base, PoseReference.of_motion(frame), self.goal.joints)
-
-
-def _pose(frame: FrameSample) -> PoseReference:
-    return PoseReference(*frame)
 
 
 class GoalMotion(NamedTuple):
@@ -270,7 +259,7 @@ class ReferencePlanner:
         clearance = self._planner.clearance
         if clearance is None or not clearance.has_obstacles or time >= profile.duration:
             return math.inf
-        times, shapes, base = profile.configurations()
+        shapes, base, times = profile.configurations()
         ahead = slice(max(bisect_right(times, time) - 1, 0), None)
         geometry = clearance.geometry
         required = np.where(geometry.with_obstacles, clearance.distance, -np.inf)
@@ -291,13 +280,13 @@ class ReferencePlanner:
         """
         start, goal, limits, carries, waypoints = motion
         assert goal.base is not None
-        begin, q = self._begin(start, state)
-        hand, shape = None, None
+        begin = self._begin(start, state)
+        q, hand, shape = begin.q, None, None
         if self._outputs.joints and goal.joints is not None:
             shape = goal.joints.q
         elif carries or not self._outputs.end_effector:
             shape = q
-        if shape is None and goal.end_effector is not None:
+        elif goal.end_effector is not None:
             hand = _numbers(goal.end_effector)
         ends = [ThrustGoal(pose, None, q, keeps_shape=carries) for pose in waypoints]
         ends.append(ThrustGoal(_numbers(goal.base), hand, shape, keeps_shape=carries))
@@ -330,27 +319,17 @@ class ReferencePlanner:
         PlanningError
             No motion is found.
         """
-        begin, _ = self._begin(start, state)
-        motion = self._planner.plan(begin, grapple, cancellation)
+        motion = self._planner.plan(self._begin(start, state), grapple, cancellation)
         return GrappleReference(start, limits, motion, grapple)
 
-    def _begin(self, start: Reference, state: ControlState) -> tuple[RobotMotion, Array]:
-        """Return where a plan from a reference begins, and the shape (n,) there."""
+    def _begin(self, start: Reference, state: ControlState) -> RobotMotion:
+        """Return where a plan from a reference begins."""
         base, joints = start.base, start.joints if self._outputs.joints else None
         assert base is not None
         R_BW = matrix_from_quaternion(base.quaternion).T
+        twist = np.concatenate([R_BW @ base.velocity, R_BW @ base.angular_velocity])
         q, qdot = (state.q, state.qdot) if joints is None else (joints.q, joints.qdot)
-        begin = RobotMotion(
-            _numbers(base),
-            np.concatenate([R_BW @ base.velocity, R_BW @ base.angular_velocity]),
-            q.copy(),
-            qdot.copy() if _moves(base) else np.zeros(len(q)),
-        )
-        return begin, q
-
-
-def _moves(pose: PoseReference) -> bool:
-    return bool(np.any(pose.velocity) or np.any(pose.angular_velocity))
+        return RobotMotion(_numbers(base), twist, q.copy(), qdot * bool(twist.any()))
 
 
 def _numbers(pose: PoseReference) -> Array:

@@ -8,10 +8,9 @@ end-effector and a cone that moves with the target.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -33,9 +32,15 @@ from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import end_effector_pose
+from spacerobot_ros.planning.methods.optimal.problem import Trajectory
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
 from spacerobot_ros.planning.methods.thrust.goals import Grapple, base_for_hand
-from spacerobot_ros.planning.methods.thrust.motion import EXACT_STEPS, ThrustMotion, base_poses
+from spacerobot_ros.planning.methods.thrust.motion import (
+    EXACT_STEPS,
+    Samples,
+    ThrustMotion,
+    base_poses,
+)
 from spacerobot_ros.planning.methods.thrust.transcription import (
     INSTANTS,
     KeptPlaces,
@@ -51,17 +56,12 @@ instants."""
 _NO_DISTANCE = 1e3
 """m; rows for a plane this far away are always satisfied."""
 
-_CORRIDOR_RADIUS, _CORRIDOR_ROOM, _CORRIDOR_ROUNDING = 0.02, 0.01, 1e-3
-"""Radius of a corridor at its fixture, distance from its surface at these instants, and length over
-which its axis is smoothed, m."""
+_CORRIDOR_RADIUS, _CORRIDOR_ROOM, _CORRIDOR_ROUNDING, _CORRIDOR_RESOLUTION = 0.02, 0.01, 1e-3, 5e-4
+"""Radius of a corridor at its fixture, distance from its surface at these instants, length over
+which its axis is smoothed, and largest motion between two checks, m."""
 
-
-class _Samples(NamedTuple):
-    """A path at instants: shapes (K, n), poses of the base, and times (K,) since its start, s."""
-
-    shapes: Array
-    base: BasePoses
-    times: Array
+_LEAST_SLOPE = 1e-3
+"""Least sine of the half-angle of a corridor, because its direction is scaled by it."""
 
 
 class _Surroundings:
@@ -78,7 +78,7 @@ class _Surroundings:
         self.required = np.zeros(0)
         """Distances (P,), m."""
 
-    def base(self, path: _Samples) -> BasePoses:
+    def base(self, path: Samples) -> BasePoses:
         """Return the base poses in the frame in which the obstacles are at rest."""
         if self.target is None:
             return path.base
@@ -87,34 +87,30 @@ class _Surroundings:
         r_TB = np.einsum("kji,kj->ki", R_WT, path.base.position - r_WT)
         return BasePoses(r_TB, quaternion_multiply(quaternion_inverse(X_WT), path.base.quaternion))
 
-    def poses(self, path: _Samples) -> Poses:
+    def poses(self, path: Samples) -> Poses:
         return self.geometry.poses(path.shapes, self.base(path))
 
     def distance_function(self, pair: int, center_of_mass: ca.Function) -> ca.Function:
         """Return the distance of a pair as a function of a plane."""
         return support_distance(self.geometry, pair, center_of_mass)
 
-    def distances(self, pair: int, path: _Samples) -> Array:
+    def distances(self, pair: int, path: Samples) -> Array:
         """Return the distances (K,) of a pair along a path, m."""
         return self.geometry.distances(pair, self.poses(path))
 
-    def is_near(self, pair: int, path: _Samples) -> npt.NDArray[np.bool_]:
+    def is_near(self, pair: int, path: Samples) -> npt.NDArray[np.bool_]:
         """Return where a pair on a path (K,) is closer than the size of its first solid."""
         first = self.geometry.solids[self.geometry.pairs[pair][0]]
         reach = self.required[pair] + first.enclosure.bounding_radius
         return np.asarray(self.distances(pair, path) < reach)
 
-    def room(self, path: _Samples, pairs: Collection[int] | None) -> float:
+    def room(self, path: Samples) -> float:
         """Return the least room along a path, m; see :meth:`Bodies.room`."""
-        required = self.required.copy()
-        if pairs is not None:
-            numbers = self.first + np.arange(len(required))
-            counted = self.geometry.with_obstacles | np.isin(numbers, list(pairs))
-            required[~counted] = -np.inf
+        required = np.where(self.geometry.with_obstacles, self.required, -np.inf)
         found, _ = self.geometry.nearest_along(path.shapes, self.base(path), required)
         return float(found.min())
 
-    def approaches(self, path: _Samples) -> list[Approach]:
+    def approaches(self, path: Samples) -> list[Approach]:
         """Return the pairs that come too close on a path."""
         found = self.clearance.approaches(path.shapes, self.required, self.base(path))
         return found if self.target is None else [replace(e, place_on_obstacle=None) for e in found]
@@ -122,7 +118,7 @@ class _Surroundings:
     def clause(self, approach: Approach) -> str:
         return self.clearance.clause(approach, None)
 
-    def planes(self, pair: int, path: _Samples, at: npt.NDArray[np.int64]) -> Array:
+    def planes(self, pair: int, path: Samples, at: npt.NDArray[np.int64]) -> Array:
         """Return planes (K, 7) of a pair at instants (K,) of a path; obstacle planes are in W."""
         R, r = self.poses(path)
         _, planes = self.geometry.planes(pair, (R[at], r[at]))
@@ -145,12 +141,13 @@ class _Corridor:
 
     def __init__(self, robot: SpaceRobot, link: str, grapple: Grapple, first: int) -> None:
         self._robot, self._link, self._grapple, self.first = robot, link, grapple, first
-        self._slope, self._length = float(np.sin(grapple.corridor_angle)), grapple.corridor_length
+        self._slope = max(float(np.sin(grapple.corridor_angle)), _LEAST_SLOPE)
+        self._length = grapple.corridor_length
         self.required, self.of_hand = np.zeros(1), np.zeros(1, dtype=bool)
 
     def require_start(self, start: RobotMotion) -> None:
         """Refuse a start far beside the corridor; one a little beside it need not come nearer."""
-        path = _Samples(start.q[np.newaxis], _poses(start.pose), np.zeros(1))
+        path = Samples(start.q[np.newaxis], _poses(start.pose), np.zeros(1))
         self.required[:] = min(float(self.distances(0, path)[0]), 0.0)
         if self.required[0] < -_CORRIDOR_RADIUS:
             raise PlanningError(
@@ -175,7 +172,7 @@ class _Corridor:
         d = ca.dot(axis, from_apex) + ca.sqrt(ca.fmax(1 - square, 0)) * room - cone[3]
         return ca.Function("corridor", [y, cone], [d])
 
-    def _places(self, path: _Samples) -> tuple[Array, Array, Array, Array, Array]:
+    def _places(self, path: Samples) -> tuple[Array, Array, Array, Array, Array]:
         """Return positions of the end-effector from the fixture, the fixture, and axes of the cone
         (K, 3); distances (K,) from the surface of the cone and from the sphere.
         """
@@ -190,7 +187,7 @@ class _Corridor:
         inside += np.sqrt(1 - self._slope**2) * (_CORRIDOR_RADIUS - beside)
         return p, frame.r, axis, inside, np.linalg.norm(p, axis=1) - self._length
 
-    def planes(self, _pair: int, path: _Samples, at: npt.NDArray[np.int64]) -> Array:
+    def planes(self, _pair: int, path: Samples, at: npt.NDArray[np.int64]) -> Array:
         """Return cones (K, 7) at instants (K,) of a path or, where it is nearer to the outside of
         the sphere, planes that touch the sphere."""
         p, apex, axis, inside, outside = self._places(path)
@@ -202,24 +199,35 @@ class _Corridor:
         offset = np.where(chosen, 0.0, self._length + _CORRIDOR_ROOM)
         return np.hstack([np.where(chosen, self._slope * axis, normal), offset, apex])[at]
 
-    def distances(self, _pair: int, path: _Samples) -> Array:
+    def distances(self, _pair: int, path: Samples) -> Array:
         """Return the distances (K,) along a path, m."""
         *_, inside, outside = self._places(path)
         return np.maximum(inside, outside)
 
-    def is_near(self, _pair: int, path: _Samples) -> npt.NDArray[np.bool_]:
+    def is_near(self, _pair: int, path: Samples) -> npt.NDArray[np.bool_]:
         """Return where an end-effector on a path (K,) is near the sphere or in it."""
         *_, outside = self._places(path)
         return np.asarray(outside < 0.1 * self._length)
 
-    def approaches(self, path: _Samples) -> list[Approach]:
-        """Return where the end-effector is farthest outside, if it is."""
-        distances = self.distances(0, path)
-        k = int(np.argmin(distances))
+    def approaches(self, path: Samples) -> list[Approach]:
+        """Return where the end-effector is farthest outside, if it is: also between the instants of
+        a path, as far as it moves there.
+        """
+        ticks = np.arange(len(path.times), dtype=float)
+        while True:
+            here = path.at(ticks)
+            distances, hand = self.distances(0, here), self._places(here)[0]
+            k = int(np.argmin(distances))
+            moved = np.linalg.norm(np.diff(hand, axis=0), axis=1)
+            least = (distances[:-1] + distances[1:] - moved) / 2
+            open_ = (least < self.required[0]) & (moved > _CORRIDOR_RESOLUTION)
+            if distances[k] < self.required[0] or not open_.any():
+                break
+            ticks = np.sort(np.append(ticks, (ticks[:-1] + ticks[1:])[open_] / 2))
         if distances[k] >= self.required[0]:
             return []
         links = LinkPair(self._link, self._link)
-        return [Approach(links, 0, float(distances[k]), float(k), path.shapes[k])]
+        return [Approach(links, 0, float(distances[k]), float(ticks[k]), here.shapes[k])]
 
     def clause(self, approach: Approach) -> str:
         return self._beside(approach.distance)
@@ -281,7 +289,7 @@ class Bodies:
         """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
         (N K,)."""
         shape = start.q[np.newaxis]
-        begin = _Samples(shape, _poses(start.pose), np.zeros(1))
+        begin = Samples(shape, _poses(start.pose), np.zeros(1))
         for each in solid:
             each.required = each.clearance.required(start.q, each.base(begin))
             if each.target is not None:
@@ -312,31 +320,30 @@ class Bodies:
         center_of_mass = self._robot.function("center_of_mass", compile=False)
         return pair_block(self._robot.n, around.distance_function(pair, center_of_mass))
 
-    def _along(self, knots: ThrustKnots) -> _Samples:
+    def _along(self, knots: ThrustKnots) -> Samples:
         """Return a path at the instants (N K,) at which pairs are kept apart."""
-        N, h = len(knots.levels), knots.step
-        tau = np.tile(np.arange(1, INSTANTS + 1) / INSTANTS, N)[:, np.newaxis]
-        k = np.repeat(np.arange(N), INSTANTS)
-        # A copy, whose parts are views.
-        states = (1 - tau) * knots.states[k] + tau * knots.states[k + 1]
-        X, _, r, _, q, _ = state_parts(states)
-        X /= np.linalg.norm(X, axis=1, keepdims=True)
-        _, _, r_0, V, q_0, v = state_parts(knots.states)
-        q[:] = q_0[k] + h * (tau * v[k] + tau**2 / 2 * (v[k + 1] - v[k]))
-        r[:] = r_0[k] + h * (tau * V[k] + tau**2 / 2 * (V[k + 1] - V[k]))
-        return _Samples(q, base_poses(self._robot, states), (k + tau[:, 0]) * h)
+        X, _, r, V, q, v = state_parts(knots.states)
+        count = INSTANTS * len(knots.levels)
+        path = Trajectory(knots.step, np.hstack([q, r]), np.hstack([v, V]), X)
+        q, r = np.split(path.at_ticks(count)[1:], [self._robot.n], axis=1)
+        place = np.arange(1, count + 1)
+        k = (place - 1) // INSTANTS
+        share = (place / INSTANTS - k)[:, np.newaxis]
+        X = BasePoses(path.shapes, X).between(k, share).quaternion
+        times = np.linspace(0.0, knots.duration, count + 1)[1:]
+        return Samples(q, base_poses(self._robot, X, r, q), times)
 
     def distances(self, number: int, knots: ThrustKnots) -> Array:
         """Return the distances (N K,) of a pair at these instants, m."""
         around, pair = self._pair(number)
         return around.distances(pair, self._along(knots))
 
-    def room(self, knots: ThrustKnots, pairs: Collection[int] | None = None) -> float:
-        """Return the smallest difference between actual and required distance along a path, m, for
-        obstacles, the target and some other pairs (None: all).
+    def room(self, knots: ThrustKnots) -> float:
+        """Return the smallest difference between the actual and the required distance of obstacles
+        and the target along a path, m.
         """
         path = self._along(knots)
-        return min((each.room(path, pairs) for each in self._solid), default=np.inf)
+        return min((each.room(path) for each in self._solid), default=np.inf)
 
     def keep(self, near: Sequence[Approach], knots: ThrustKnots) -> None:
         """Keep more pairs apart: at the instants of a path at which they are closer than the size
@@ -388,26 +395,12 @@ class Bodies:
 
     def approaches(self, motion: ThrustMotion) -> list[Approach]:
         """Return the pairs that come too close in a motion, nearest first."""
-        shapes, base = motion.path()
-        path = _Samples(shapes, base, np.linspace(0.0, motion.duration, len(shapes)))
+        path = motion.path()
         found: list[Approach] = []
         for around in self._around:
             for each in around.approaches(path):
                 found.append(replace(each, pair=each.pair + around.first))
         return sorted(found, key=lambda each: each.distance)
-
-    def is_in_the_way(self, near: Sequence[Approach]) -> bool:
-        """Whether an obstacle or the target is among the pairs."""
-        pairs = [self._pair(each.pair) for each in near]
-        return any(
-            isinstance(around, _Surroundings) and around.geometry.with_obstacles[pair]
-            for around, pair in pairs
-        )
-
-    def depth(self, near: Sequence[Approach]) -> float:
-        """Return how deep solids are in each other, m."""
-        pairs = ((self._pair(each.pair)[0], each.distance) for each in near)
-        return max((-d for around, d in pairs if isinstance(around, _Surroundings)), default=0.0)
 
     def reason(self, approach: Approach) -> str:
         """Return a clause that describes a motion that is not clear."""

@@ -65,8 +65,11 @@ class MotionSample(NamedTuple):
 
 
 class MotionFunctions(NamedTuple):
-    """The functions of one robot's motions, with an end-effector if ``link`` names one: one step of
-    the integration, the steps of an interval, and a sample of the motion.
+    """Functions of one robot's motions, of states (:class:`.ThrustKnots`) and controls ``[qddot;
+    wrench]``: a Runge-Kutta step, the steps of an interval, and a sample.
+
+    The sample contains the base frame and, if ``link`` names one, the end-effector frame as numbers
+    (19,), and the joint efforts.
     """
 
     robot: SpaceRobot
@@ -78,15 +81,57 @@ class MotionFunctions(NamedTuple):
     @classmethod
     def of(cls, robot: SpaceRobot, link: str = "") -> MotionFunctions:
         """Derive the functions."""
-        step = runge_kutta_step(_flight_rate(robot), attitude=slice(4))
-        return cls(robot, link, step, step.mapaccum(EXACT_STEPS), _sample(robot, link))
+        names = ("inertia_matrix", "center_of_mass", "link_poses")
+        x, (X, L, r, V, q, qdot) = state_symbols(robot.n)
+        H, c, (R_all, r_all) = (robot.function(name, compile=False)(q) for name in names)
+        qddot, force, torque = (ca.SX.sym(*each) for each in (("a", robot.n), ("f", 3), ("n", 3)))
+        R, controls = matrix_from_quaternion(X), ca.vertcat(qddot, force, torque)
+        v, omega = R.T @ V, solve_positive_definite(H[3:6, 3:6], R.T @ L - H[3:6, 6:] @ qdot)
+        of_base = quaternion_rate(X, omega), R @ (torque - ca.cross(c, force)), V
+        x_dot = ca.vertcat(*of_base, R @ force / robot.total_mass, qdot, qddot)
+
+        def jacobian(name: str) -> ca.SX:
+            return robot.function(f"jacobian:{name}", compile=False)(q)
+
+        def frame(name: str) -> ca.SX:
+            i = robot.link_names.index(name)
+            quaternion = quaternion_from_matrix(R @ R_all[:, 3 * i : 3 * i + 3])
+            twist = ca.vec(R @ ca.reshape(jacobian(name) @ ca.vertcat(v, omega, qdot), 3, 2))
+            place = r + R @ (r_all[:, i] - c)
+            return ca.vertcat(place, quaternion, twist, ca.jtimes(twist, x, x_dot))
+
+        base = frame(robot.base_link)
+        base[3:7] = X
+        C = robot.function("bias", compile=False)(q, v, omega, qdot)
+        tau = H[6:, 3:6] @ ca.jtimes(omega, x, x_dot) + H[6:, 6:] @ qddot + C[6:]
+        tau -= jacobian(robot.base_link)[:3, 6:].T @ force
+        sample = ca.cse([base, frame(link) if link else ca.SX(19, 1), tau])
+        rate = ca.Function("flight_rate", [x, controls], [ca.densify(ca.cse(x_dot))])
+        step = runge_kutta_step(rate, attitude=slice(4))
+        sampled = ca.Function("sample", [x, controls], [ca.densify(each) for each in sample])
+        return cls(robot, link, step, step.mapaccum(EXACT_STEPS), sampled)
 
 
-def base_poses(robot: SpaceRobot, states: Array) -> BasePoses:
-    """Return the poses of the base in states (K, 13 + 2 n)."""
-    X, _, r, _, q, _ = state_parts(states)
+def base_poses(robot: SpaceRobot, X: Array, r: Array, q: Array) -> BasePoses:
+    """Return the poses of the base at attitudes (K, 4), centres of mass (K, 3) and shapes (K, n)."""
     c = robot.function("center_of_mass")(q.T).full().T
     return BasePoses(r - np.einsum("kij,kj->ki", matrices_from_quaternions(X), c), X)
+
+
+class Samples(NamedTuple):
+    """A path at instants: shapes (K, n), poses of the base, and times (K,) since its start, s."""
+
+    shapes: Array
+    base: BasePoses
+    times: Array
+
+    def at(self, ticks: Array) -> Samples:
+        """Return the path, linear between its instants, at places (M,) among them."""
+        k = np.minimum(ticks.astype(int), max(len(self.times) - 2, 0))
+        after, share = np.minimum(k + 1, len(self.times) - 1), (ticks - k)[:, np.newaxis]
+        shapes = (1 - share) * self.shapes[k] + share * self.shapes[after]
+        times = np.interp(ticks, np.arange(len(self.times)), self.times)
+        return Samples(shapes, self.base.between(k, share), times)
 
 
 class ThrustMotion:
@@ -106,10 +151,11 @@ class ThrustMotion:
         self, functions: MotionFunctions, propulsion: Propulsion, knots: ThrustKnots
     ) -> None:
         self.propulsion = propulsion
-        self._functions, self._knots = functions, knots
-        self.levels = knots.levels
-        """Propulsion levels (N, m), each held for :attr:`step` seconds."""
-        self.step = knots.step
+        self._functions, self._knots, self.joints = functions, knots, functions.robot.n
+        self.levels, self.step, self.duration = knots.levels, knots.step, knots.duration
+        """Propulsion levels (N, m), each held for :attr:`step` seconds, and the duration, s."""
+        self.spent = self.step * float(propulsion.cost_of(ca.DM(self.levels.T)))
+        """Cost of the levels: kg of propellant with a thruster table, else N s."""
         qddot = np.diff(state_parts(knots.states)[5], axis=0) / knots.step
         self._controls = np.hstack([qddot, knots.levels @ propulsion.wrenches.T])
         states = [knots.states[:1]]
@@ -117,21 +163,8 @@ class ThrustMotion:
             states.append(self._through(k, states[-1][-1]))
         self._grid = np.vstack(states)
         """States (N EXACT_STEPS + 1, 13 + 2 n) at equal time intervals."""
-
-    @property
-    def joints(self) -> int:
-        """n."""
-        return self._functions.robot.n
-
-    @property
-    def duration(self) -> float:
-        """s."""
-        return self._knots.duration
-
-    @property
-    def spent(self) -> float:
-        """Cost of the levels: kg of propellant with a thruster table, else N s."""
-        return self.step * float(self.propulsion.cost_of(ca.DM(self.levels.T)))
+        self.final_state: Array = self._grid[-1]
+        """State (13 + 2 n,) at the end."""
 
     def _through(self, k: int, state: Array) -> Array:
         """Return the states (EXACT_STEPS, 13 + 2 n) on an interval that begins in one."""
@@ -160,7 +193,7 @@ class ThrustMotion:
         base, hand, tau = (each.full().ravel() for each in numbers)
         frames = [FrameSample(*np.split(each, [3, 7, 10, 13, 16])) for each in (base, hand)]
         *_, q, qdot = state_parts(state)
-        qddot, wrench = np.split(controls, [self.joints])
+        qddot, wrench = np.split(controls, [len(q)])
         return MotionSample(
             frames[0], frames[1] if self._functions.link else None, q, qdot, qddot, wrench, tau
         )
@@ -174,9 +207,11 @@ class ThrustMotion:
         tau = np.abs(np.hstack(list(ends))[limited])
         return float(np.max(tau / limit[limited, np.newaxis], initial=0.0))
 
-    def path(self) -> tuple[Array, BasePoses]:
-        """Return shapes (K, n) and base poses at all instants of the exact integration."""
-        return state_parts(self._grid)[4], base_poses(self._functions.robot, self._grid)
+    def path(self) -> Samples:
+        """Return the motion at all instants of the exact integration."""
+        X, _, r, _, q, _ = state_parts(self._grid)
+        times = np.linspace(0.0, self.duration, len(q))
+        return Samples(q, base_poses(self._functions.robot, X, r, q), times)
 
     def joined_momentum(self, target: TorqueFreeMotion) -> Array:
         """Return the final angular momentum (3,) of the robot and a target about their common
@@ -187,63 +222,3 @@ class ThrustMotion:
         L_T, r_T, V_T, of_target = at[5:8], at[8:11], at[11:14], float(at[14])
         momenta = np.concatenate([mass * V, L]), np.concatenate([of_target * V_T, L_T])
         return combined_momenta((mass, of_target), (r, r_T), momenta)[3:]
-
-    @property
-    def final_state(self) -> Array:
-        """State (13 + 2 n,) at the end."""
-        return np.asarray(self._grid[-1])
-
-
-def _sample(robot: SpaceRobot, link: str) -> ca.Function:
-    """Return ``(x, [qddot; wrench]) -> (base, end_effector, tau)``: numbers of frames (19,), zeros
-    without an end-effector, and efforts.
-    """
-    n = robot.n
-    qddot, wrench = ca.SX.sym("qddot", n), ca.SX.sym("wrench", 6)
-    x, (X, L, r, V, q, qdot) = state_symbols(n)
-    R, force, torque = matrix_from_quaternion(X), wrench[:3], wrench[3:]
-    H = robot.function("inertia_matrix", compile=False)(q)
-    c = robot.function("center_of_mass", compile=False)(q)
-    D, D_q, v = H[3:6, 3:6], H[3:6, 6:], R.T @ V
-    omega = solve_positive_definite(D, R.T @ L - D_q @ qdot)
-    C = robot.function("bias", compile=False)(q, v, omega, qdot)
-    alpha = solve_positive_definite(D, torque - ca.cross(c, force) - D_q @ qddot - C[3:6])
-    velocities = ca.vertcat(v, omega, qdot)
-    rates = ca.vertcat(force / robot.total_mass - ca.cross(omega, v), alpha, qddot)
-    R_all, r_all = robot.function("link_poses", compile=False)(q)
-
-    def jacobian(name: str) -> ca.SX:
-        return robot.function(f"jacobian:{name}", compile=False)(q)
-
-    def frame(name: str) -> ca.SX:
-        """Return a link frame as numbers."""
-        i, z = robot.link_names.index(name), ca.SX.sym("z", 6 + n)
-        moving = ca.substitute(ca.jtimes(jacobian(name) @ z, q, qdot), z, velocities)
-        twist, rate = jacobian(name) @ velocities, jacobian(name) @ rates + moving
-        # The base, in whose components they are, rotates.
-        rate += ca.vertcat(*(ca.cross(omega, each) for each in ca.vertsplit(twist, 3)))
-        return ca.vertcat(
-            r + R @ (r_all[:, i] - c),
-            quaternion_from_matrix(R @ R_all[:, 3 * i : 3 * i + 3]),
-            *(R @ each for each in ca.vertsplit(ca.vertcat(twist, rate), 3)),
-        )
-
-    base = frame(robot.base_link)
-    base[3:7] = X
-    to_joints = jacobian(robot.base_link)[:3, 6:]
-    tau = H[6:, 3:6] @ alpha + H[6:, 6:] @ qddot + C[6:] - to_joints.T @ force
-    outputs = [ca.densify(each) for each in (base, frame(link) if link else ca.SX(19, 1), tau)]
-    return ca.Function("thrust_sample", [x, ca.vertcat(qddot, wrench)], ca.cse(outputs))
-
-
-def _flight_rate(robot: SpaceRobot) -> ca.Function:
-    """Return ``(x, [qddot; wrench]) -> x_dot``, with the wrench in the base."""
-    x, (X, L, _, V, q, qdot) = state_symbols(robot.n)
-    qddot, force, torque = (ca.SX.sym(*each) for each in (("qddot", robot.n), ("f", 3), ("n", 3)))
-    D, D_q = robot.function("locked_inertia", compile=False)(q)
-    R, c = matrix_from_quaternion(X), robot.function("center_of_mass", compile=False)(q)
-    omega = solve_positive_definite(D, R.T @ L - D_q @ qdot)
-    turning, twisted = quaternion_rate(X, omega), R @ (torque - ca.cross(c, force))
-    x_dot = ca.vertcat(turning, twisted, V, R @ force / robot.total_mass, qdot, qddot)
-    controls = ca.vertcat(qddot, force, torque)
-    return ca.Function("flight_rate", [x, controls], [ca.densify(ca.cse(x_dot))])

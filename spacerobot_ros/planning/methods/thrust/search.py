@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 
@@ -68,63 +68,54 @@ from spacerobot_ros.planning.methods.thrust.transcription import (
 
 _LOG = logging.getLogger(__name__)
 
-_REGULARISATION = 1e-3
-"""Weight of the squared levels, which makes solutions unique. 1e-2 costs 1 % of propellant, 1e-4
-saves 0.1 % and takes twice the steps."""
-
-_SMOOTHNESS = 1.0
-"""Weight of the squares of joint accelerations: arms swinging as counterweights save 5 % of
-propellant, but swing into their own robot."""
-
-_TIME_REGULARISATION = 1e-5
+_REGULARISATION, _SMOOTHNESS, _TIME_REGULARISATION = 1e-3, 1.0, 1e-5
+"""Weights of the squared levels, which make solutions unique (1e-2 costs 1 % of propellant, 1e-4
+saves 0.1 % and takes twice the steps); of the squares of joint accelerations, since arms swinging
+as counterweights save 5 % of propellant, but swing into their own robot; and of both in the
+shortest time."""
 
 _ROUNDINGS = (0.1, 0.01, 0.003)
 """Levels at which norm costs are smoothed, in turn: the last one alone takes three times the
 steps."""
 
-_EXACT_END, _MAX_CORRECTIONS = 1e-5, 10
-"""Largest error at the end, m and rad, and largest number of corrections to achieve it."""
+_NEAREST = Weights(0.0, 0.0, 1e4, 1e4)
+"""Weights of the nearest motion: large, so that the barrier does not push levels off their bounds.
+"""
 
-_NEAR_END = 1e-2
-"""Final error below which the nearest exact motion is searched for, m and rad."""
+_EXACT_END, _NEAR_END, _LARGEST_END_ERROR, _MAX_CORRECTIONS = 1e-5, 1e-2, 1e-3, 10
+"""Errors at the end, m and rad: to be achieved, below which the nearest exact motion is searched
+for, and above which a motion is not a solution; and the largest number of corrections."""
 
-_LARGEST_END_ERROR = 1e-3
-"""Final error above which a motion is not a solution, m and rad."""
-
-_END_REACH = 0.3
-"""Largest distance of the final joint positions from the shape found by inverse kinematics, m or
-rad."""
-
-_COST_OF_LACK = 1e3
-"""Weight of missing distance between pairs, per metre."""
+_END_REACH, _GRASP_REACH = 0.3, 0.6
+"""Largest distance of the final joint positions from the shape found by inverse kinematics, and of
+the joints from their initial shape on the way to a grasp, m or rad: the base moves, and the arm
+stays clear of it."""
 
 _LARGEST_LACK = 1e-4
 """Missing distance between pairs up to which a solution counts as clear before the exact check,
 m."""
 
+_SHALLOW = 0.1
+"""Contact depth on a path to a target up to which planes along this path are tried first, m."""
+
 _MAX_ROUNDS = 6
 """Number of times that new planes are computed to clear a path."""
-
-_GRASP_REACH = 0.6
-"""Distance of the joints from their initial shape on the way to a grasp, m or rad: the base moves,
-and the arm stays clear of it."""
-
-_SHALLOW = 0.1
-"""Contact depth on a path above which the path is not tried with planes, m."""
 
 _SHARES_LEFT = (0.0, 0.25, 0.5)
 """Fractions of the angular momentum that may be left after a grasp."""
 
-_MEETING_PERIOD = 1.0
-"""Interval between the times at which guesses meet a target, s."""
+_MEETING_PERIOD, _LATER = 1.0, 0.3
+"""Interval between the times at which guesses meet a target, s, and relative to the time of a guess
+that led nowhere."""
 
 _LARGEST_STRETCH = 4.0
 """Largest factor applied to the duration of a motion with excessive efforts."""
 
-_BOW_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0)
-_BOW_DIRECTIONS = 12
+_BOW_SHARES, _BOW_DIRECTIONS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0), 12
 """Heights of bends away from a straight line, relative to the smallest height worth trying, and
 number of directions."""
+
+_FREE_TIME = DurationBounds(1e-3, 1e5)
 
 
 @dataclass(frozen=True)
@@ -403,11 +394,6 @@ class ThrustPlanner:
         return replace(knots, levels=np.clip(knots.levels, self.propulsion.lowest, 1.0))
 
 
-_NEAREST = Weights(0.0, 0.0, 1.0, 1.0, _COST_OF_LACK)
-
-_FREE_TIME = DurationBounds(1e-3, 1e5)
-
-
 class _Search:
     """One search of a planner."""
 
@@ -432,67 +418,65 @@ class _Search:
         self.earliest = self.latest = 0.0
         """Time at which a target is met, s."""
 
-    def _bowed(self, base: Array, shape: Array, side: Array, height: float) -> ThrustKnots:
-        """Return a guess to a pose (7,) and a shape (n,) on a way that bows out to a side (3,), by
-        a multiple of the least height that is worth a try.
+    def _ways(self, base: Array, shape: Array, sides: Array, time: float) -> Iterator[ThrustKnots]:
+        """Yield guesses to a base pose (7,) and a shape (n,) that are clear of obstacles, in a time
+        if it suffices, the straightest first: each bows out to the side (3,) with the most room.
         """
-        way = base[:3] - self.boundary.start[7:10]
-        bow = height * max(float(np.linalg.norm(way)) / 2, 0.5) * side
-        return self.planner.guess(self.boundary, base, shape, bow)
+        bow = max(float(np.linalg.norm(base[:3] - self.boundary.start[7:10])) / 2, 0.5)
+        for height in _BOW_SHARES:
+            best, room = None, 0.0
+            for side in sides if height else sides[:1]:
+                guess = self.planner.guess(self.boundary, base, shape, height * bow * side)
+                guess = guess.stretched(max(time / guess.duration, 1.0))
+                if (found := self.bodies.room(guess)) > room:
+                    best, room = guess, found
+            if best is not None:
+                yield best
+            if room == math.inf:
+                return
 
-    def _bows(self, path: ThrustKnots, near: Sequence[Approach]) -> Iterator[ThrustKnots]:
-        """Yield straight guesses and clear guesses near them, with the duration of a path, the
-        straightest first.
-        """
-        position, X = base_poses(self.planner.robot, path.states[-1:])
-        end = np.concatenate([position[0], X[0]]), state_parts(path.states[-1])[4]
-        frame = np.linalg.svd((end[0][:3] - self.boundary.start[7:10])[np.newaxis])[2]
+    def _bows(self, path: ThrustKnots) -> Iterator[ThrustKnots]:
+        """Yield guesses to the end of a path, then the path."""
+        X, _, r, _, q, _ = state_parts(path.states[-1:])
+        base = np.hstack(base_poses(self.planner.robot, X, r, q))[0]
+        frame = np.linalg.svd((base[:3] - self.boundary.start[7:10])[np.newaxis])[2]
         angles = 2 * math.pi * np.arange(_BOW_DIRECTIONS) / _BOW_DIRECTIONS
         sides = np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
-        pairs = {each.pair for each in near}
-        for height in _BOW_SHARES if self.bodies.is_in_the_way(near) else _BOW_SHARES[:1]:
-            found = []
-            for side in sides if height else sides[:1]:
-                guess = self._bowed(*end, side, height)
-                guess = guess.stretched(max(path.duration / guess.duration, 1.0))
-                found.append((self.bodies.room(guess, pairs), guess))
-            best, guess = max(found, key=lambda each: each[0])
-            if best > 0:
-                yield guess
+        yield from self._ways(base, q[0], sides, path.duration)
+        yield path
 
-    def _meeting(self, time: float, height: float = 0.0) -> ThrustKnots | None:
-        """Return a guess to where a target is at a time, in the shape of the start, on a way that
-        bows out to the side of the fixture; None: the robot is not there by then.
+    def _meeting(self, time: float) -> tuple[Array, Array, Array]:
+        """Return the base pose (7,) to meet a target at a time in the shape (n,) of the start, this
+        shape, and the side (1, 3) of the fixture.
         """
         planner, grapple, shape = self.planner, self.grapple, state_parts(self.boundary.start)[4]
         assert grapple is not None
         frame = grapple.motion.grapple([time])
         there = np.concatenate([frame.r[0], quaternion_from_matrix(frame.R[0])])
-        away = frame.R[0] @ grapple.standoff
-        away /= max(float(np.linalg.norm(away)), 1e-9)
-        base = base_for_hand(planner.robot, planner.link, shape, there)
-        guess = self._bowed(base, shape, away, height)
-        return guess.stretched(time / guess.duration) if guess.duration <= time else None
+        side = frame.R @ grapple.standoff / max(float(np.linalg.norm(grapple.standoff)), 1e-9)
+        return base_for_hand(planner.robot, planner.link, shape, there), shape, side
 
     def first_meeting(self) -> ThrustKnots:
         """Return the guess that meets a target at the earliest time possible for the robot."""
         # There is one: distances grow with time, and what full thrust covers with its square.
-        guesses = map(self._meeting, itertools.count(_MEETING_PERIOD, _MEETING_PERIOD))
-        return next(guess for guess in guesses if guess is not None)
+        for time in itertools.count(_MEETING_PERIOD, _MEETING_PERIOD):
+            base, shape, _ = self._meeting(time)
+            guess = self.planner.guess(self.boundary, base, shape, np.zeros(3))
+            if guess.duration <= time:
+                break
+        return guess.stretched(time / guess.duration)
 
-    def _meetings(self, begin: float) -> Iterator[ThrustKnots]:
-        """Yield guesses at a target that are clear, from a time on, of each time the straightest
-        one.
+    def _meetings(self, time: float) -> Iterator[ThrustKnots]:
+        """Yield clear guesses at a target from a time on, each one much later than the one before,
+        which was in vain.
         """
         assert self.grapple is not None
-        for time in np.arange(begin, self.grapple.horizon, _MEETING_PERIOD).tolist():
-            for height in _BOW_SHARES:
-                guess = self._meeting(time, height)
-                if guess is None:
-                    break
-                if self.bodies.room(guess) > 0:
-                    yield guess
-                    break
+        while time < self.grapple.horizon:
+            guess = next(self._ways(*self._meeting(time), time), None)
+            is_in_time = guess is not None and guess.duration < time + 1e-6
+            if guess is not None and is_in_time:
+                yield guess
+            time += max(_MEETING_PERIOD, _LATER * time * is_in_time)
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
         """Return the motion.
@@ -535,12 +519,10 @@ class _Search:
         self.is_timed, path = True, replace(other.path, multipliers=None)
         self.earliest = self.latest = path.duration
         path = self._solve(path, _NEAREST, center=path) or path
-        cleared = self._cleared(path)
-        if cleared is not None:
-            motion = self._settled(cleared)
-            if motion.effort_share(self.planner.effort_limit) <= 1.0:
-                return motion
-        raise self._failure("no motion near the other motion was found")
+        motion = self._settled(self._cleared(path))
+        if motion.effort_share(self.planner.effort_limit) > 1.0:
+            raise self._failure("its joints need more than the efforts that a plan may use")
+        return motion
 
     def _motion(self, fastest: ThrustKnots, time: float) -> ThrustMotion:
         """Return the exact and clear motion near the fastest one, in a time if that is given; to a
@@ -556,13 +538,20 @@ class _Search:
         if self.is_timed:
             # Roughly, for a look at what is in the way.
             path = self._solve(path, self._weights(path, _ROUNDINGS[0]), rough=True) or path
-        near = bodies.approaches(self.planner.motion(path))
-        if not near:
-            motion = self._exact(path)
-            near = bodies.approaches(motion)
-            if not near:
-                return motion
-        return self._settled(self._clear(path, near))
+        near, failure = bodies.approaches(self.planner.motion(path)), None
+        guesses = self._bows(path) if self.grapple is None else self._meetings(path.duration)
+        if not near or (self.grapple is not None and near[0].distance > -_SHALLOW):
+            guesses = itertools.chain([path], guesses)
+        for guess in guesses:
+            bodies.keep_none()
+            bodies.keep(near, guess)
+            try:
+                return self._settled(self._cleared(guess) if near else guess)
+            except PlanningCancelled:
+                raise
+            except PlanningError as error:
+                failure = error
+        raise failure or self._failure(bodies.reason(near[0]))
 
     def _settled(self, path: ThrustKnots) -> ThrustMotion:
         """Return the exact motion near a clear path, which is clear, too."""
@@ -608,10 +597,10 @@ class _Search:
         """Return the weights of least propellant, or of least time, in units of the guess."""
         if not self.is_timed:
             small = _TIME_REGULARISATION
-            return Weights(1 / guess.duration, 0.0, small, small, _COST_OF_LACK)
+            return Weights(1 / guess.duration, 0.0, small, small)
         spent = guess.step * float(self.planner.propulsion.cost_of(ca.DM(guess.levels.T)))
         small = _REGULARISATION
-        return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, small, _COST_OF_LACK, rounding)
+        return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, small, rounding)
 
     def _exact(self, guess: ThrustKnots) -> ThrustMotion:
         """Return the motion of least propellant, or of least time, near a path, as it flies.
@@ -666,29 +655,14 @@ class _Search:
         of_poses = 9 if self.kind.target else rows.numel()
         return float(np.abs(rows.full()[:of_poses]).max(initial=0.0))
 
-    def _clear(self, path: ThrustKnots, near: Sequence[Approach]) -> ThrustKnots:
-        """Return a path that is clear of the pairs that came near, and of all others."""
-        if self.grapple is None:
-            guesses = itertools.chain(self._bows(path, near), [path])
-        else:
-            shallow = [path] if self.bodies.depth(near) < _SHALLOW else []
-            guesses = itertools.chain(shallow, self._meetings(path.duration))
-        for guess in guesses:
-            self.bodies.keep_none()
-            self.bodies.keep(near, guess)
-            cleared = self._cleared(guess)
-            if cleared is not None:
-                return cleared
-        raise self._failure(self.bodies.reason(near[0]))
-
-    def _cleared(self, at: ThrustKnots) -> ThrustKnots | None:
+    def _cleared(self, at: ThrustKnots) -> ThrustKnots:
         """Return a path near one that keeps pairs apart, and all others that come too near."""
-        bodies = self.bodies
+        bodies, near = self.bodies, list[Approach]()
         self._begin(SearchPhase.CLEARING)
         for _ in range(_MAX_ROUNDS):
             solved = self._solve(at, self._weights(at, _ROUNDINGS[0]))
             if solved is None:
-                return None
+                break
             if self._solver.lack > _LARGEST_LACK:
                 at = solved
                 continue
@@ -702,7 +676,7 @@ class _Search:
             if not fell_in or min(bodies.distances(pair, at).min() for pair in fell_in) <= 0:
                 # Else planes of these pairs are made along the path before, which is clear of them.
                 at = solved
-        return None
+        raise self._failure(bodies.reason(near[0]) if near else "no clear motion was found")
 
     def _begin(self, phase: SearchPhase) -> None:
         progress = SearchProgress(0, 0, self.earliest or math.inf, phase)

@@ -76,6 +76,9 @@ K - 1.
 """
 
 
+_COST_OF_LACK = 1e3
+"""Weight of missing distance between pairs, per metre."""
+
 _CONTINUED = {
     "ipopt.mu_init": 1e-5,
     "ipopt.tol": 1e-5,
@@ -182,18 +185,15 @@ class ThrustBoundary:
 
 
 class Weights(NamedTuple):
-    """Weights of the terms in the objective.
-
-    The weights apply to the duration (1/s), the propulsion cost, the squares of joint accelerations
-    over their limits and of levels, and the missing distance of pairs (1/m); the last value is the
-    level at which the cost of a norm is smoothed.
+    """Weights of the terms in the objective: of the duration (1/s), of the propulsion cost, of the
+    squares of joint accelerations over their limits, and of those of levels; and the level at which
+    the cost of a norm is smoothed.
     """
 
     duration: float
     cost: float
     accelerations: float
     levels: float
-    lack: float = 0.0
     rounding: float = 1.0
 
 
@@ -359,74 +359,6 @@ def pair_block(joints: int, distance: ca.Function) -> ConstraintBlock:
     )
 
 
-def thrust_program(
-    stages: Stages,
-    propulsion: Propulsion,
-    intervals: int,
-    pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]] = (),
-) -> tuple[Layout, Program]:
-    """Assemble the program from the stages of a problem.
-
-    Its parameters are the initial shape (n,), the end parameters (:attr:`EndKind.size`), the
-    wrenches (6 m,); the defects (12 N,); typical accelerations (n,); weights of the duration, of
-    the propellant, of the squares of accelerations and levels, of the lack, and the level at which
-    the cost of a norm is smoothed (6,); centres of the squares (n + m, N); and the planes
-    (8,) of every pair at its places (:data:`KeptPlaces`).
-    """
-    n, N, m = stages[0].rows, intervals, propulsion.size
-    layout = Layout((13 + 2 * n,), (n, m), N, bool(pairs))
-    knot, a, u = layout.knots()
-    x = ca.MX.sym("x", layout.size)
-    goals = int(stages[2].values.size1_in(1))
-    p = {
-        name: ca.MX.sym(name, size)
-        for name, size in (
-            ("start", n),
-            ("goals", goals),
-            ("wrenches", 6 * m),
-            ("defects", DEFECT_SIZE * N),
-            ("typical", n),
-            ("weights", 6),
-            ("centers", (n + m) * N),
-            ("planes", 8 * sum(len(at) for _, at in pairs)),
-        )
-    }
-    zero = np.zeros((N, 1), dtype=np.int64)
-    defects = ca.reshape(p["defects"], DEFECT_SIZE, N)
-    placed, equalities = place_stages(
-        stages,
-        (
-            np.hstack([zero[:1], knot[:1, 13:]]),
-            np.hstack([zero, knot[:-1], a, u, knot[1:]]),
-            np.hstack([zero[:1], knot[-1:]]),
-        ),
-        (p["start"], ca.vertcat(defects, ca.repmat(p["wrenches"], 1, N)), p["goals"]),
-    )
-    if propulsion.norms:
-        group = ca.SX.sym("u", 3)
-        norm = ConstraintBlock.of("norm", group, ca.SX(0, 1), 1 - ca.sumsqr(group))
-        groups = np.vstack([u[:, list(each)] for each in propulsion.norms])
-        placed.append(PlacedBlock.after(placed, norm, groups, ca.MX(0, 1)))
-    lack = np.full((N, 1), layout.size - 1)
-    variables = np.hstack([zero, knot[:-1], knot[1:], lack])
-    ends = np.cumsum([0, *(8 * len(at) for _, at in pairs)]).tolist()
-    for (block, at), planes in zip(pairs, ca.vertsplit(p["planes"], ends), strict=False):
-        planes = ca.reshape(planes, 8, len(at))
-        placed.append(PlacedBlock.after(placed, block, variables[np.array(at) // INSTANTS], planes))
-    levels = ca.reshape(x[u.ravel().tolist()], m, N)
-    centers = ca.reshape(p["centers"], n + m, N)
-    change = (ca.reshape(x[a.ravel().tolist()], n, N) - centers[:n, :]) / ca.repmat(
-        p["typical"], 1, N
-    )
-    w = p["weights"]
-    spent = propulsion.cost_of(levels, w[5])
-    f = w[0] * N * x[0] + w[1] * x[0] * spent
-    f += (w[2] * ca.sumsqr(change) + w[3] * ca.sumsqr(levels - centers[n:, :])) / N
-    if pairs:
-        f += w[4] * x[-1]
-    return layout, assembled(x, ca.vertcat(*p.values()), f, placed, equalities)
-
-
 class ThrustSolver:
     """Solves the problem of one robot for many boundary conditions.
 
@@ -453,12 +385,62 @@ class ThrustSolver:
         self.lack = 0.0
         """Distance by which pairs are closer than required in the last solution, m."""
         self._propulsion, self._acceleration = propulsion, acceleration
-        self._layout, self._program = thrust_program(stages, propulsion, intervals, pairs)
-        program = self._program
+        n, m = len(acceleration), propulsion.size
+        self._layout = Layout((13 + 2 * n,), (n, m), intervals, bool(pairs))
+        self._program = program = self._assembled(stages, pairs)
         self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
         self._ipopt = cache(
             lambda begins: build_solver("thrust", program, self._monitor, _OPTIONS[begins])
         )
+
+    def _assembled(
+        self, stages: Stages, pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]]
+    ) -> Program:
+        """Assemble the program. Its parameters are the initial shape (n,), the end parameters
+        (:attr:`EndKind.size`), the defects (12, N), the :class:`Weights`, the centres of the
+        squares (n + m, N), and the planes (8,) of every pair at its places.
+        """
+        layout, propulsion, N = self._layout, self._propulsion, self._layout.intervals
+        (n, m), counts = layout.controls, [len(at) for _, at in pairs]
+        knot, a, u = layout.knots()
+        x = ca.MX.sym("x", layout.size)
+        start, goals, w = (
+            ca.MX.sym("start", n),
+            ca.MX.sym("goals", stages[2].values.size1_in(1)),
+            ca.MX.sym("w", 5),
+        )
+        defects, centers = ca.MX.sym("defects", DEFECT_SIZE, N), ca.MX.sym("centers", n + m, N)
+        planes = [ca.MX.sym("planes", PLANE_SIZE + 1, count) for count in counts]
+        wrenches = ca.repmat(ca.vec(ca.DM(propulsion.wrenches)), 1, N)
+        zero = np.zeros((N, 1), dtype=np.int64)
+        placed, equalities = place_stages(
+            stages,
+            (
+                np.hstack([zero[:1], knot[:1, 13:]]),
+                np.hstack([zero, knot[:-1], a, u, knot[1:]]),
+                np.hstack([zero[:1], knot[-1:]]),
+            ),
+            (start, ca.vertcat(defects, wrenches), goals),
+        )
+        if propulsion.norms:
+            group = ca.SX.sym("u", 3)
+            norm = ConstraintBlock.of("norm", group, ca.SX(0, 1), 1 - ca.sumsqr(group))
+            groups = np.vstack([u[:, list(each)] for each in propulsion.norms])
+            placed.append(PlacedBlock.after(placed, norm, groups, ca.MX(0, 1)))
+        variables = np.hstack([zero, knot[:-1], knot[1:], np.full((N, 1), layout.size - 1)])
+        for (block, at), of_pair in zip(pairs, planes, strict=True):
+            places = variables[np.array(at) // INSTANTS]
+            placed.append(PlacedBlock.after(placed, block, places, of_pair))
+        controls = ca.reshape(x[np.hstack([a, u]).ravel().tolist()], n + m, N)
+        scale = ca.DM(np.concatenate([self._acceleration, np.ones(m)]))
+        change = (controls - centers) / ca.repmat(scale, 1, N)
+        spent = propulsion.cost_of(controls[n:, :], w[4])
+        f = w[0] * N * x[0] + w[1] * x[0] * spent
+        f += (w[2] * ca.sumsqr(change[:n, :]) + w[3] * ca.sumsqr(change[n:, :])) / N
+        if pairs:
+            f += _COST_OF_LACK * x[-1]
+        parameters = [start, goals, defects, w, centers, *planes]
+        return assembled(x, ca.vertcat(*map(ca.vec, parameters)), f, placed, equalities)
 
     def solve(
         self,
@@ -492,7 +474,7 @@ class ThrustSolver:
         corrected
             Whether the guess is a solution with other defects.
         """
-        layout, propulsion = self._layout, self._propulsion
+        layout, propulsion, program = self._layout, self._propulsion, self._program
         N, most = layout.intervals, self._acceleration
         vertices = with_joints_moved(guess.states, guess.step / 2)
         x0 = pack_knots(layout, guess.step, vertices, guess.accelerations, guess.levels)
@@ -501,22 +483,19 @@ class ThrustSolver:
         if guess.multipliers is not None:
             begins = "corrected" if corrected else "continued"
             of_variables, of_rows = guess.multipliers
-            rows = len(self._program.lower)
+            rows = len(program.lower)
             # Of all rows, if they are the same ones, else of those without pairs.
             same = rows if len(of_rows) == rows else rows - len(planes)
             begin["lam_x0"] = np.zeros(layout.size)
             begin["lam_x0"][: len(of_variables)] = of_variables[: layout.size]
             begin["lam_g0"] = np.append(of_rows[:same], np.zeros(rows - same))
-        parameters = [
-            *(state_parts(boundary.start)[4], boundary.goals),
-            propulsion.wrenches.ravel(order="F"),
-            np.zeros(DEFECT_SIZE * N) if guess.defects is None else guess.defects.ravel(),
-            *(most, np.array(weights)),
-            np.zeros(sum(layout.controls) * N)
-            if center is None
-            else np.hstack([center.accelerations, center.levels]).ravel(),
-            planes.ravel(),
-        ]
+        defects, centers = np.zeros(DEFECT_SIZE * N), np.zeros(sum(layout.controls) * N)
+        if guess.defects is not None:
+            defects = guess.defects.ravel()
+        if center is not None:
+            centers = np.hstack([center.accelerations, center.levels]).ravel()
+        shape = state_parts(boundary.start)[4]
+        parameters = (shape, boundary.goals, defects, weights, centers, planes.ravel())
         least, largest = (
             pack_knots(layout, span / N, bounds, acceleration, levels)
             for span, bounds, acceleration, levels in (
@@ -528,14 +507,8 @@ class ThrustSolver:
             largest[-1] = np.inf
         solver = self._ipopt(begins)
         self._monitor.begin(stop)
-        result = solver(
-            **begin,
-            lbx=least,
-            ubx=largest,
-            lbg=self._program.lower,
-            ubg=self._program.upper,
-            p=np.concatenate(parameters),
-        )
+        bounds = {"lbx": least, "ubx": largest, "lbg": program.lower, "ubg": program.upper}
+        result = solver(**begin, **bounds, p=np.concatenate(parameters))
         x, *found = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
         multipliers = (found[0], found[1]) if solver.stats()["success"] else None
         if multipliers is None:
