@@ -172,7 +172,7 @@ class InitialGuesses:
             velocities = steady.copy()
             velocities[:, other] = by_instant / (step * (len(s) - 1))
             quaternions = self._blended_attitudes(boundary, shapes, velocities, step, turns)
-            w = _rates_between(quaternions, step)
+            w = rates_between(quaternions, step)
             L_B = boundary.angular_momentum @ matrices_from_quaternions(quaternions)
             left = L_B - np.einsum("kij,kj->ki", D, w) - np.einsum("kij,kj->ki", D_q, velocities)
             velocities[1:-1, index] += (left @ to_wheels)[1:-1]
@@ -341,7 +341,7 @@ def attitudes_along(turn: ca.Function, q: Array, u: Array, u_next: Array) -> Arr
     return quaternions
 
 
-def _rates_between(quaternions: Array, step: float) -> Array:
+def rates_between(quaternions: Array, step: float) -> Array:
     """Return the angular velocity (N + 1, 3), base components, at attitudes (N + 1, 4) that are a
     step, s, apart.
     """

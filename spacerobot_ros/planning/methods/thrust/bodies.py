@@ -65,14 +65,10 @@ _LEAST_SLOPE = 1e-3
 
 
 class _Surroundings:
-    """The distances of links and of obstacles that rest in W or, if there is one, on a target.
+    """The distances of links and of obstacles that rest in W or, if there is one, on a target."""
 
-    Its first pair is number ``first`` of all pairs of a motion.
-    """
-
-    def __init__(self, clearance: Clearance, first: int, target: TorqueFreeMotion | None) -> None:
-        self.clearance, self.first, self.target = clearance, first, target
-        self.geometry = clearance.geometry
+    def __init__(self, clearance: Clearance, target: TorqueFreeMotion | None = None) -> None:
+        self.clearance, self.target, self.geometry = clearance, target, clearance.geometry
         self.of_hand = np.zeros(len(self.geometry.pairs), dtype=bool)
         """Whether each pair (P,) is the body that grasps and the target."""
         self.required = np.zeros(0)
@@ -91,11 +87,9 @@ class _Surroundings:
         return self.geometry.poses(path.shapes, self.base(path))
 
     def distance_function(self, pair: int, center_of_mass: ca.Function) -> ca.Function:
-        """Return the distance of a pair as a function of a plane."""
         return support_distance(self.geometry, pair, center_of_mass)
 
     def distances(self, pair: int, path: Samples) -> Array:
-        """Return the distances (K,) of a pair along a path, m."""
         return self.geometry.distances(pair, self.poses(path))
 
     def is_near(self, pair: int, path: Samples) -> npt.NDArray[np.bool_]:
@@ -105,13 +99,10 @@ class _Surroundings:
         return np.asarray(self.distances(pair, path) < reach)
 
     def room(self, path: Samples) -> float:
-        """Return the least room along a path, m; see :meth:`Bodies.room`."""
         required = np.where(self.geometry.with_obstacles, self.required, -np.inf)
-        found, _ = self.geometry.nearest_along(path.shapes, self.base(path), required)
-        return float(found.min())
+        return float(self.geometry.nearest_at(self.poses(path), required)[0].min())
 
     def approaches(self, path: Samples) -> list[Approach]:
-        """Return the pairs that come too close on a path."""
         found = self.clearance.approaches(path.shapes, self.required, self.base(path))
         return found if self.target is None else [replace(e, place_on_obstacle=None) for e in found]
 
@@ -132,23 +123,18 @@ class _Surroundings:
 
 class _Corridor:
     """The cone through which an end-effector approaches the grapple frame of a target, within some
-    distance of it.
+    distance of it; its axis is the direction of the standoff.
 
-    Its axis is the direction of the standoff. It is one pair, number ``first``, whose distance is
-    that of the end-effector origin from the surface of the cone or, if that is more, from the
-    sphere in which the cone counts; negative: it is beside the cone.
+    It is one pair, whose distance is that of the end-effector origin from the surface of the cone
+    or, if that is more, from the sphere in which the cone counts; negative: it is beside the cone.
     """
 
-    def __init__(self, robot: SpaceRobot, link: str, grapple: Grapple, first: int) -> None:
-        self._robot, self._link, self._grapple, self.first = robot, link, grapple, first
+    def __init__(self, robot: SpaceRobot, link: str, grapple: Grapple, start: Samples) -> None:
+        self._robot, self._link, self._grapple = robot, link, grapple
         self._slope = max(float(np.sin(grapple.corridor_angle)), _LEAST_SLOPE)
-        self._length = grapple.corridor_length
-        self.required, self.of_hand = np.zeros(1), np.zeros(1, dtype=bool)
-
-    def require_start(self, start: RobotMotion) -> None:
-        """Refuse a start far beside the corridor; one a little beside it need not come nearer."""
-        path = Samples(start.q[np.newaxis], _poses(start.pose), np.zeros(1))
-        self.required[:] = min(float(self.distances(0, path)[0]), 0.0)
+        self._length, self.of_hand = grapple.corridor_length, np.zeros(1, dtype=bool)
+        # A start a little beside it need not come nearer.
+        self.required = np.minimum(self.distances(0, start), 0.0)
         if self.required[0] < -_CORRIDOR_RADIUS:
             raise PlanningError(
                 f"At the start, {self._beside(self.required[0])}: move the robot away from the "
@@ -200,14 +186,12 @@ class _Corridor:
         return np.hstack([np.where(chosen, self._slope * axis, normal), offset, apex])[at]
 
     def distances(self, _pair: int, path: Samples) -> Array:
-        """Return the distances (K,) along a path, m."""
         *_, inside, outside = self._places(path)
         return np.maximum(inside, outside)
 
     def is_near(self, _pair: int, path: Samples) -> npt.NDArray[np.bool_]:
         """Return where an end-effector on a path (K,) is near the sphere or in it."""
-        *_, outside = self._places(path)
-        return np.asarray(outside < 0.1 * self._length)
+        return np.asarray(self._places(path)[-1] < 0.1 * self._length)
 
     def approaches(self, path: Samples) -> list[Approach]:
         """Return where the end-effector is farthest outside, if it is: also between the instants of
@@ -221,19 +205,18 @@ class _Corridor:
             moved = np.linalg.norm(np.diff(hand, axis=0), axis=1)
             least = (distances[:-1] + distances[1:] - moved) / 2
             open_ = (least < self.required[0]) & (moved > _CORRIDOR_RESOLUTION)
-            if distances[k] < self.required[0] or not open_.any():
-                break
+            if distances[k] < self.required[0]:
+                links = LinkPair(self._link, self._link)
+                return [Approach(links, 0, float(distances[k]), float(ticks[k]), here.shapes[k])]
+            if not open_.any():
+                return []
             ticks = np.sort(np.append(ticks, (ticks[:-1] + ticks[1:])[open_] / 2))
-        if distances[k] >= self.required[0]:
-            return []
-        links = LinkPair(self._link, self._link)
-        return [Approach(links, 0, float(distances[k]), float(ticks[k]), here.shapes[k])]
 
     def clause(self, approach: Approach) -> str:
-        return self._beside(approach.distance)
+        return f"{self._beside(approach.distance)}; widen the corridor or shorten it"
 
     def _beside(self, distance: float) -> str:
-        angle, length = self._grapple.corridor_angle, self._grapple.corridor_length
+        angle, length = self._grapple.corridor_angle, self._length
         return (
             f"'{self._link}' is {quantity(-distance, 'm')} outside its corridor, with "
             f"target.corridor_angle = {angle:g} rad and target.corridor_length = {length:g} m"
@@ -270,37 +253,34 @@ class Bodies:
         grapple: Grapple | None,
     ) -> None:
         self._robot = robot
-        solid = [] if clearance is None else [_Surroundings(clearance, 0, None)]
+        begin = Samples(start.q[np.newaxis], _poses(start.pose), np.zeros(1))
+        self._solid = [] if clearance is None else [_Surroundings(clearance)]
         if grapple is not None and grapple.description is not None and grapple.clearance > 0:
             among = replace(robot.description, world=grapple.description)
             distance, name = grapple.clearance, "target.clearance"
             kept = Clearance(among, distance, name, obstacles_alone=True)
-            first = sum(len(each.geometry.pairs) for each in solid)
-            solid.append(_Surroundings(kept, first, grapple.motion))
-        self._solid, self._around = solid, list[_Surroundings | _Corridor](solid)
-        if grapple is not None and grapple.corridor_length > 0:
-            first = sum(len(each.geometry.pairs) for each in solid)
-            corridor = _Corridor(robot, link, grapple, first)
-            corridor.require_start(start)
-            self._around.append(corridor)
-        self.rows = cache(self._derived_rows)
-        """Returns the rows of a pair with a given number."""
-        self._kept: dict[int, tuple[float, npt.NDArray[np.bool_]]] = {}
-        """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
-        (N K,)."""
-        shape = start.q[np.newaxis]
-        begin = Samples(shape, _poses(start.pose), np.zeros(1))
-        for each in solid:
+            self._solid.append(_Surroundings(kept, grapple.motion))
+        for each in self._solid:
             each.required = each.clearance.required(start.q, each.base(begin))
             if each.target is not None:
                 # The body that grasps comes as near as the grasp has it.
                 hand, solids = robot.description.frames[link][0], each.geometry.solids
                 each.of_hand[:] = [solids[i].body == hand for i, _ in each.geometry.pairs]
                 at = base_for_hand(robot, link, start.q, each.target.grapple_in_target)
-                grasp = each.geometry.poses(shape, _poses(at))
+                grasp = each.geometry.poses(begin.shapes, _poses(at))
                 for pair in np.flatnonzero(each.of_hand).tolist():
                     grasped = float(each.geometry.distances(pair, grasp)[0]) / 2
                     each.required[pair] = min(each.required[pair], grasped)
+        self._around: list[_Surroundings | _Corridor] = [*self._solid]
+        if grapple is not None and grapple.corridor_length > 0:
+            self._around.append(_Corridor(robot, link, grapple, begin))
+        self._pairs = [(each, k) for each in self._around for k in range(len(each.required))]
+        """Surroundings of each pair, and its number there."""
+        self.rows = cache(self._derived_rows)
+        """Returns the rows of a pair with a given number."""
+        self._kept: dict[int, tuple[float, npt.NDArray[np.bool_]]] = {}
+        """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
+        (N K,)."""
 
     def require_end(self, shape: Array, pose: Array) -> None:
         """Reject a goal, given by a shape (n,) and a base pose (7,), at which links are too
@@ -308,15 +288,10 @@ class Bodies:
         for each in self._solid:
             each.clearance.require_shape(shape, each.required, _poses(pose))
 
-    def _pair(self, number: int) -> tuple[_Surroundings | _Corridor, int]:
-        """Return the surroundings of a pair, and its number there."""
-        around = next(each for each in reversed(self._around) if each.first <= number)
-        return around, number - around.first
-
     # -- rows of the program ------------------------------------------------------------------
 
     def _derived_rows(self, number: int) -> ConstraintBlock:
-        around, pair = self._pair(number)
+        around, pair = self._pairs[number]
         center_of_mass = self._robot.function("center_of_mass", compile=False)
         return pair_block(self._robot.n, around.distance_function(pair, center_of_mass))
 
@@ -335,7 +310,7 @@ class Bodies:
 
     def distances(self, number: int, knots: ThrustKnots) -> Array:
         """Return the distances (N K,) of a pair at these instants, m."""
-        around, pair = self._pair(number)
+        around, pair = self._pairs[number]
         return around.distances(pair, self._along(knots))
 
     def room(self, knots: ThrustKnots) -> float:
@@ -352,7 +327,7 @@ class Bodies:
         """
         path = self._along(knots)
         for approach in near:
-            around, pair = self._pair(approach.pair)
+            around, pair = self._pairs[approach.pair]
             places = around.is_near(pair, path)
             place = int(approach.tick / EXACT_STEPS * INSTANTS) - 1
             places[max(place, 0) : place + 2] = True
@@ -380,7 +355,7 @@ class Bodies:
         found, last = [np.zeros((0, 8))], len(path.times) - INSTANTS
         for number, places in self.kept:
             at = np.array(places)
-            around, pair = self._pair(number)
+            around, pair = self._pairs[number]
             planes = around.planes(pair, path, at)
             at_ends = (at < INSTANTS) | (at >= last)
             wanted = around.required[pair] + np.where(at_ends, 0.0, self._kept[number][0])
@@ -396,15 +371,15 @@ class Bodies:
     def approaches(self, motion: ThrustMotion) -> list[Approach]:
         """Return the pairs that come too close in a motion, nearest first."""
         path = motion.path()
-        found: list[Approach] = []
+        found = list[Approach]()
         for around in self._around:
-            for each in around.approaches(path):
-                found.append(replace(each, pair=each.pair + around.first))
+            near = around.approaches(path)
+            found += [replace(e, pair=self._pairs.index((around, e.pair))) for e in near]
         return sorted(found, key=lambda each: each.distance)
 
     def reason(self, approach: Approach) -> str:
         """Return a clause that describes a motion that is not clear."""
-        around, _ = self._pair(approach.pair)
+        around, _ = self._pairs[approach.pair]
         return f"no clear motion was found: {around.clause(approach)}"
 
 

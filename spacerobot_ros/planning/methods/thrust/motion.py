@@ -113,7 +113,7 @@ class MotionFunctions(NamedTuple):
 
 
 def base_poses(robot: SpaceRobot, X: Array, r: Array, q: Array) -> BasePoses:
-    """Return the poses of the base at attitudes (K, 4), centres of mass (K, 3) and shapes (K, n)."""
+    """Return base poses at attitudes (K, 4), centres of mass (K, 3) and shapes (K, n)."""
     c = robot.function("center_of_mass")(q.T).full().T
     return BasePoses(r - np.einsum("kij,kj->ki", matrices_from_quaternions(X), c), X)
 

@@ -3,9 +3,8 @@ and clearance.
 
 The search is short, because the base and the arm can be pushed in every direction: in most cases, a
 straight guess leads to the solution. The problem is solved for the shortest time, then in a longer
-time for the
-least propellant, then again with the interval defects until it is exact. For pairs that come too
-close in the exact check, planes are added along a clear path, found by bending a path away from
+time for the least propellant, then again with the interval defects until it is exact. For pairs
+that come too close in the exact check, planes are added along a clear path, which bends away from
 obstacles.
 """
 
@@ -15,13 +14,12 @@ import itertools
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.collision import Approach
 from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
@@ -32,10 +30,8 @@ from spacerobot_ros.model.rotations import (
     matrices_from_quaternions,
     matrix_from_quaternion,
     quaternion_from_matrix,
-    quaternion_inverse,
     quaternion_multiply,
     quaternions_from_rotvecs,
-    rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.model.world import with_world
@@ -43,6 +39,7 @@ from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
+from spacerobot_ros.planning.methods.optimal.initial_guesses import rates_between
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
@@ -91,15 +88,13 @@ _END_REACH, _GRASP_REACH = 0.3, 0.6
 the joints from their initial shape on the way to a grasp, m or rad: the base moves, and the arm
 stays clear of it."""
 
-_LARGEST_LACK = 1e-4
-"""Missing distance between pairs up to which a solution counts as clear before the exact check,
-m."""
+_LARGEST_LACK, _SHALLOW = 1e-4, 0.1
+"""Missing distance between pairs up to which a solution counts as clear before the exact check, and
+contact depth on a path to a target up to which planes along this path are tried first, m."""
 
-_SHALLOW = 0.1
-"""Contact depth on a path to a target up to which planes along this path are tried first, m."""
-
-_MAX_ROUNDS = 6
-"""Number of times that new planes are computed to clear a path."""
+_MAX_ROUNDS, _LARGEST_STRETCH = 6, 4.0
+"""Number of times that new planes are computed to clear a path or that a motion with excessive
+efforts is slowed down, and largest factor applied to its duration."""
 
 _SHARES_LEFT = (0.0, 0.25, 0.5)
 """Fractions of the angular momentum that may be left after a grasp."""
@@ -107,9 +102,6 @@ _SHARES_LEFT = (0.0, 0.25, 0.5)
 _MEETING_PERIOD, _LATER = 1.0, 0.3
 """Interval between the times at which guesses meet a target, s, and relative to the time of a guess
 that led nowhere."""
-
-_LARGEST_STRETCH = 4.0
-"""Largest factor applied to the duration of a motion with excessive efforts."""
 
 _BOW_SHARES, _BOW_DIRECTIONS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0), 12
 """Heights of bends away from a straight line, relative to the smallest height worth trying, and
@@ -230,18 +222,18 @@ class ThrustPlanner:
         """Return the motion to a target: with no angular momentum left, or as little as there is
         a motion for.
         """
-        boundary, kind = self._meeting(start), EndKind(self.link, target=True)
+        boundary = self._start(start, np.zeros(0))
         self._require_catch(boundary.start, grapple)
+        s, reach = state_parts(boundary.bounds)[4], np.where(self._wheels, np.inf, _GRASP_REACH)
+        s[:] = np.clip(s, start.q - reach, start.q + reach)
+        kind = EndKind(self.link, target=True)
         plain = _Search(self, boundary, kind, stop, bodies, grapple)
         motion = plain.run(plain.first_meeting())
-        if not grapple.detumbles:
-            return motion
         left = motion.joined_momentum(grapple.motion)
-        kind = kind._replace(momentum=True)
-        for share in _SHARES_LEFT:
-            search = _Search(self, boundary, kind, stop, bodies, grapple, share * left)
+        for share in _SHARES_LEFT if grapple.detumbles else ():
+            search = replace(plain, kind=kind._replace(momentum=True), left=share * left)
             try:
-                return search.run_near(plain)
+                return search.run_near(plain.path)
             except PlanningCancelled:
                 raise
             except PlanningError:
@@ -282,14 +274,6 @@ class ThrustPlanner:
         v[:, -1, self._wheels] = start.qdot[self._wheels]
         return ThrustBoundary(state, goals, bounds)
 
-    def _meeting(self, start: RobotMotion) -> ThrustBoundary:
-        """Return both ends of a motion to a target, with joints near their shape at the start."""
-        boundary = self._start(start, np.zeros(0))
-        s = state_parts(boundary.bounds)[4]
-        reach = np.where(self._wheels, np.inf, _GRASP_REACH)
-        s[:] = np.clip(s, start.q - reach, start.q + reach)
-        return boundary
-
     def _require_catch(self, state: Array, grapple: Grapple) -> None:
         robot, target, options = self.robot, grapple.motion, self.limits
         away = target.center_of_mass(0.0) - state[7:10]
@@ -311,7 +295,7 @@ class ThrustPlanner:
 
     def _boundary(self, start: RobotMotion, goal: ThrustGoal) -> tuple[ThrustBoundary, Array]:
         """Return both ends of a motion, and the shape (n,) at its end."""
-        robot, hand = self.robot, goal.end_effector
+        robot, hand, limits = self.robot, goal.end_effector, self.limits
         shape = np.full(robot.n, np.nan) if goal.shape is None else goal.shape
         given = np.isfinite(shape) & ~self._wheels
         q, reach = np.where(given, shape, start.q), np.where(given, 0.0, np.inf)
@@ -319,10 +303,13 @@ class ThrustPlanner:
             q = np.where(given, q, self._shape_at(goal.base, hand, q))
             # Near to this family of shapes: others may lie beyond a contact of the arm.
             reach[~given & ~self._wheels] = _END_REACH
-        self._require_within(q)
-        boundary = self._start(
-            start, goal.base if hand is None else np.concatenate([goal.base, hand])
-        )
+        for i in np.flatnonzero((q < limits.lower) | (q > limits.upper))[:1]:
+            raise UnreachableError(
+                f"Joint '{robot.joint_names[i]}' would end at {q[i]:.4g}, beyond its limits "
+                f"[{limits.lower[i]:.4g}, {limits.upper[i]:.4g}].",
+                Proof.LIMITS,
+            )
+        boundary = self._start(start, np.append(goal.base, [] if hand is None else hand))
         _, L, _, V, s, v = state_parts(boundary.bounds)
         last = np.where(self._wheels, start.qdot, 0.0)
         L[:, -1] = matrix_from_quaternion(goal.base[3:]) @ robot.inertia_matrix(q)[3:6, 6:] @ last
@@ -346,17 +333,6 @@ class ThrustPlanner:
                 )
         return found
 
-    def _require_within(self, q: Array) -> None:
-        for name, value, low, high in zip(
-            self.robot.joint_names, q, self.limits.lower, self.limits.upper, strict=True
-        ):
-            if not low <= value <= high:
-                raise UnreachableError(
-                    f"Joint '{name}' would end at {value:.4g}, beyond its limits "
-                    f"[{low:.4g}, {high:.4g}].",
-                    Proof.LIMITS,
-                )
-
     def guess(self, boundary: ThrustBoundary, base: Array, end: Array, bow: Array) -> ThrustKnots:
         """Return a guess at full thrust along a quintic: the base moves on a straight line and
         geodesic to a pose (7,), and the joints move straight to a shape (n,). Half-way, the base is
@@ -376,8 +352,7 @@ class ThrustPlanner:
         # In one second; the time follows.
         h = 1.0 / N
         V, v = np.gradient(r, h, axis=0), np.gradient(q, h, axis=0)
-        rates = rotvecs_from_quaternions(quaternion_multiply(quaternion_inverse(X[:-1]), X[1:])) / h
-        omega = np.vstack([rates[:1], (rates[1:] + rates[:-1]) / 2, rates[-1:]])
+        omega = rates_between(X, h)
         H = np.array([robot.inertia_matrix(each)[3:6, 3:] for each in q])
         L_B = np.einsum("kij,kj->ki", H, np.hstack([omega, v]))
         L = np.einsum("kij,kj->ki", R, L_B)
@@ -394,29 +369,26 @@ class ThrustPlanner:
         return replace(knots, levels=np.clip(knots.levels, self.propulsion.lowest, 1.0))
 
 
+@dataclass
 class _Search:
-    """One search of a planner."""
+    """One search of a planner; ``left`` is the final angular momentum of the robot and the target,
+    N m s.
+    """
 
-    def __init__(
-        self,
-        planner: ThrustPlanner,
-        boundary: ThrustBoundary,
-        kind: EndKind,
-        stop: StopRule,
-        bodies: Bodies,
-        grapple: Grapple | None = None,
-        left: Array | None = None,
-    ) -> None:
-        self.planner, self.boundary, self.kind, self.stop = planner, boundary, kind, stop
-        self.bodies, self.grapple = bodies, grapple
-        self.left = np.zeros(3) if left is None else left
-        """Final angular momentum of the robot and the target, N m s."""
-        self.path: ThrustKnots
-        """The knots of the last exact motion."""
-        self.is_timed = False
-        """Whether the duration is given, or follows from the shortest one."""
-        self.earliest = self.latest = 0.0
-        """Time at which a target is met, s."""
+    planner: ThrustPlanner
+    boundary: ThrustBoundary
+    kind: EndKind
+    stop: StopRule
+    bodies: Bodies
+    grapple: Grapple | None = None
+    left: Array = field(default_factory=lambda: np.zeros(3))
+    path: ThrustKnots = field(init=False)
+    """The knots of the last exact motion."""
+    is_timed: bool = False
+    """Whether the duration is given, or follows from the shortest one."""
+    earliest: float = 0.0
+    latest: float = 0.0
+    """Time at which a target is met, s."""
 
     def _ways(self, base: Array, shape: Array, sides: Array, time: float) -> Iterator[ThrustKnots]:
         """Yield guesses to a base pose (7,) and a shape (n,) that are clear of obstacles, in a time
@@ -479,17 +451,10 @@ class _Search:
             time += max(_MEETING_PERIOD, _LATER * time * is_in_time)
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
-        """Return the motion.
-
-        Raises
-        ------
-        PlanningError
-            No motion exists, or none was found.
-        """
         options = self.planner.options
         self._begin(SearchPhase.SEARCHING)
         is_timed = options.duration > 0 or options.time_factor > 1
-        fastest = self._solve(guess, self._weights(guess), rough=is_timed)
+        fastest = self._solve(guess, self._weights(guess), begins="rough" * is_timed)
         if fastest is None:
             raise self._failure("no motion to the goal was found")
         if 0 < options.duration < fastest.duration:
@@ -514,12 +479,12 @@ class _Search:
             self.is_timed = True
         raise self._failure(f"its joints need {share:.3g} times the efforts that a plan may use")
 
-    def run_near(self, other: _Search) -> ThrustMotion:
-        """Return a motion near the path of another search, with the same duration."""
-        self.is_timed, path = True, replace(other.path, multipliers=None)
+    def run_near(self, path: ThrustKnots) -> ThrustMotion:
+        """Return a motion near a path, with the same duration."""
+        self.is_timed, path = True, replace(path, multipliers=None)
         self.earliest = self.latest = path.duration
         path = self._solve(path, _NEAREST, center=path) or path
-        motion = self._settled(self._cleared(path))
+        motion = self._settled(self._cleared(path) or path)
         if motion.effort_share(self.planner.effort_limit) > 1.0:
             raise self._failure("its joints need more than the efforts that a plan may use")
         return motion
@@ -528,25 +493,25 @@ class _Search:
         """Return the exact and clear motion near the fastest one, in a time if that is given; to a
         target, by that time.
         """
-        bodies = self.bodies
+        bodies, failure, self.latest = self.bodies, None, time
         self._begin(SearchPhase.REFINING)
         bodies.keep_none()
-        self.latest = time
-        path = fastest.stretched(
-            (time if self.grapple is None else self.earliest) / fastest.duration
-        )
+        first = time if self.grapple is None else self.earliest
+        path = fastest.stretched(first / fastest.duration)
         if self.is_timed:
             # Roughly, for a look at what is in the way.
-            path = self._solve(path, self._weights(path, _ROUNDINGS[0]), rough=True) or path
-        near, failure = bodies.approaches(self.planner.motion(path)), None
+            path = self._solve(path, self._weights(path, _ROUNDINGS[0]), begins="rough") or path
+        near = bodies.approaches(self.planner.motion(path))
         guesses = self._bows(path) if self.grapple is None else self._meetings(path.duration)
         if not near or (self.grapple is not None and near[0].distance > -_SHALLOW):
             guesses = itertools.chain([path], guesses)
         for guess in guesses:
             bodies.keep_none()
             bodies.keep(near, guess)
+            cleared = self._cleared(guess) if near else guess
             try:
-                return self._settled(self._cleared(guess) if near else guess)
+                if cleared is not None:
+                    return self._settled(cleared)
             except PlanningCancelled:
                 raise
             except PlanningError as error:
@@ -570,9 +535,7 @@ class _Search:
         weights: Weights,
         planes: Array | None = None,
         center: ThrustKnots | None = None,
-        *,
-        rough: bool = False,
-        corrected: bool = False,
+        begins: str = "",
     ) -> ThrustKnots | None:
         """Return the best motion near a guess: in its time, in any time if none is given yet, and
         to a target by the latest time if nothing is in the way. Planes are those along the guess,
@@ -584,10 +547,10 @@ class _Search:
             duration = _FREE_TIME
         elif self.grapple is not None and center is None and not self.bodies.kept:
             duration = DurationBounds(self.earliest, self.latest)
-        boundary = replace(self.boundary, goals=self._goals(guess.duration))
+        boundary = self.boundary._replace(goals=self._goals(guess.duration))
         planes = self.bodies.planes(guess) if planes is None else planes
-        args = boundary, guess, weights, self.stop, duration, planes, center
-        return self._solver.solve(*args, rough=rough, corrected=corrected)
+        args = boundary, guess, weights, self.stop, duration, planes, center, begins
+        return self._solver.solve(*args)
 
     @property
     def _solver(self) -> ThrustSolver:
@@ -596,30 +559,22 @@ class _Search:
     def _weights(self, guess: ThrustKnots, rounding: float = 1.0) -> Weights:
         """Return the weights of least propellant, or of least time, in units of the guess."""
         if not self.is_timed:
-            small = _TIME_REGULARISATION
-            return Weights(1 / guess.duration, 0.0, small, small)
+            return Weights(1 / guess.duration, 0.0, _TIME_REGULARISATION, _TIME_REGULARISATION)
         spent = guess.step * float(self.planner.propulsion.cost_of(ca.DM(guess.levels.T)))
-        small = _REGULARISATION
-        return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, small, rounding)
+        return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, _REGULARISATION, rounding)
 
     def _exact(self, guess: ThrustKnots) -> ThrustMotion:
-        """Return the motion of least propellant, or of least time, near a path, as it flies.
-
-        Raises
-        ------
-        PlanningError
-            None is found that ends at the goal.
-        """
+        """Return the motion of least propellant, or of least time, near a path, as it flies."""
         planner, knots, planes = self.planner, guess, self.bodies.planes(guess)
-        roundings = _ROUNDINGS[1:] if planner.propulsion.norms else (1.0,)
-        if len(planes) or not self.is_timed:
-            roundings = roundings[:1]
+        is_rounded = planner.propulsion.norms and self.is_timed and not len(planes)
+        roundings = _ROUNDINGS[1:] if is_rounded else _ROUNDINGS[1:2]
         *others, weights = (self._weights(guess, each) for each in roundings)
         for each in others:
             knots = self._solve(knots, each, planes) or knots
         center, best, error = None, None, math.inf
         for number in range(_MAX_CORRECTIONS):
-            solved = self._solve(knots, weights, planes, center, corrected=number > 0)
+            begins = "corrected" * (number > 0)
+            solved = self._solve(knots, weights, planes, center, begins)
             if solved is None:
                 break
             motion = planner.motion(solved)
@@ -655,14 +610,14 @@ class _Search:
         of_poses = 9 if self.kind.target else rows.numel()
         return float(np.abs(rows.full()[:of_poses]).max(initial=0.0))
 
-    def _cleared(self, at: ThrustKnots) -> ThrustKnots:
+    def _cleared(self, at: ThrustKnots) -> ThrustKnots | None:
         """Return a path near one that keeps pairs apart, and all others that come too near."""
-        bodies, near = self.bodies, list[Approach]()
+        bodies = self.bodies
         self._begin(SearchPhase.CLEARING)
         for _ in range(_MAX_ROUNDS):
             solved = self._solve(at, self._weights(at, _ROUNDINGS[0]))
             if solved is None:
-                break
+                return None
             if self._solver.lack > _LARGEST_LACK:
                 at = solved
                 continue
@@ -676,7 +631,7 @@ class _Search:
             if not fell_in or min(bodies.distances(pair, at).min() for pair in fell_in) <= 0:
                 # Else planes of these pairs are made along the path before, which is clear of them.
                 at = solved
-        raise self._failure(bodies.reason(near[0]) if near else "no clear motion was found")
+        return None
 
     def _begin(self, phase: SearchPhase) -> None:
         progress = SearchProgress(0, 0, self.earliest or math.inf, phase)

@@ -79,40 +79,25 @@ K - 1.
 _COST_OF_LACK = 1e3
 """Weight of missing distance between pairs, per metre."""
 
+_PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 _CONTINUED = {
     "ipopt.mu_init": 1e-5,
     "ipopt.tol": 1e-5,
     "ipopt.warm_start_init_point": "yes",
-    **{
-        f"ipopt.warm_start_{of}": 1e-7
-        for of in (
-            *("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac"),
-            "mult_bound_push",
-        )
-    },
+    **{f"ipopt.warm_start_{each}": 1e-7 for each in _PUSHES},
 }
+_EXACT = {"ipopt.mu_init": 1e-9, "ipopt.constr_viol_tol": 1e-9, "ipopt.tol": 1e-8}
+_NEAR_BOUNDS = {"ipopt.mu_init": 1e-2, "ipopt.bound_push": 1e-3, "ipopt.bound_frac": 1e-3}
 
 _OPTIONS: Mapping[str, Mapping[str, object]] = {
     "": {"ipopt.tol": 1e-6},
     # A shortest time that another time follows from, or a look at what is in the way.
     "rough": {"ipopt.tol": 1e-4, "ipopt.constr_viol_tol": 1e-5},
     # The guess is clear of its planes, or nearly so; planes made anew follow its solution.
-    "clear": {
-        "ipopt.mu_init": 1e-2,
-        "ipopt.bound_push": 1e-3,
-        "ipopt.bound_frac": 1e-3,
-        "ipopt.tol": 1e-3,
-        "ipopt.dual_inf_tol": 1e-1,
-    },
-    # The guess is a solution with other weights, planes or pairs.
+    "clear": {**_NEAR_BOUNDS, "ipopt.tol": 1e-3, "ipopt.dual_inf_tol": 1e-1},
+    # The guess is a solution with other weights, planes or pairs; then one with other defects.
     "continued": _CONTINUED,
-    # The guess is a solution with other defects.
-    "corrected": {
-        **_CONTINUED,
-        "ipopt.mu_init": 1e-9,
-        "ipopt.constr_viol_tol": 1e-9,
-        "ipopt.tol": 1e-8,
-    },
+    "corrected": {**_CONTINUED, **_EXACT},
 }
 """IPOPT options by starting point."""
 
@@ -164,19 +149,10 @@ class ThrustKnots:
         )
 
 
-@dataclass(frozen=True)
-class ThrustBoundary:
-    """Both ends of a motion, in W.
-
-    Attributes
-    ----------
-    start
-        (13 + 2 n,) state at the start (:class:`ThrustKnots`).
-    goals
-        Values prescribed at the end of the motion (:class:`.EndKind`).
-    bounds
-        (2, N + 1, 13 + 2 n) smallest and largest states at the knots, with the vertices of the
-        joints' parabolas in place of their positions.
+class ThrustBoundary(NamedTuple):
+    """Both ends of a motion, in W: the state at the start (13 + 2 n,), the values prescribed at the
+    end (:class:`.EndKind`), and the smallest and largest states (2, N + 1, 13 + 2 n) at the knots,
+    with the vertices of the joints' parabolas in place of their positions.
     """
 
     start: Array
@@ -404,11 +380,8 @@ class ThrustSolver:
         (n, m), counts = layout.controls, [len(at) for _, at in pairs]
         knot, a, u = layout.knots()
         x = ca.MX.sym("x", layout.size)
-        start, goals, w = (
-            ca.MX.sym("start", n),
-            ca.MX.sym("goals", stages[2].values.size1_in(1)),
-            ca.MX.sym("w", 5),
-        )
+        sizes = {"start": n, "goals": stages[2].values.size1_in(1), "weights": len(Weights._fields)}
+        start, goals, w = (ca.MX.sym(*each) for each in sizes.items())
         defects, centers = ca.MX.sym("defects", DEFECT_SIZE, N), ca.MX.sym("centers", n + m, N)
         planes = [ca.MX.sym("planes", PLANE_SIZE + 1, count) for count in counts]
         wrenches = ca.repmat(ca.vec(ca.DM(propulsion.wrenches)), 1, N)
@@ -451,9 +424,7 @@ class ThrustSolver:
         duration: DurationBounds,
         planes: Array,
         center: ThrustKnots | None = None,
-        *,
-        rough: bool = False,
-        corrected: bool = False,
+        begins: str = "",
     ) -> ThrustKnots | None:
         """Return the best motion near ``guess``; None if none.
 
@@ -469,26 +440,25 @@ class ThrustSolver:
             (R, 8) planes of the pairs at their places.
         center
             Controls whose differences are squared; None: zero.
-        rough
-            Whether another solve starts from the solution.
-        corrected
-            Whether the guess is a solution with other defects.
+        begins
+            ``rough`` if another solve starts from the solution, ``corrected`` if the guess is a
+            solution with other defects.
         """
         layout, propulsion, program = self._layout, self._propulsion, self._program
-        N, most = layout.intervals, self._acceleration
+        N, most, rows = layout.intervals, self._acceleration, len(program.lower)
         vertices = with_joints_moved(guess.states, guess.step / 2)
         x0 = pack_knots(layout, guess.step, vertices, guess.accelerations, guess.levels)
         begin = {"x0": x0}
-        begins = "clear" if layout.has_lack else "rough" if rough else ""
         if guess.multipliers is not None:
-            begins = "corrected" if corrected else "continued"
+            begins = begins if begins == "corrected" else "continued"
             of_variables, of_rows = guess.multipliers
-            rows = len(program.lower)
             # Of all rows, if they are the same ones, else of those without pairs.
             same = rows if len(of_rows) == rows else rows - len(planes)
             begin["lam_x0"] = np.zeros(layout.size)
             begin["lam_x0"][: len(of_variables)] = of_variables[: layout.size]
             begin["lam_g0"] = np.append(of_rows[:same], np.zeros(rows - same))
+        elif layout.has_lack:
+            begins = "clear"
         defects, centers = np.zeros(DEFECT_SIZE * N), np.zeros(sum(layout.controls) * N)
         if guess.defects is not None:
             defects = guess.defects.ravel()
