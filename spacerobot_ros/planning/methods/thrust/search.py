@@ -612,14 +612,16 @@ class _Search:
 
     def _cleared(self, at: ThrustKnots) -> ThrustKnots | None:
         """Return a path near one that keeps pairs apart, and all others that come too near."""
-        bodies = self.bodies
+        bodies, lack = self.bodies, math.inf
         self._begin(SearchPhase.CLEARING)
         for _ in range(_MAX_ROUNDS):
             solved = self._solve(at, self._weights(at, _ROUNDINGS[0]))
             if solved is None:
                 return None
             if self._solver.lack > _LARGEST_LACK:
-                at = solved
+                if self._solver.lack > lack / 2:
+                    return None
+                at, lack = solved, self._solver.lack
                 continue
             motion = self.planner.motion(solved)
             near, solved = bodies.approaches(motion), replace(solved, defects=motion.defects())
