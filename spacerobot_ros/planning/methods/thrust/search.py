@@ -457,17 +457,17 @@ class _Search:
         fastest = self._solve(guess, self._weights(guess), begins="rough" * is_timed)
         if fastest is None:
             raise self._failure("no motion to the goal was found")
-        if 0 < options.duration < fastest.duration:
-            raise UnreachableError(
-                f"The motion takes at least {fastest.duration:.4g} s, but plan.duration is "
-                f"{options.duration:g} s: increase it, or set it to 0.",
-                Proof.LIMITS,
-            )
-        self.is_timed = is_timed
-        time = options.duration or options.time_factor * fastest.duration
-        if self.grapple is not None:
-            time = max(min(time, self.grapple.horizon), fastest.duration)
-        self.earliest = fastest.duration
+        horizon = math.inf if self.grapple is None else self.grapple.horizon
+        limits = {"plan.duration": options.duration or math.inf, "target.horizon": horizon}
+        for name, limit in limits.items():
+            if fastest.duration > limit:
+                raise UnreachableError(
+                    f"The motion takes at least {fastest.duration:.4g} s, but {name} is {limit:g} "
+                    "s: increase it.",
+                    Proof.LIMITS,
+                )
+        self.is_timed, self.earliest = is_timed, fastest.duration
+        time = min(options.duration or options.time_factor * fastest.duration, horizon)
         for _ in range(_MAX_ROUNDS):
             motion = self._motion(fastest, time)
             share = motion.effort_share(self.planner.effort_limit)
