@@ -60,7 +60,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
-from spacerobot_ros.planning.methods.thrust.goals import Grapple
+from spacerobot_ros.planning.methods.thrust.problem import Grapple
 
 _LONGEST_MOTION = 1e9
 """Longest duration of a reference, s, equal to that of the longest flights."""

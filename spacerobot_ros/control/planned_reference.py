@@ -30,9 +30,8 @@ from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal
 from spacerobot_ros.planning.methods.thrust.motion import Samples, ThrustMotion
-from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, Propulsion, ThrustGoal
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 
 PLANNING_TIME = 2.0

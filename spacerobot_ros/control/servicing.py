@@ -38,7 +38,7 @@ from spacerobot_ros.model.grasp import (
 )
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.planning.core.cancellation import PlanningJob
-from spacerobot_ros.planning.methods.thrust.goals import Grapple
+from spacerobot_ros.planning.methods.thrust.problem import Grapple
 
 _PREDICTION_TOLERANCE = 0.02
 """Deviation (m and rad) of a target from its predicted motion beyond which the approach is

@@ -22,9 +22,8 @@ from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, TargetBody
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.planning.methods.thrust.goals import Grapple
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
-from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file, share_directory
 

@@ -20,8 +20,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.planning.methods.thrust.goals import ThrustGoal
-from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.problem import Propulsion, ThrustGoal
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file
 

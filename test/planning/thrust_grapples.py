@@ -22,8 +22,7 @@ from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, TargetBody
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.model.thrusters import thrusters_of_urdf
-from spacerobot_ros.planning.methods.thrust.goals import Grapple
-from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, Propulsion
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
 from spacerobot_ros.resources import robot_file, share_directory
 

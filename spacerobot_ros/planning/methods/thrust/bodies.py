@@ -34,13 +34,13 @@ from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import end_effector_pose
 from spacerobot_ros.planning.methods.optimal.problem import Trajectory
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
-from spacerobot_ros.planning.methods.thrust.goals import Grapple, base_for_hand
 from spacerobot_ros.planning.methods.thrust.motion import (
     EXACT_STEPS,
     Samples,
     ThrustMotion,
     base_poses,
 )
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, base_for_hand
 from spacerobot_ros.planning.methods.thrust.transcription import (
     INSTANTS,
     KeptPlaces,

@@ -25,7 +25,7 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_rate,
 )
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
-from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.problem import Propulsion
 from spacerobot_ros.planning.methods.thrust.transcription import (
     ThrustKnots,
     state_parts,
@@ -127,9 +127,9 @@ class Samples(NamedTuple):
 
     def at(self, ticks: Array) -> Samples:
         """Return the path, linear between its instants, at places (M,) among them."""
-        k = np.minimum(ticks.astype(int), max(len(self.times) - 2, 0))
-        after, share = np.minimum(k + 1, len(self.times) - 1), (ticks - k)[:, np.newaxis]
-        shapes = (1 - share) * self.shapes[k] + share * self.shapes[after]
+        k = np.minimum(ticks.astype(int), len(self.times) - 2)
+        share = (ticks - k)[:, np.newaxis]
+        shapes = (1 - share) * self.shapes[k] + share * self.shapes[k + 1]
         times = np.interp(ticks, np.arange(len(self.times)), self.times)
         return Samples(shapes, self.base.between(k, share), times)
 

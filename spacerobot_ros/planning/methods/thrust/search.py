@@ -44,13 +44,17 @@ from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_e
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
 from spacerobot_ros.planning.methods.thrust.bodies import Bodies
-from spacerobot_ros.planning.methods.thrust.goals import Grapple, ThrustGoal, base_for_hand
 from spacerobot_ros.planning.methods.thrust.motion import (
     MotionFunctions,
     ThrustMotion,
     base_poses,
 )
-from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.problem import (
+    Grapple,
+    Propulsion,
+    ThrustGoal,
+    base_for_hand,
+)
 from spacerobot_ros.planning.methods.thrust.transcription import (
     EndKind,
     KeptPlaces,

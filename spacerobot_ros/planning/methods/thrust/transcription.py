@@ -62,7 +62,7 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
     rotation_with_derivatives,
     state_within_interval,
 )
-from spacerobot_ros.planning.methods.thrust.propulsion import Propulsion
+from spacerobot_ros.planning.methods.thrust.problem import Propulsion
 
 DEFECT_SIZE = 12
 """Length of an interval's defect: rotation vector, then L, r and V at its end."""
