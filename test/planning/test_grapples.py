@@ -212,6 +212,9 @@ def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
     assert_one_sentence(touching, "obstacle 'slab' touch at the start", "target.clearance")
     short = refusal(slab((2.5, 0.2, -0.1)), duration=3.0)
     assert_one_sentence(short, "s at least", "plan.duration is 3 s")
+    with pytest.raises(PlanningError) as late:
+        boomed().plan(start, replace(meeting(slab((2.5, 0.2, -0.1))), horizon=14.0))
+    assert_one_sentence(str(late.value), "takes at least", "target.horizon is 14 s: increase it")
 
 
 @pytest.mark.slow

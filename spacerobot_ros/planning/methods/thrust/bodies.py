@@ -360,8 +360,8 @@ class Bodies:
             at_ends = (at < INSTANTS) | (at >= last)
             wanted = around.required[pair] + np.where(at_ends, 0.0, self._kept[number][0])
             if around.of_hand[pair]:
-                # Boxes around the hand would touch before it does.
-                wanted[at >= last] = -np.inf
+                # At the grasp, the boxes around the hand touch.
+                wanted[at > last] = -np.inf
             planes[:, 3] += np.maximum(wanted, -_NO_DISTANCE)
             found.append(np.column_stack([planes, (at % INSTANTS + 1) / INSTANTS]))
         return np.vstack(found)

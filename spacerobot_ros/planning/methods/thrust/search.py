@@ -449,10 +449,11 @@ class _Search:
         assert self.grapple is not None
         while time < self.grapple.horizon:
             guess = next(self._ways(*self._meeting(time), time), None)
-            is_in_time = guess is not None and guess.duration < time + 1e-6
-            if guess is not None and is_in_time:
-                yield guess
-            time += max(_MEETING_PERIOD, _LATER * time * is_in_time)
+            if guess is None or guess.duration > time + 1e-6:
+                time += _MEETING_PERIOD
+                continue
+            yield guess
+            time += max(_MEETING_PERIOD, _LATER * time)
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
         options = self.planner.options
