@@ -335,8 +335,8 @@ class Bodies:
             lack = float(around.required[pair]) - approach.distance
             more = _ROOM if room is None else room + lack + _ROOM
             if isinstance(around, _Corridor):
-                # Its rows have room; what a path misses says where to make others, not how far.
-                more = 0.0 if room is None else room + _ROOM
+                # Its rows have room; what a path misses says little of how far to make others.
+                more = 0.0 if room is None else room + min(lack, _ROOM) + _ROOM
             self._kept[approach.pair] = more, places | known
 
     def keep_none(self) -> None:
