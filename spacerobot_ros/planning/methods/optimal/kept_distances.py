@@ -36,8 +36,8 @@ _INITIAL_MARGIN = 2e-3
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 _MIN_INSTANTS = 80
-"""Smallest number of instants in a manoeuvre at which links are kept apart: between the knots of a
-coarse grid, they would come too close."""
+"""Smallest number of instants in a manoeuvre at which links are kept apart. With 160 on the full
+grid, a solver step took twice as long, and paths were no sooner clear in between."""
 
 _SHARE_OF_ENDS = 0.1
 """Fraction of a path, at an end with a given shape, where pairs need not have room."""
@@ -45,7 +45,7 @@ _SHARE_OF_ENDS = 0.1
 
 def instants_of(intervals: int) -> int:
     """Return the number of instants per interval at which pairs are kept apart."""
-    return max(2, math.ceil(_MIN_INSTANTS / intervals))
+    return math.ceil(_MIN_INSTANTS / intervals)
 
 
 class DistanceLibrary:
@@ -145,21 +145,27 @@ class KeptDistances:
         """Their numbers."""
         return tuple(sorted(self._room))
 
-    def approaches(self, positions: Array, turns: Array) -> list[Approach]:
-        """Return the pairs that come too close along held commands (N + 1, n), nearest first.
+    def approaches(self, positions: Array, turns: Array, margin: float = 0.0) -> list[Approach]:
+        """Return the pairs that come closer along held commands (N + 1, n) than required plus a
+        margin, m, nearest first.
 
         ``turns`` (N + 1, 4) are the base rotations since the start.
         """
         base = self._library.base_poses(self._boundary, positions, turns)
-        return self._library.clearance.approaches(positions, self._required, base)
+        return self._library.clearance.approaches(positions, self._required + margin, base)
 
     def message(self, approach: Approach, control_period: float | None) -> str:
         """Return a clause about an approach that is too close, with times if a period is given."""
         return self._library.clearance.clause(approach, control_period)
 
-    def anew(self) -> KeptDistances:
-        """Return the same motion ends, with no pairs to keep apart."""
-        return KeptDistances(self._library, self._boundary, self._required)
+    def beside(self, path: Trajectory, margin: float = 0.0) -> KeptDistances:
+        """Return the same motion ends, with the pairs that come closer along a path than required
+        plus a margin, m; pairs that are already kept apart keep their room.
+        """
+        kept = KeptDistances(self._library, self._boundary, self._required)
+        near = (each.pair for each in self.approaches_of(path, margin))
+        kept._room = {pair: self._room.get(pair, _INITIAL_MARGIN) for pair in near}
+        return kept
 
     def add(self, near: Sequence[Approach]) -> None:
         """Add pairs that came too close."""
@@ -192,12 +198,11 @@ class KeptDistances:
         clearance = self._library.clearance
         return clearance.is_clear(path.shapes, self._required) and not self.approaches_of(path)
 
-    def approaches_of(self, path: Trajectory) -> list[Approach]:
-        """Return the pairs that come too close along a path, nearest first."""
+    def approaches_of(self, path: Trajectory, margin: float = 0.0) -> list[Approach]:
+        """Return the pairs that come too close along a path, as :meth:`approaches`."""
         shapes, turns = self.along(path)
-        return self.approaches(
-            np.vstack([path.shapes[:1], shapes]), np.vstack([path.quaternions[:1], turns])
-        )
+        shapes = np.vstack([path.shapes[:1], shapes])
+        return self.approaches(shapes, np.vstack([path.quaternions[:1], turns]), margin)
 
     def within(
         self, limits: MotionLimits, path: Trajectory, *, pushing: bool = False
