@@ -300,7 +300,7 @@ def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: st
         warning is logged each time.
     """
     cache = Cache(folder)
-    # Installations that share a cache have a file each.
+    # Installations that share a cache have one file each.
     entry = f"{name}-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:32]}"
     known = cache.load(entry, entry) is not None
     logger.log(logging.DEBUG if known else logging.WARNING, message)

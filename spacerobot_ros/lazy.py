@@ -52,7 +52,7 @@ def optional_module(
     except ImportError as missing:
         package = name.partition(".")[0]
         if (missing.name or package).partition(".")[0] != package:
-            raise  # It is there, and lacks another package.
+            raise  # The package is installed, but lacks another package.
         raise error(
             f"{needed_by} {package}, which is not installed: pip install '.[{extra}]' in the clone."
         ) from missing

@@ -255,7 +255,7 @@ def _capture_metric(name: str, unit: str, description: str, *, yes_or_no: bool =
 
 
 def _error_metric(part: str, unit: str, description: str) -> Metric:
-    """Return the metric of a part (``distance`` or ``angle``) of the error of the base."""
+    """Return the metric for one part (``distance`` or ``angle``) of the base error."""
     return Metric(unit, description, lambda m, _: float(getattr(m.error, part, math.nan)))
 
 
@@ -371,7 +371,7 @@ METRICS: dict[str, Metric] = {
 def metrics_of_each(
     measures: Sequence[Measures], robot: RobotDescription
 ) -> list[dict[str, float]]:
-    """Return every metric by name, including joint metrics, for flights of one robot; NaN: none."""
+    """Return all metrics by name, including joint metrics, for flights of one robot; NaN: none."""
     if not measures:
         return []
     joints: dict[str, Any] = {

@@ -195,12 +195,12 @@ _MODERATE = f"0 or from {_SMALLEST:g} to {_LARGEST:g} in magnitude"
 
 
 def _is_moderate(number: float) -> bool:
-    """Whether products of a number with others, and its square, are numbers that are not 0."""
+    """Whether the square of a number, and its products with others, are finite and nonzero."""
     return number == 0 or _SMALLEST <= abs(number) <= _LARGEST
 
 
 def _named_entries(value: Any) -> dict[str, Any] | None:
-    """Return the values of a mapping or of texts ``NAME:VALUE`` by name; None for anything else."""
+    """Return the values of a mapping or of strings ``NAME:VALUE`` by name; otherwise None."""
     if isinstance(value, Mapping):
         return {str(name): entry for name, entry in value.items()}
     if isinstance(value, str):
@@ -315,7 +315,7 @@ def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
 
 def _configured(defaults: Any, values: Mapping[str, Any], prefix: str) -> Any:
     chosen: dict[str, Any] = {}
-    # Few of many fields change: the first words after the prefix say which.
+    # Few of many fields change; the first words after the prefix show which.
     words = {name[len(prefix) :].partition(".")[0] for name in values if name.startswith(prefix)}
     for each in fields(defaults) if words else ():
         name, default = f"{prefix}{each.name}", getattr(defaults, each.name)

@@ -104,7 +104,7 @@ class Registry(dict[str, type[T]]):
         for entry in list(vars(module).values()):
             _require_base(entry, module)
             own = inspect.isclass(entry) and entry.__module__ == module.__name__
-            # A class without a name of its own is a base of others.
+            # A class without a name of its own is a base class.
             if (
                 own
                 and issubclass(entry, self.base)
@@ -194,7 +194,7 @@ def _loaded(point: EntryPoint) -> Any:
 
 
 def _module_of(file: Path) -> ModuleType:
-    """Import a file, once, under a name of its own, so that its objects can be pickled."""
+    """Import a file once, under a unique name, so that its objects can be pickled."""
     name = f"spacerobot_plugin_{file.stem}_{hashlib.sha256(str(file).encode()).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
@@ -215,7 +215,7 @@ def _module_of(file: Path) -> ModuleType:
 
 
 def _require_base(entry: Any, module: ModuleType) -> None:
-    """Refuse a class with a name and a work that is no law and no method, which nothing uses."""
+    """Reject a class that looks like a law or method but has no base class of this package."""
     if not (inspect.isclass(entry) and entry.__module__ == module.__name__):
         return
     works = any(callable(getattr(entry, each, None)) for each in ("compute", "results", "plan"))

@@ -169,7 +169,7 @@ class Scenario:
         return self._following_plant(node, self._configs[node])
 
     def _following_plant(self, node: str, config: Any) -> Any:
-        """Return a configuration with what nodes learn of each other instead of "automatic"."""
+        """Return a configuration with automatic values replaced by what nodes learn from others."""
         changes: dict[str, Any] = {}
         if node == "plant" and config.actuation == "auto":
             efforts = "coordinated_control" in self.commanders
@@ -199,7 +199,7 @@ class Scenario:
             raise ParameterError(f"Node '{node}': {error}") from error
 
     def _automatic_tolerance(self, config: Any) -> float:
-        """Return the position tolerance of the robot of a commander, m."""
+        """Return the automatic position tolerance for a commander's robot, m."""
         named = config if config.robot_description or config.robot else self.plant
         try:
             text, file = named.robot_description, Path()
@@ -207,7 +207,7 @@ class Scenario:
                 file = robot_file(named.robot)
             return automatic_tolerance(_described(text, file, 0.0 if text else _changed(file)))
         except (ParameterError, RobotDescriptionError):
-            return DEFAULT_POSITION_TOLERANCE  # The robot is refused where it is built.
+            return DEFAULT_POSITION_TOLERANCE  # The robot is rejected when it is built.
 
     def _parameters_as_written(self, node: str) -> dict[str, Any]:
         return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
@@ -322,7 +322,7 @@ class Scenario:
         return self._replace_fields(goal=goal, end_effector_goal=end_effector_goal)
 
     def _replace_fields(self, **changes: Any) -> Scenario:
-        """Return a changed copy of the scenario, which reuses the configurations already made."""
+        """Return a changed copy of the scenario, which reuses the existing configurations."""
         made = replace(self, **changes)
         made._configs.update(self._configs)
         return made
@@ -525,12 +525,12 @@ class Scenario:
 
 @lru_cache(maxsize=64)
 def _described(text: str, file: Path, changed: float) -> RobotDescription:
-    """Return the robot of a URDF text, or of a file that was ``changed`` at a time."""
+    """Return the robot in a URDF string, or in a file with the modification time ``changed``."""
     return parse_robot(text) if text else load_robot(file)
 
 
 def _changed(file: Path) -> float:
-    """Return the time at which a file was changed last; 0: it cannot be read."""
+    """Return the modification time of a file; 0: it cannot be read."""
     try:
         return file.stat().st_mtime
     except OSError:
@@ -563,7 +563,7 @@ def scenario_text(scenario: Scenario) -> str:
 
 
 def _end_effector_values(goal: Goal) -> dict[str, list[float] | list[list[float]]]:
-    """Return the numbers of the goals of end-effectors by link; those of a path are nested."""
+    """Return the end-effector goals as numbers by link; the numbers of a path are nested."""
     return {each.link: each.numbers for each in goal.end_effectors}
 
 
@@ -629,7 +629,7 @@ def load_scenario(name: str) -> Scenario:
 
 
 def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a scenario file; files beside it have their whole paths."""
+    """Return the parameters of a scenario file, with full paths for files next to it."""
     beside = {
         name: str((path.parent / file).resolve())
         for name in ("robot", "world", "target.robot", "srdf", "thrusters")
@@ -643,7 +643,7 @@ def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
 def _with_world(
     in_file: dict[str, dict[str, Any]], world: str, path: Path
 ) -> dict[str, dict[str, Any]]:
-    """Return the parameters of a scenario file with its obstacles for the plant and the planner."""
+    """Return a scenario file's parameters, with its obstacles for the plant and the planner."""
     try:
         file = (path.parent / world).resolve()
         load_world(file)
@@ -675,7 +675,7 @@ def scenario_or_robot(name: str) -> Scenario:
     if name in scenario_names() or not is_robot:
         return load_scenario(name)
     path = path if path.is_file() else robot_file(name)
-    load_robot(path)  # A file that is no robot is refused before its missing goal.
+    load_robot(path)  # A file that is not a robot is rejected before the missing goal.
     robot = {"robot": str(path.resolve()) if path == Path(name) else name}
     return _scenario_without_goal(path.name.split(".")[0], path, _nodes_of(robot))
 
@@ -822,7 +822,7 @@ def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]
 
 
 def _value_text(value: Any) -> str:
-    """Return a text that is the same for a list and a tuple, a number and the same integer."""
+    """Return a string that is equal for a list and a tuple, or a number and an equal integer."""
     match value:
         case bool():
             return "yes" if value else "no"

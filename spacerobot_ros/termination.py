@@ -78,7 +78,7 @@ class _Guard:
         self.on_request: Callable[[], None] | None = None
         self._since = 0.0
         self._errors: TextIO | None = None
-        # nohup has a process ignore the end of its terminal.
+        # nohup makes a process ignore the end of its terminal.
         ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
         numbers = [each for each in _MESSAGE_BY_SIGNAL if not (ignored and each == signal.SIGHUP)]
         self._parent = int(os.environ.pop(_PARENT_VARIABLE, "0"))
@@ -138,7 +138,7 @@ class _Guard:
 
 
 def _set_timer(seconds: float, handler: Any) -> None:
-    """Have a timer call a signal handler; ``SIG_DFL``: the kernel kills this process."""
+    """Make a timer call a signal handler; ``SIG_DFL``: the kernel kills this process."""
     signal.signal(signal.SIGALRM, handler)
     signal.setitimer(signal.ITIMER_REAL, seconds)
 
@@ -199,7 +199,7 @@ def graceful_shutdown(
 
 @contextmanager
 def _on_first_signal(on_request: Callable[[], None] | None) -> Iterator[_Guard | None]:
-    """Have the first signal in this context call a function; None: raise an exception."""
+    """Make the first signal in this context call a function; None: raise an exception."""
     guard = _guard
     if guard is None or threading.current_thread() is not threading.main_thread():
         yield None
@@ -246,7 +246,7 @@ def start_child(
 
 def end_with_parent() -> None:
     """End a :mod:`multiprocessing` process when its parent ends; call this in a thread."""
-    import multiprocessing  # It takes a while, and few processes are of it.
+    import multiprocessing  # This import takes a while, and few processes need it.
 
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -294,7 +294,7 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
     Parameters
     ----------
     words, options
-        As of ``subprocess.Popen``.
+        As for ``subprocess.Popen``.
 
     Raises
     ------

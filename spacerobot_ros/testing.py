@@ -71,7 +71,7 @@ class Stack:
         timeout: float = 60.0,
     ) -> None:
         scenario = scenario_or_robot(robot).with_overrides("plant", {"time_mode": "lockstep"})
-        # Before the plant tells its time mode, a commander would let it go on during a first plan.
+        # Until the plant reports its time mode, a commander would let time run during a first plan.
         for name in COMMANDERS:
             scenario = scenario.with_overrides(name, {"plan_in_background": False})
         for name, values in parameters.items():
@@ -149,7 +149,7 @@ class Stack:
             self.spin_until(
                 lambda: not topics_without_all_matches(map(MatchedEndpoints.of, everyone))
             )
-            # Messages that a callback publishes are delivered in their order: the goal comes first.
+            # Messages published by one callback are delivered in order: the goal comes first.
             clock = Clock(clock_type=ClockType.STEADY_TIME)
             timer = client.node.create_timer(1e-3, lambda: self._launch(client, goal), clock=clock)
             self.spin_until(lambda: client.goal_id is not None)

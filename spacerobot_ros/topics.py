@@ -131,7 +131,7 @@ _TWIST_STAMPED_TYPE = "geometry_msgs/msg/TwistStamped"
 _WRENCH_STAMPED_TYPE = "geometry_msgs/msg/WrenchStamped"
 
 # The plant publishes its state in this order: the clock first, so that a subscriber that sees a
-# state has seen its time; odom and joint_states late, because they set the commanders off.
+# state has seen its time; odom and joint_states late, because they trigger the commanders.
 _TOPIC_TABLE = (
     Topic("/clock", "rosgraph_msgs/msg/Clock", "simulated time"),
     Topic(

@@ -86,7 +86,7 @@ class QosProfile:
         RecordingError
             ``text`` is not such a list.
         """
-        # It imports all of rosbags, and few bags are replayed.
+        # This import loads all of rosbags, and few bags are replayed.
         from rosbags.rosbag2.metadata import parse_qos
 
         try:
@@ -140,7 +140,7 @@ _Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 METADATA_NAME = "rosbag2"
 """Name of the MCAP Metadata record that ``ros2 bag info`` and ``ros2 bag play`` read first."""
 
-# First version with QoS policies as words; without a version readers expect numbers.
+# First version with QoS policies as strings; without a version, readers expect numbers.
 _METADATA_VERSION = 9
 
 
@@ -232,9 +232,9 @@ def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
 
 
 class _Tail:
-    """What the library has written behind the part of a file that the operating system has.
+    """Data written by the library that has not been passed to the operating system yet.
 
-    The library must not meet a full disk: its indexes would no longer fit the file.
+    The library must not encounter a full disk: its indexes would no longer match the file.
     """
 
     def __init__(self) -> None:
@@ -254,8 +254,8 @@ class _Tail:
 class McapFile:
     """An MCAP file to which whole chunks are appended.
 
-    Every chunk, attachment and metadata record is passed to the operating system at once; a failed
-    write is undone. If the process dies, the file is complete except for the record being appended.
+    Chunks, attachments and metadata records are passed to the operating system immediately; failed
+    writes are undone. If the process dies, the file is complete except for the record being added.
     An open file is locked: the same path cannot be opened a second time. If the disk is full or
     fails, calls that add records raise RecordingError; the file is then unchanged and must be
     closed.
@@ -386,7 +386,7 @@ class McapFile:
             self._raw.close()
 
     def _commit_full_chunk(self) -> bool:
-        """Commit the chunk that the library may have completed; return whether it has."""
+        """Commit the current chunk if the library has completed it; return whether it has."""
         if not self._tail.data:
             return False
         self.bytes_waiting = 0
@@ -395,7 +395,7 @@ class McapFile:
         return True
 
     def _commit(self) -> None:
-        """Hand what the library has written to the operating system, all or nothing."""
+        """Pass the library's data to the operating system, completely or not at all."""
         data, self._tail.data = self._tail.data, bytearray()
         rest = memoryview(data)
         try:

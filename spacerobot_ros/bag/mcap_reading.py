@@ -1,8 +1,8 @@
 """Reads records, summaries and messages from untrusted MCAP files.
 
 The records are parsed by ``mcap``. Values are checked before use: records end within the file,
-chunks have the declared size, and the total inflated size of all chunks in a bag is limited. A
-violation raises a ``ValueError`` that states the byte offset; :class:`BagFile` converts it to a
+chunks have the declared size, and the total uncompressed size of all chunks in a bag is limited.
+A violation raises a ``ValueError`` that states the byte offset; :class:`BagFile` converts it to a
 user message.
 """
 
@@ -49,14 +49,14 @@ from spacerobot_ros.files import irregular_kind
 RecordT = TypeVar("RecordT", bound=McapRecord)
 
 INFLATED_SIZE_VARIABLE = "SPACEROBOT_BAG_LIMIT"
-"""Environment variable: number of MB to which even a small bag may inflate."""
+"""Environment variable: uncompressed size, in MB, that even a small bag may have."""
 
 _DEFAULT_LIMIT_MB = 32.0
-"""Default limit on the inflated size of a bag, MB."""
+"""Default limit on the uncompressed size of a bag, MB."""
 
 _MAX_INFLATION_RATIO = 200
-"""Largest ratio of inflated size to file size for a bag above the MB limit. Telemetry has ratios
-of 3 to 40, malicious bags 1000 and more."""
+"""Largest ratio of uncompressed size to file size for a bag above the MB limit. Telemetry has
+ratios of 3 to 40, malicious bags 1000 and more."""
 
 _UNPACKED_AT_ONCE = 1 << 20  # bytes
 
@@ -126,7 +126,7 @@ class RecordedChannel(NamedTuple):
     definition: bytes
     offered_qos: str
     message_count: int
-    """As the file says."""
+    """According to the file."""
 
 
 class BagFile:
@@ -190,7 +190,7 @@ class BagFile:
 
 
 def _unpack(file: BinaryIO, unpacked: BinaryIO) -> None:
-    """Write the content of a file that is compressed as a whole into another one."""
+    """Write the content of a file that is compressed as a whole to another file."""
     limit = ChunkUnpacker(file_size(file)).max_bytes
     file.seek(0)
     packed = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
@@ -319,7 +319,7 @@ def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
 
 
 class ChunkUnpacker:
-    """Unpacks the chunks of a file, up to a limit on the total inflated size."""
+    """Unpacks the chunks of a file, up to a limit on the total uncompressed size."""
 
     def __init__(self, compressed: int) -> None:
         limit_mb = _DEFAULT_LIMIT_MB
@@ -327,12 +327,12 @@ class ChunkUnpacker:
             given = float(os.environ.get(INFLATED_SIZE_VARIABLE, limit_mb))
             limit_mb = given if 0.0 < given < 1e12 else limit_mb
         self.max_bytes = max(round(1e6 * limit_mb), _MAX_INFLATION_RATIO * compressed)
-        """Largest inflated size of all chunks together, bytes."""
+        """Largest total uncompressed size of all chunks, bytes."""
         self._inflated_size = 0
 
     def count(self, size: int, place: int) -> None:
-        """Add the inflated size of the chunk at ``place`` to the total; raise ValueError if the
-        total is too large."""
+        """Add the uncompressed size of the chunk at ``place`` to the total; raise ValueError if
+        the total is too large."""
         if self._inflated_size + size > self.max_bytes:
             raise ValueError(
                 f"with the chunk at byte {place} it inflates to {self._inflated_size + size} "
@@ -431,7 +431,7 @@ _NOT_WANTED = -1
 
 
 class _Wanted:
-    """The messages of a file to read: topics, numbered by their places in a list, and times."""
+    """The messages to read from a file: topics, numbered by their list positions, and times."""
 
     def __init__(
         self,
@@ -470,7 +470,7 @@ def _blocks_of_records(opened: BinaryIO, wanted: _Wanted) -> Iterator[MessageBlo
 
 
 def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
-    """Return the wanted messages among the records of the chunk at ``place``, in their order."""
+    """Return the requested messages in the chunk at ``place``, in record order."""
     found = [a for a, _ in records_in_chunk(data, place) if data[a] == Opcode.MESSAGE]
     begins, size = np.array(found, np.int64), _MESSAGE_HEADS.itemsize
     within = begins[:, np.newaxis] + np.arange(size)
@@ -491,7 +491,7 @@ def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
 
 
 class _Section(NamedTuple):
-    """A part of a file: a chunk by its index, or all of a file that has no index of chunks."""
+    """A section of a file: a chunk with its index, or a whole file without a chunk index."""
 
     start_ns: int
     written: tuple[int, int]
@@ -541,11 +541,11 @@ def blocks_in_time_order(
 
 
 def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
-    """Group sections of files; those of a group overlap in time."""
+    """Group file sections so that the sections in a group overlap in time."""
     cluster: list[_Section] = []
     latest, farthest = 0, (0, 0)
     for section in sorted(sections, key=lambda each: each[:2]):
-        # Among messages of equal time, those of earlier chunks come first.
+        # Among messages with equal times, those in earlier chunks come first.
         if cluster and section[:2] >= (latest, farthest):
             yield cluster
             cluster = []
@@ -556,7 +556,7 @@ def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
 
 
 def _in_time_order(blocks: Iterable[MessageBlock]) -> MessageBlock:
-    """Merge blocks into one by log time; messages of one time keep their order."""
+    """Merge blocks into one by log time; messages with equal times keep their order."""
     nothing: MessageBlock = np.zeros(0, np.intp), np.zeros(0, np.uint64), []
     numbers, log_times, data = zip(nothing, *blocks, strict=True)
     times = np.concatenate(log_times)

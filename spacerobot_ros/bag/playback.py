@@ -149,7 +149,7 @@ def renamed_topics(remap: str, topics: Collection[str]) -> dict[str, str]:
 class Playback:
     """Messages in a bag, scheduled by log time.
 
-    The last message on each latched topic before the start time is due at once:
+    The last message on each latched topic before the start time is due immediately:
     subscribers to a latched topic always expect its last message.
 
     Parameters
@@ -305,7 +305,7 @@ class Playback:
         return self._bag_ns + math.floor((clock_ns - self._clock_ns) * self._rate)
 
     def _clock_span(self, bag_ns: int) -> int:
-        """Return how long the clock takes from the last change of time to a time in the bag."""
+        """Return the clock time from the last time change to a time in the bag, ns."""
         return math.ceil((bag_ns - self._bag_ns) / self._rate)
 
     def _set_time(self, bag_ns: int, clock_ns: int) -> None:
@@ -317,7 +317,7 @@ class Playback:
         self._next_message = next(messages, None)
 
     def _begin(self) -> None:
-        """Let all messages from the start on come, after those that were latched before it."""
+        """Schedule all messages from the start time on, after earlier latched messages."""
         found = self._messages(self._names, self._start_ns, self._end_ns)
         first = list(islice(found, 1))
         start = self._start_ns
@@ -336,7 +336,7 @@ class Playback:
         return message
 
     def _last_messages(self, time_ns: int, since_ns: int, until_ns: int) -> list[ReplayMessage]:
-        """Return the last message of each topic, by age, as due at a time."""
+        """Return the last message of each topic, oldest first, to be published at a given time."""
         latched = [topic.name for topic in self.topics if topic.latched]
         last: dict[str, ReplayMessage] = {}
         spans = (latched, 0, time_ns - 1), (self._names, since_ns, until_ns)

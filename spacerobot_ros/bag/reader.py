@@ -106,7 +106,7 @@ def _files_of_folder(folder: Path) -> list[Path]:
     listed = [folder / name for name in _listed_files(folder)]
     if listed and all(file.is_file() for file in listed):
         return _salvaged(listed)
-    # Files of other formats are refused one by one, with what to do.
+    # Files in other formats are rejected individually, with a remedy.
     found = (sorted(folder.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
     files = next(filter(None, found), [])
     if not files:
@@ -119,14 +119,14 @@ def _files_of_folder(folder: Path) -> list[Path]:
 
 
 def _listed_files(folder: Path) -> list[str]:
-    """Return the names of the files of the bag in a folder, as rosbag2's metadata list them."""
+    """Return the names of a bag's files in a folder, as listed in rosbag2's metadata."""
     file = folder / "metadata.yaml"
     if not file.is_file():
         return []
     try:
         text = file.read_text("utf-8")
         listed = load_yaml(text)["rosbag2_bagfile_information"]["relative_file_paths"]
-        # Old versions of rosbag2 list them with the folder, others may be anywhere.
+        # Old versions of rosbag2 include the folder; other paths may lead anywhere.
         return list(dict.fromkeys(PurePath(name).name for name in listed))
     except (OSError, ValueError, TypeError, KeyError):
         return []
@@ -174,7 +174,7 @@ class Bag(Mapping[str, TopicSeries]):
     def __bool__(self) -> bool:
         return True
 
-    # Two bags are not compared message by message.
+    # Bags are not compared message by message.
     __eq__, __hash__ = object.__eq__, object.__hash__
 
     def __contains__(self, topic: object) -> bool:
@@ -234,7 +234,7 @@ class Bag(Mapping[str, TopicSeries]):
         return {each.name: each.data for each in self._records(Attachment)}
 
     def _records(self, kind: type[RecordT]) -> Iterator[RecordT]:
-        """Read the records of a kind that the summaries name, each once."""
+        """Read the records of one kind that the summaries list, each once."""
         for file in self._files:
             indexes: Sequence[AttachmentIndex | MetadataIndex] = file.summary.attachment_indexes
             if kind is Metadata:
@@ -367,7 +367,7 @@ class Bag(Mapping[str, TopicSeries]):
         """
         found: dict[str, TopicTable] = {}
         refused: dict[str, RecordingError] = {}
-        # One pass unpacks each chunk once; of a damaged bag some topics may be whole.
+        # One pass unpacks each chunk once; in a damaged bag, some topics may be intact.
         with suppress(RecordingError):
             self.load(self)
         for topic in self:
@@ -537,7 +537,7 @@ class RecordedRobot:
         Raises
         ------
         RecordingError
-            It has no message, is of another type, or is damaged.
+            It has no messages, has a different type, or is damaged.
         """
         series = self.get(name)
         if series is None:

@@ -221,7 +221,7 @@ class Recording:
             raise
 
     def _choose_time_base(self, state: RecordingState) -> None:
-        """Choose the time base of the bag, unless it is chosen, and write the early messages."""
+        """Choose the bag's time base unless already chosen, and write the early messages."""
         if self._time_base is not None or self.failure is not None:
             return
         self._time_base = state

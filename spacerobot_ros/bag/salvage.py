@@ -153,7 +153,7 @@ class _Copy:
         """Add the readable content of a file, up to the first truncated record."""
         size, whole = file_size(old), MAGIC_SIZE
         chunks = ChunkUnpacker(size)
-        # A ValueError ends the iteration: none comes from what is done with a record.
+        # A ValueError from the iteration ends it; processing a record raises none.
         with suppress(ValueError):
             for place, opcode, record in records(old, MAGIC_SIZE):
                 whole = place + len(record)
@@ -317,13 +317,13 @@ def _last_target(robot: RecordedRobot, time_ns: int) -> Array | None:
 
 
 def _last_payload(robot: RecordedRobot, time_ns: int) -> str:
-    """Return the text of the body that the robot held in a state; empty if none."""
+    """Return the string for the body that the robot held in a state; empty if none."""
     series, payload = robot.get("plant/status"), ""
     for _, message in () if series is None else series.messages():
         values = {pair.key: pair.value for pair in message.values}
         with suppress(KeyError, ValueError):
-            # A capture changes the states after that in which it took place. A plant that was
-            # started meanwhile knows of nothing.
+            # A capture changes the states after the one in which it took place. A plant
+            # restarted in the meantime has no record of it.
             since = round(float(values["time_s"]) * SECOND)
             if values["state"] not in _WITHOUT_STATES and since < time_ns:
                 payload = values.get("payload", "")

@@ -31,7 +31,7 @@ _DECODING_ERRORS = (SerdeError, ValueError, IndexError, OverflowError, TypeError
 
 
 class TopicSeries:
-    """The messages on one topic in log time order; ``bag[topic]`` makes it.
+    """The messages on one topic in log time order; ``bag[topic]`` returns it.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class TopicSeries:
         self.topic = topic
         self.type_name = type_name
         self.time_ns = time_ns
-        # A change in place would change the array for every reader.
+        # An in-place change would affect every reader of the array.
         self.time_ns.flags.writeable = False
         self.data = data
         self._kind, self._fields = kind, kind.fields
@@ -194,7 +194,7 @@ class TopicSeries:
         return made
 
     def _values_by_joint(self, path: str) -> Any:
-        """Return an array of joint states whose names change, or their names, by joint."""
+        """Return a joint state array, or the names, if the joint names vary between messages."""
         if path == "name":
             return [list(self.joint_names) for _ in self.data]
         places = {name: k for k, name in enumerate(self.joint_names)}
@@ -278,7 +278,7 @@ class TopicSeries:
 
     def _resolve_path(self, path: str) -> tuple[np.dtype[Any] | None, bool, bool, str | None]:
         """Resolve a field's path: type of its numbers if any, whether it is an array, whether it is
-        inside of a list, type of its messages if any.
+        inside a list, type of its messages if any.
         """
         type_name: str | None = self.type_name
         dtype, is_array, in_list = None, False, False
@@ -300,7 +300,7 @@ class TopicSeries:
 
 
 def _field_matrix(values: Any, width: int) -> NDArray[np.float64]:
-    """Return a field's values (N, width); nan for messages with another number of values."""
+    """Return a field's values (N, width); nan for messages with a different number of values."""
     if isinstance(values, np.ndarray) and values.size == len(values) * width:
         return np.asarray(values, dtype=float).reshape(len(values), width)
     rows = [np.asarray(value, dtype=float).reshape(-1) for value in values]

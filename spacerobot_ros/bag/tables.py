@@ -204,7 +204,7 @@ def array_field(
     names
         Joint or thruster names in joint states.
     prismatic
-        As of :func:`table_of`.
+        As for :func:`table_of`.
     """
     width = values.shape[1]
     if names and width == len(names):
@@ -257,7 +257,7 @@ def _euler_angles(quaternions: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 
 
 def _key_value_fields(path: str, values: list[Any]) -> list[Field]:
-    """Return a column of texts for each key of lists of keys and values."""
+    """Return a string column for each key in lists of key-value pairs."""
     rows = [key_values(pairs) for pairs in values]
     keys = dict.fromkeys(key for row in rows for key in row)
     return [Field(f"{path}[{k}]", _object_array([r.get(k, "") for r in rows]), ("",)) for k in keys]
@@ -281,7 +281,7 @@ def _object_array(values: list[str]) -> NDArray[Any]:
 
 def _json_value(value: Any) -> Any:
     if is_dataclass(value):
-        # Constants are in capitals, and fields never are.
+        # Constants have upper-case names; fields never do.
         names = (each.name for each in fields(value) if not each.name.isupper())
         return {name: _json_value(getattr(value, name)) for name in names if name[0] != "_"}
     if isinstance(value, np.ndarray):
@@ -413,7 +413,7 @@ def _require_suffix(target: Path, format: ExportFormat) -> None:
 
 
 def _tables_by_file_name(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
-    """Return the tables that have rows, by names that are safe for files, each once."""
+    """Return the tables that have rows, by unique and safe file names."""
     found: dict[str, TopicTable] = {}
     for table in tables:
         if len(table):
@@ -425,7 +425,7 @@ def _tables_by_file_name(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
 
 
 def _unused_name(name: str, taken: Mapping[str, Any]) -> str:
-    """Return a file name that is unique even where case is ignored."""
+    """Return a file name that is unique even if case is ignored."""
     others = {each.lower() for each in taken}
     names = (name, *(f"{name}_{number}" for number in range(2, len(others) + 3)))
     return next(each for each in names if each.lower() not in others)
@@ -455,7 +455,7 @@ def _write_csv(tables: dict[str, TopicTable], folder: Path) -> None:
 
 def _write_rows(file: Path, rows: Iterable[Iterable[Any]]) -> None:
     with file.open("w", encoding="utf-8", newline="") as stream:
-        # All texts are in quotes, as some have commas and line breaks. Numbers keep every digit.
+        # All strings are quoted, as some contain commas or line breaks. Numbers keep all digits.
         csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n").writerows(rows)
 
 

@@ -45,7 +45,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     path
         Path of the bag, usually ``*.mcap``; parent folders are created.
     compression
-        Of the chunks: ``zstd``, ``lz4`` or ``none``.
+        Chunk compression: ``zstd``, ``lz4`` or ``none``.
     chunk_size
         Uncompressed chunk size, bytes.
     overwrite
@@ -98,8 +98,8 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._closed = False
         self._file = self._open_first_file()
         try:
-            # rosbag2 writes this record at both ends. The first tells the readers of a cut file
-            # that its QoS policies are words.
+            # rosbag2 writes this record at both ends. The first one informs readers of a
+            # truncated file that its QoS policies are strings.
             self._file.add_rosbag2_metadata([])
         except RecordingError:
             self._file.close()
@@ -271,7 +271,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self.close()
 
     def _register(self, name: str, type_name: str, qos: QosProfile) -> int:
-        """Put a topic into the present file; it gets the same channel in every file."""
+        """Add a topic to the current file; it gets the same channel in every file."""
         hash_string = type_hash(type_name)
         if type_name not in self._schema_ids:
             text = message_definition(type_name).encode()
@@ -332,7 +332,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         )
 
     def _begin_next_file(self) -> None:
-        """Complete the present file and begin the next one, with the same schemas and channels."""
+        """Complete the current file and start the next one, with the same schemas and channels."""
         self._file.finish(self._recorded_topics())
         self._earlier_counts += self._file.message_counts
         self._file = self._open_next_file()
@@ -350,7 +350,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             try:
                 return self._open_numbered_file()
             except BagExistsError:
-                # A file of another bag has this number: in flight, the next number is taken.
+                # A file of another bag has this number: in flight, the next number is used.
                 if self._overwrite:
                     raise
 
@@ -363,7 +363,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     @contextmanager
     def _adding(self) -> Iterator[None]:
-        """Refuse to add anything after a failure, and remember one."""
+        """Reject additions after a failure, and remember the failure."""
         if self._refusal is not None:
             raise RecordingError(self._refusal)
         try:

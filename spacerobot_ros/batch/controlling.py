@@ -47,7 +47,7 @@ class BatchController:
         self._period_ns = round(program.config.control_period * SECOND)
         for gains in program.gains:
             if self.law.has_automatic_gains(gains):
-                # From then on its function computes them, for all flights.
+                # From then on, the law's function computes them for all flights.
                 self.law.set_gains(gains)
                 break
         selection = self.law.outputs.selection

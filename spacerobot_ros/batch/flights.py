@@ -93,7 +93,7 @@ class InitialStates:
         return len(self.position)
 
     def __getitem__(self, rows: Counts) -> InitialStates:
-        """Return some rows, in any order and number."""
+        """Return the selected rows, in any order and number."""
         return InitialStates(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     def initial_state(self, index: int) -> InitialState:
@@ -143,7 +143,7 @@ class SensorErrors:
         return len(self.seeds)
 
     def __getitem__(self, rows: Counts) -> SensorErrors:
-        """Return some rows, in any order and number."""
+        """Return the selected rows, in any order and number."""
         return SensorErrors(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     def config(self, index: int) -> SensorConfig:
@@ -186,14 +186,14 @@ R = TypeVar("R", InitialStates, SensorErrors, InertialParameters)
 
 
 def joined_rows(each: Sequence[R]) -> R:
-    """Return one object with the rows of several objects."""
+    """Return one object with the concatenated rows of several."""
     names = [part.name for part in fields(each[0])]
     parts = (np.concatenate([getattr(one, name) for one in each]) for name in names)
     return type(each[0])(*parts)
 
 
 def assign_rows(to: R, rows: Counts, values: R) -> None:
-    """Replace some rows, in place."""
+    """Replace the selected rows in place."""
     for part in fields(to):
         getattr(to, part.name)[rows] = getattr(values, part.name)
 

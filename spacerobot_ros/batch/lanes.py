@@ -85,7 +85,7 @@ def fly_lanes(
 
 
 def symbolic_model_of(flights: Flights) -> tuple[ModelFunctions, Array]:
-    """Return the robot model and its arguments ``p`` (N, ...), which are the masses in the
+    """Return the robot model and its arguments ``p`` (N, ...), which are the masses of the
     flights."""
     inertial = flights.inertial
     if inertial is None:
@@ -156,14 +156,14 @@ class LaneBlock:
             (self._groups, len(flights.report_ticks), tick.report_width, self._lanes)
         )
         self._normals: Any = None
-        """Random numbers of the sensors at the instants, in the order of :class:`.Sensors`."""
+        """Sensor random numbers at the instants, in the order of :class:`.Sensors`."""
         if flights.sensors is not None:
             width = 12 + 2 * flights.robot.n
             self._normals = self._target.zeros((*self._reports.shape[:2], width, self._lanes))
         self._job, self._referenced = self._prepare_job()
 
     def _write_rows(self, name: str, values: Any, lanes: Counts | None = None) -> None:
-        """Write rows of a name, (lanes, size) or a number, of all flights or of some lanes."""
+        """Write the rows with a name, (lanes, size) or a number, for all flights or some lanes."""
         arrays = self._target.arrays
         if lanes is None and len(self._flown) == self._groups * self._lanes:
             part, each = self._memory[:, self._rows[name]], arrays.asarray(values)
@@ -183,7 +183,7 @@ class LaneBlock:
         return part.reshape(len(self._rows_of_lanes), -1)[: len(self._flown)]
 
     def _write_starts(self, p: Array, lanes: Counts | None = None) -> None:
-        """Write masses ``p`` and initial states of all flights, or of those in some lanes."""
+        """Write masses ``p`` and initial states of all flights, or only of those in some lanes."""
         at = self._flown if lanes is None else self._flown[lanes]
         starts = self._flights.initial_states[at]
         self._write_rows("p", p, lanes)
@@ -269,7 +269,7 @@ class LaneBlock:
     def fly(self, stopped: Callable[[], bool]) -> None:
         """Fly the flights and write the results, unless stopped."""
         flights, job, library = self._flights, self._job, self._tick.library
-        # A tick of no duration under no command reports the start.
+        # A zero-duration tick without a command reports the start.
         library.start_flights(job)
         self._memory[:, self._rows["h"]] = flights.control_period
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
@@ -344,7 +344,7 @@ class LaneBlock:
             self._result.fallback_ticks[row] += 1
 
     def _reported(self, reports: Any) -> Array:
-        """Return what is reported at instants (groups, instants, width, lanes) as (flights,
+        """Return the values reported at instants (groups, instants, width, lanes) as (flights,
         instants, width)."""
         each = np.moveaxis(self._target.to_numpy(reports), 3, 1)
         return each.reshape(-1, *reports.shape[1:3])[: len(self._flown)]

@@ -1,6 +1,6 @@
 """The tick of a plant and its commander, compiled for SIMD lanes, one flight per lane.
 
-CasADi functions become C++ in which a vector register takes the place of every number;
+CasADi functions become C++ in which every number is replaced by a vector register;
 ``driver.hpp`` loops over ticks and groups of lanes. Everything shared by Python and C++ is declared
 once, here, and generated as C++: the rows of a group's memory (:class:`RowLayout`), the
 enumerations, and :class:`Job`.
@@ -110,11 +110,11 @@ class CompiledTick:
     library: Any
     """The functions of ``driver.hpp``, which take a :class:`Job`."""
     target: Target
-    """What they run on."""
+    """Target on which they run."""
     memory_layout: RowLayout
-    """Memory of a group."""
+    """Memory layout of a group."""
     report_width: int
-    """Numbers of a report."""
+    """Number of values in a report."""
     controller: BatchController | None = None
     """Source of the commands; None: tables."""
 
@@ -137,7 +137,7 @@ class CompiledTick:
         key = (*key, link, target, compilation_settings())
         program = flights.program
         if isinstance(program, ControlledGoals):
-            # The function has all parameters as constants, except the gains of each flight.
+            # All parameters are compiled in as constants, except the gains of each flight.
             values = values_of(program.config).items()
             parameters = [each for each in values if not each[0].startswith("gains.")]
             believed = program.robot or flights.robot

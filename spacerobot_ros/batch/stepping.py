@@ -175,7 +175,7 @@ class SteppedFlights:
                 f"{counted(len(starts), 'start state')}"
                 + ("." if inertial is None else f" and {len(inertial.masses)} rows of masses.")
             )
-        # Checked as rows of their own: a refusal changes no flight.
+        # Checked as separate rows, so that a rejection changes no flight.
         self.require_startable(starts, inertial)
         assign_rows(self._flights.initial_states, chosen, starts)
         if inertial is not None:
@@ -209,7 +209,7 @@ class SteppedFlights:
         """
         flights = replace(self._flights, initial_states=starts, inertial=inertial)
         for row in np.flatnonzero(~starts_accepted_by_plant(flights)).tolist():
-            plant_of(flights, row)  # It says why.
+            plant_of(flights, row)  # Raises an error with the reason.
 
     def end(self, rows: npt.ArrayLike) -> None:
         """End some flights; they are not stepped until they are reset."""
@@ -291,7 +291,7 @@ class _SteppedLanes(LaneBlock):
         self._memory[:, self._rows["h"]] = flights.control_period
 
     def start(self, rows: Counts) -> Array:
-        """Begin flights at the start states in their rows, and return their reports (rows,
+        """Begin flights at the initial states in their rows, and return their reports (rows,
         width)."""
         flights = self._flights
         assert flights.inertial is not None
@@ -299,7 +299,7 @@ class _SteppedLanes(LaneBlock):
         if model is not self._model:
             whole, all_p = symbolic_model_of(flights)
             if whole is not self._model:
-                # The first masses with entries that are usually zero need another model.
+                # The first masses with usually zero entries that are nonzero need another model.
                 names = ("state", "before", "momenta", "r_cm")
                 kept = {each: self._read_rows(each) for each in names if each in self._rows.slices}
                 self._lay_out(flights, self._target, self._result)
@@ -325,7 +325,7 @@ class _SteppedLanes(LaneBlock):
         self._write_rows("command", 0.0, rows)
         if self._flights.actuation == "velocity":
             self._write_rows("before", 0.0, rows)
-        # A tick of no duration reports the start; groups that have none are left alone.
+        # A zero-duration tick reports the start; it leaves groups without starts unchanged.
         self._write_rows("h", 0.0, rows)
         self._instants[0] = 0
         self._tick.library.start_flights(self._job)

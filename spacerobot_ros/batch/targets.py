@@ -51,11 +51,11 @@ class Target:
     """A target on which flights run, with code from this machine's C++ compiler."""
 
     name: str
-    """For people."""
+    """Name for display."""
     lanes: int
-    """Numbers in a register."""
+    """Number of values in a register."""
     flags: tuple[str, ...] = ()
-    """Options of the compiler."""
+    """Compiler options."""
     libmvec: str = ""
     """Letter that stands for these registers in function names of the vector math library of the C
     library; empty: none."""
@@ -118,7 +118,7 @@ class Target:
         NoLibraryError
             The functions cannot be compiled on this machine.
         """
-        # Vectors as arguments between functions of this file: no other is called with them.
+        # Vector arguments are passed only between functions of this file.
         flags = ("-O2", "-std=c++17", "-fno-math-errno", "-Wno-psabi", *_SCHEDULING, *self.flags)
         name = f"lanes_{next(iter(functions.values())).name()}"
         library = None
@@ -240,7 +240,7 @@ class CudaDevice(Target):
 
     @property
     def arrays(self) -> Any:
-        """CuPy, which from now on makes arrays on this device."""
+        """CuPy, which from now on creates arrays on this device."""
         cupy = optional_module("cupy", "cuda", "Flights on a GPU require")
         cupy.cuda.Device(self.number).use()
         return cupy
@@ -285,7 +285,7 @@ class CudaDevice(Target):
 
 
 class _Kernels:
-    """The driver's functions as kernels, a thread for each flight."""
+    """The driver's functions as kernels, one thread per flight."""
 
     def __init__(self, device: CudaDevice, kernels: Mapping[str, Any]) -> None:
         self._device, self._kernels = device, kernels
@@ -313,8 +313,8 @@ def is_device_name(name: str) -> bool:
 
 def device_named(name: str) -> Target:
     """Return a device by name: ``cuda``, ``cuda:1`` (the second one), or ``cuda:single`` and
-    ``cuda:1:single``, which compute with 32-bit numbers. ``host`` and ``host:single`` are the
-    program of a device on this processor, for tests.
+    ``cuda:1:single``, which compute with 32-bit numbers. ``host`` and ``host:single`` run the
+    device program on this processor, for tests.
 
     Raises
     ------
@@ -333,7 +333,7 @@ def device_named(name: str) -> Target:
 
 
 def _vector_source(functions: Sequence[ca.Function]) -> str:
-    """Return C++ of functions in which every number has the type ``V``."""
+    """Return C++ code of functions in which every number has the type ``V``."""
     options = {"with_header": False, "cpp": True, "casadi_real": "V"}
     generator = ca.CodeGenerator(functions[0].name(), options)
     for function in functions:

@@ -74,7 +74,7 @@ class Dataset:
         self._schema: Any = None
         self._part = 0
         self._descriptor = -1
-        """Folder descriptor, locked while this process writes to the folder."""
+        """File descriptor of the folder, locked while this process writes to the folder."""
 
     # -- description --------------------------------------------------------------------------
 
@@ -118,7 +118,7 @@ class Dataset:
             raise
 
     def _require_same_campaign(self, campaign: Campaign) -> None:
-        """Refuse another campaign than the one in the folder; the message names the differences."""
+        """Reject a campaign other than the one in the folder; the message names the differences."""
         facts = self._read_identity()
         if facts["fingerprint"] == _fingerprint_of(campaign):
             return
@@ -171,7 +171,7 @@ class Dataset:
         self._write_file(_ABOUT_FILE, json.dumps(facts, indent=1))
 
     def _write_file(self, name: str, text: str) -> None:
-        """Replace a file as a whole or not at all: a full disk does not damage it."""
+        """Replace a file completely or not at all: a full disk does not damage it."""
         path, new = self.folder / name, self.folder / f".{name}"
         new.write_text(text, encoding="utf-8")
         os.replace(new, path)
@@ -311,7 +311,7 @@ class Dataset:
 
 
 def _read_row_file(part: Path, columns: Collection[str] | None = None) -> Any:
-    """Return a file of rows as a pyarrow table of ``columns`` it has; ParameterError if damaged."""
+    """Return a row file as a pyarrow table of existing ``columns``; ParameterError if damaged."""
     arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
     try:
         with parquet.ParquetFile(part) as file:
@@ -368,14 +368,14 @@ def _columns_of_rows(rows: Sequence[Row], names: Sequence[str]) -> dict[str, lis
 
 
 def _fingerprint_of(campaign: Campaign) -> str:
-    """Return a hash, equal for campaigns whose draws of one number are the same flight."""
+    """Return a hash that is equal if draws with equal numbers are the same flight."""
     text = json.dumps(_settings_of_draws(campaign), sort_keys=True, default=str)
     flown = scenario_text(self_contained(campaign).scenario)
     return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()
 
 
 def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
-    """Return the settings that determine the rows of a campaign, beside the scenario."""
+    """Return the settings, other than the scenario, that determine the rows of a campaign."""
     own = {"flights", "engine", "description", "scenario", "set", "method"}
     section = {key: value for key, value in campaign.section.items() if key not in own}
     section |= {

@@ -43,7 +43,7 @@ class Distribution:
         """Return the values (N,) for flights with the given numbers and cumulative probabilities
         (N,)."""
         if self.name == _TABLE:
-            # Draws are made in blocks, whose last one reaches beyond the table.
+            # Draws are made in blocks; the last block extends beyond the table.
             return [self.choices[flight % len(self.choices)] for flight in flights]
         return self.quantiles(shares)
 

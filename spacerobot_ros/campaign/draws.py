@@ -193,7 +193,7 @@ def drawn_flights(
 
 
 def _with_values(campaign: Campaign, draw: Draw, flight: DrawnFlight) -> DrawnFlight:
-    """Return a flight that has the masses of a draw with its other values, too."""
+    """Return a flight that already has a draw's masses, with the draw's other values applied."""
     for dispersion in campaign.dispersions:
         value, target = draw.values[dispersion.name], dispersion.target
         if not target.is_text and not math.isfinite(value):

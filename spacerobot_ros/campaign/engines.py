@@ -16,13 +16,13 @@ from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Fallback, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 _FLIGHTS_WORTH_A_DEVICE = 100_000
-"""Flights under coordinated control from which a device saves more time than its program takes to
-compile; other campaigns take most time for plans."""
+"""Minimum number of flights under coordinated control for which a device saves more time than its
+program takes to compile; other campaigns spend most of their time planning."""
 
 
 def select_engine(campaign: Campaign, engine_name: str, *, local: bool = True) -> Engine:
     """Return the engine ``engine_name``; ``auto`` selects the first engine that can fly the
-    campaign, if the flights are ``local`` also a device.
+    campaign, including devices if the flights are ``local``.
 
     Raises
     ------

@@ -61,7 +61,7 @@ _MAX_BATCH_TICKS = 4_000_000
 """Largest number of ticks in one batch; all its schedules are in memory."""
 
 _DEVICE_FLIGHTS = 4096
-"""Flights of a batch on a device: about as many as are prepared in the following time."""
+"""Flights per batch on a device: about as many as are prepared in the following time."""
 
 _MAX_BATCH_PREPARATION_TIME = 4.0
 """Wall time, s, after which a batch is flown with the draws that are ready; this limits the loss if
@@ -117,7 +117,7 @@ class _Plan:
 
 @dataclass(frozen=True)
 class _PreparedDraw:
-    """A draw that is ready for lanes: with its plan, if it follows one, and wall time for it, s."""
+    """A draw that is ready for lanes, with its plan, if any, and the planning wall time, s."""
 
     draw: Draw
     flight: DrawnFlight
@@ -230,7 +230,7 @@ class LanesEngine:
             result = fly_lanes(flights, self._target, look)
             if interrupted:
                 return
-        # The error is of one draw, so each draw is flown by itself.
+        # The error concerns one draw, so each draw is flown separately.
         except SpaceRobotError as error:
             yield from (Fallback(each.draw, str(error)) for each in batch)
             return
@@ -287,7 +287,7 @@ class _ScheduledLanes:
         return _PreparedDraw(draw, flight, plan, time.perf_counter() - began)
 
     def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
-        """Return the plan for the first state; the last one if the same values determine it."""
+        """Return the plan for the first state; the last plan is reused if its values are equal."""
         values = self._planned_values
         if values is None or values.scenario is not flight.scenario:
             values = self._planned_values = _PlannedValues.of(flight.scenario)
@@ -535,7 +535,7 @@ def _batch_of_flights(
     instants: tuple[int, ...] = (),
 ) -> Flights:
     robot, nominal = plant_robot(drawn[0]), InertialParameters.of(drawn[0].nominal)
-    # Draws that leave the scenario share it.
+    # Draws that do not change the scenario share it.
     scenarios = {id(each.scenario): each.scenario for each in drawn}
     places = {key: place for place, key in enumerate(scenarios)}
     rows = np.array([places[id(each.scenario)] for each in drawn])
@@ -605,7 +605,7 @@ class _PlannedValues:
     """The values of a scenario that determine a plan for the first state.
 
     ``are_noisy``: the first measured state may differ from draw to draw. ``others`` are all values
-    that determine a plan without noise, beside the masses of the plant's robot.
+    that determine a plan without noise, except the masses of the plant's robot.
     """
 
     scenario: Scenario
@@ -632,7 +632,7 @@ class _PlannedValues:
 
 
 def _first_plan(flight: DrawnFlight) -> _Plan | None:
-    """Let the executive plan for the first state; None if it makes no whole schedule."""
+    """Let the executive plan for the first state; None if there is no complete schedule."""
     period = flight.scenario.plant.control_period
     first = fly_scenario(flight.seeded_scenario, robots=robots_of(flight), longest=period)
     if len(first.schedules) != 1 or first.gait is None:
@@ -645,10 +645,10 @@ def _first_plan(flight: DrawnFlight) -> _Plan | None:
 
 @lru_cache(maxsize=64)
 def _evaluated_ticks(ticks: int) -> Array:
-    """Return the ticks at which a flight along a schedule of so many ticks is evaluated.
+    """Return the ticks at which a flight along a schedule with this many ticks is evaluated.
 
-    They depend on nothing else, so that a flight has the same measures in any batch; those of
-    different flights coincide where possible.
+    The ticks depend on nothing else, so that a flight has the same measures in any batch; the
+    ticks of different flights coincide if possible.
     """
     spacing = 1 << max(0, math.ceil(math.log2(ticks / _STATES_PER_FLIGHT)))
     return np.append(np.arange(0, ticks, spacing), ticks)
@@ -667,7 +667,7 @@ def _goals_by_frame(scenario: Scenario) -> dict[str, Goal | None]:
 
 
 def _goal_poses(goals: Sequence[Goal | None]) -> Array | None:
-    """Return goals as a controller receives them, (N, 7); None without any."""
+    """Return goals as received by a controller, (N, 7); None if there are none."""
     checked = [Goal.checked(each.position, each.quaternion) for each in goals if each is not None]
     if not checked:
         return None

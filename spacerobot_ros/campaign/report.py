@@ -209,7 +209,7 @@ def _outcomes_section(results: Results) -> str:
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):
         line = f"{counted(count, 'flight')} "
-        if reason.endswith("."):  # The reason is the sentence of an error.
+        if reason.endswith("."):  # The reason is an error message.
             line += f"used engine 'flights': {reason}"
         else:
             line += f"{reason} and used engine 'flights'"
@@ -351,7 +351,7 @@ def _worst_flights_section(results: Results) -> str:
 
 
 def _convergence_section(results: Results) -> list[str]:
-    """Return a heading with a figure; nothing of so few flights that it would have one point."""
+    """Return a heading and a figure; nothing if the figure would have only one point."""
     count = len(results)
     at = np.unique(np.geomspace(min(10, count), count, 60).astype(int))
     if len(at) < 2:
@@ -423,7 +423,7 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
         ours, theirs = getattr(first, key), getattr(second, key)
         if ours != theirs:
             raise ParameterError(f"{sentence}'{key}' is {ours} and {theirs}.")
-    # The order counts, because numbers are assigned to dispersions in order.
+    # The order matters, because numbers are assigned to dispersions in order.
     for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
         a, b = (
             "nothing" if each is None else f"{each.name}: {each}" for each in (ours_is, theirs_is)
@@ -456,7 +456,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             f"'{first.campaign.name}' and '{second.campaign.name}' have no flown draws in common: "
             "fly more flights of one of them."
         )
-    # Metrics required by one campaign only are compared too, if both have them.
+    # Metrics required by only one campaign are also compared if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
     names = [name for name in names if name in first.columns and name in second.columns]
     # A flight whose goal was refused has not moved: its numbers are those of the start.

@@ -85,7 +85,7 @@ class Columns(Mapping[str, Any]):
             if name not in table.column_names:
                 continue
             column = table[name]
-            # Converted data is freed at once: a million rows of a column are eight megabytes.
+            # Converted data is freed immediately: a million rows of a column take 8 MB.
             table = table.drop_columns([name])
             if name in _TEXT_COLUMNS or column.type == text:
                 self._known[name] = self._texts(column.cast(text))
@@ -94,14 +94,14 @@ class Columns(Mapping[str, Any]):
                 self._known[name] = column.cast("double", safe=False).to_numpy()
 
     def _texts(self, column: Any) -> list[str | None]:
-        """Return a column of texts; equal ones are one object."""
+        """Return a string column; equal strings share one object."""
         known: dict[str | None, str | None] = {}
         return [known.setdefault(x, x) for chunk in column.chunks for x in chunk.to_pylist()]
 
     def __getitem__(self, name: str) -> Any:
         if name not in self._known:
             self.read([name])
-        # Reasons of a million flights are 300 megabytes, which are not kept.
+        # The reasons of a million flights take 300 MB, and are not kept.
         values = self._known.pop(name) if name == _REASON else self._known[name]
         if values is None:
             raise KeyError(name)

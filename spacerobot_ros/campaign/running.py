@@ -116,7 +116,7 @@ def run_campaign(
     with ExitStack() as opened:
         workers = None
         if cluster.scheduler and len(dataset.flown_numbers()) < len(draws):
-            # Before the folder is made, so that a scheduler that is not there leaves nothing.
+            # Before the folder is created, so that a missing scheduler leaves no folder behind.
             workers = opened.enter_context(open_workers(cluster, len(draws)))
         done = dataset.begin(campaign)
         numbers = [number for number in range(len(draws)) if number not in done]
@@ -153,7 +153,7 @@ def _fly_rows(
     if not numbers:
         return
     if workers is None:
-        selected = (draws[number] for number in numbers)  # Each draw is made when it is flown.
+        selected = (draws[number] for number in numbers)  # Each draw is created when it is flown.
         for row in fly_all(engine_by_name(engine), campaign, selected, stopped):
             yield [row]
         return

@@ -135,7 +135,7 @@ class DrawnFlight:
     def of(cls, scenario: Scenario) -> DrawnFlight:
         """Return the flight without dispersions."""
         for node in ("plant", *scenario.commanders):
-            scenario.config(node)  # Known to all flights that are made of this one.
+            scenario.config(node)  # Cached for all flights derived from this one.
         robot = description_of(scenario)
         count = len(robot.bodies)
         return cls(
@@ -192,7 +192,7 @@ class DrawnFlight:
         for row, (seed, has_other) in enumerate(zip(seeds, has_other_masses, strict=True)):
             factors: dict[str, Any] = {name: getattr(self, name)[row] for name in _FACTORS}
             flight = replace(self, seed=seed, **factors)
-            # Known here: each flight would take as long as all of them together.
+            # Set here: computing it for one flight takes as long as for all of them.
             vars(flight)["inertial"] = inertial[row] if has_other else None
             flights.append(flight)
         return flights
@@ -371,7 +371,7 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
 
 
 def _start_positions(scenario: Scenario) -> list[float]:
-    """Return the joint positions at the start; by default, as near to zero as limits allow."""
+    """Return the joint positions at the start; by default, as close to zero as limits allow."""
     given, robot = scenario.plant.initial_joint_positions, description_of(scenario)
     if given:
         return list(given)
@@ -538,7 +538,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
         )
     kind = _require_fault(faults[index], scenario).kind
     if part == "value" and not FAULT_KINDS[kind].value:
-        raise ParameterError(f"'{name}': a fault of kind {kind} has no value.")
+        raise ParameterError(f"'{name}': a fault of kind {kind} does not take a value.")
     is_text = part in ("kind", "target")
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
@@ -553,13 +553,13 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
         return flight.with_overrides("plant", {"faults": lines})
 
     unit = "s" if part in ("at", "until") else ""
-    # Absent faults are removed last, from the end of the list on, so that places stay.
+    # Absent faults are removed last, from the end of the list, so that indices stay valid.
     order = len(faults) - index if part == "present" else 0
     return DispersionTarget(name, apply, unit, is_text, frozenset({name}), order=order)
 
 
 def _require_fault(line: str, scenario: Scenario) -> Fault:
-    """Return the fault of a line; its plant alone knows whether it has a nozzle or a wrench."""
+    """Parse a fault line; only the plant can check whether it has the nozzle or wrench."""
     joints = description_of(scenario).joint_names
     return parse_fault(line, FaultTargets(joints, wrench=True, nozzles=line.split()[1:2]))
 

@@ -207,7 +207,7 @@ class LocalWorkers:
 
 @contextmanager
 def _settings_of_workers() -> Iterator[None]:
-    """Let processes that start now have one thread, and no Ctrl-C, after which they are ended."""
+    """Limit processes started here to one thread and block Ctrl-C, after which they are ended."""
     before = os.environ.copy()
     os.environ.update(dict.fromkeys(_THREAD_COUNT_VARIABLES, "1"))
     # The resource tracker would unblock the signal when it starts.
@@ -239,7 +239,7 @@ class DaskWorkers:
         A client of dask.distributed.
     """
 
-    tasks_per_worker = 2  # The running one, and one that follows it without a round trip.
+    tasks_per_worker = 2  # The running task, and one that can follow without a round trip.
 
     def __init__(self, client: Any) -> None:
         self._client = client
@@ -261,7 +261,7 @@ class DaskWorkers:
                 raise _lost_scheduler_error()
             threads = self._client.nthreads()
             self._require_package(threads)
-        except (OSError, AttributeError) as error:  # The client was about to notice it.
+        except (OSError, AttributeError) as error:  # The client has not noticed it yet.
             raise _lost_scheduler_error() from error
         workers = sum(threads.values())
         now = time.monotonic()
@@ -366,13 +366,13 @@ def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
     import dask
     from distributed import Client
 
-    # Deaths of workers are counted here.
+    # Worker deaths are counted here.
     settings = {
         "distributed.scheduler.allowed-failures": 0,
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.admin.tick.limit": "1h",
     }
-    # The errors below take the place of its tracebacks.
+    # The errors below replace its tracebacks.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     with dask.config.set(settings):
         try:
@@ -390,8 +390,8 @@ def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
 
 @dataclass(frozen=True)
 class _SubmittedTask:
-    """Numbers of the draws that a worker flies now, the name of the engine, and whether it is one
-    flight alone, after the death of a worker.
+    """Draw numbers of a task that a worker is flying, the engine name, and whether the task is a
+    single flight, repeated alone after the death of a worker.
     """
 
     numbers: list[int]
@@ -404,8 +404,8 @@ class TaskDistributor:
 
     The fallbacks of an engine are passed to engine ``flights``, in tasks with fewer flights.
 
-    If a worker dies, each flight in the tasks that it takes along is repeated alone, with nothing
-    beside it. If a worker dies again, that flight has killed it and is reported.
+    If a worker dies, each flight in its lost tasks is repeated alone, while no other task runs.
+    If a worker dies again, that flight has killed it and is reported.
 
     Parameters
     ----------
@@ -467,7 +467,7 @@ class TaskDistributor:
             queue, engine = (
                 (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
             )
-            # The last tasks are smaller, so that no worker is alone at the end.
+            # The last tasks are smaller, so that all workers finish at about the same time.
             share = max(engine_by_name(engine).efficient_flights, len(queue) / workers)
             count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
             self._submit_task([queue.popleft() for _ in range(count)], engine)
@@ -502,7 +502,7 @@ class TaskDistributor:
         ]
 
     def _on_worker_death(self, task: _SubmittedTask) -> list[Row]:
-        """Have the flights of a task flown again alone; return the row of one that was alone."""
+        """Repeat the flights of a task one at a time; return the row of a flight that was alone."""
         if not task.runs_alone:
             self._retry_alone += task.numbers
             return []

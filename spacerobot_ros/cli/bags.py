@@ -74,7 +74,7 @@ _several_bags = click.argument("bags", metavar="BAG...", type=PATH, nargs=-1, re
     "--only",
     metavar="NAME,NAME",
     default="",
-    help="Draw only these figures, such as pose,joints. Available: robot, pose, position, "
+    help="Draw only these figures, for example pose,joints. Available: robot, pose, position, "
     "attitude, cycles, joints, velocities, loops, errors, link_errors, sensors, efforts, "
     "thrusters, twist, clearance, momentum, momentum_budget and path.",
 )

@@ -191,7 +191,7 @@ def _require_flights(*each: Progress) -> None:
 
 @contextmanager
 def _progress_bar(label: str) -> Iterator[Callable[[Progress], None]]:
-    """Show progress, rate and time left of a campaign, if standard error is a terminal."""
+    """Show progress, rate and remaining time of a campaign, if standard error is a terminal."""
     if not sys.stderr.isatty():
         yield lambda progress: None
         return

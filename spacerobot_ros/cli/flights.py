@@ -114,7 +114,7 @@ def run_command(
     path = Path(result.summary["bag"])
     if result.summary["state"] == "refused" and not result.summary["ticks"]:
         if bag is None and report is None:
-            # Nobody asked for the record of a robot that did not move.
+            # No one has requested a recording of a robot that did not move.
             path.unlink(missing_ok=True)
             result.summary["bag"] = None
         if json_file is not None:
@@ -180,7 +180,7 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         )
     drift = "not explained by thrusters:" if summary["has_thrust"] else "changed by"
     took, factor = summary["plan_time_s"], summary["real_time_factor"]
-    # A controller in a process of its own does not report how long it planned.
+    # A controller in a separate process does not report its planning time.
     planned = f", planned in {took:.3f} s" if took else ""
     pace = f"{factor:.0f}" if factor >= 10 else f"{factor:.2g}"
     return [
@@ -212,13 +212,13 @@ def _fault_lines(scenario: Scenario) -> list[str]:
 
 
 def _shape(summary: dict[str, Any]) -> list[float]:
-    """Return the final positions of the joints but for wheels, whose angles mean nothing."""
+    """Return the final joint positions, except those of wheels, whose angles are meaningless."""
     joints = zip(summary["joint_names"], summary["final_joint_positions"], strict=True)
     return [position for name, position in joints if name not in summary["wheel_names"]]
 
 
 def _judged(summary: dict[str, Any], part: str, unit: str) -> str:
-    """Return the tolerance of an error, or that the part is not controlled, in brackets."""
+    """Return, in brackets, the tolerance of an error, or that the part is not controlled."""
     if part in summary["not_controlled"]:
         return " (not controlled)"
     tolerance = summary[f"{part}_tolerance_{unit}"]

@@ -70,7 +70,7 @@ class DefaultGroup(click.Group):
         return super().parse_args(ctx, args)
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the commands, and what the first argument of the default command may be."""
+        """Return the commands, and the completions of the default command's first argument."""
         first = next(p for p in self.commands[self.default].params if isinstance(p, click.Argument))
         return [*first.shell_complete(ctx, incomplete), *super().shell_complete(ctx, incomplete)]
 
@@ -83,7 +83,7 @@ _STANDARD_OUTPUT = f"{__name__}.standard_output"
 
 
 def _json_destination(ctx: click.Context, _: click.Parameter, path: Path | None) -> Path | None:
-    """Leave standard output to the JSON of ``--json -``: texts for people go to standard error."""
+    """Reserve standard output for the JSON of ``--json -``; other output goes to standard error."""
     if path == Path("-"):
         ctx.meta[_STANDARD_OUTPUT] = sys.stdout
         ctx.with_resource(redirect_stdout(sys.stderr))
@@ -119,8 +119,8 @@ def complete_robot(_: click.Context, __: click.Parameter, incomplete: str) -> li
 
 
 def _names_or_files(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
-    """Return the names that begin with a string; shells complete a file if there is none."""
-    # The item of files is first because bash drops what stands before it.
+    """Return the names that begin with a string; shells complete file names if there are none."""
+    # The item for files comes first, because bash drops all items before it.
     found = [CompletionItem(name) for name in sorted(names) if name.startswith(incomplete)]
     return [CompletionItem(incomplete, type="file"), *found]
 
@@ -293,7 +293,7 @@ def end_effector_goals(
     paths: Sequence[Path] = (),
 ) -> list[EndEffectorGoal]:
     """Return the goals of the :func:`end_effector_options`, whose links are in the order of the
-    poses, positions and paths; without a link, one goal is for the default end-effector.
+    poses, positions and paths; a single goal without a link is for the default end-effector.
 
     Raises
     ------
@@ -317,7 +317,7 @@ def end_effector_goals(
 
 
 def _read_path(file: Path) -> list[list[float]]:
-    """Return the numbers of a text file, a position or a pose a line; else raise BadParameter."""
+    """Read a text file with one position or pose per line; raise BadParameter on failure."""
     try:
         lines = [line.partition("#")[0] for line in read_regular(file).decode("utf-8").splitlines()]
         rows = [list(map(float, line.replace(",", " ").split())) for line in lines]

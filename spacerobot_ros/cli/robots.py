@@ -369,7 +369,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     for line in (*analysis_lines(known), *_notes(model)):
         say(line)
     click.echo()
-    # A robot file beside its scenario is found from any working folder.
+    # A robot file next to its scenario is found from any working directory.
     from_there = os.path.relpath(file.resolve(), target.resolve().parent)
     named = from_there if is_path(robot) else robot
     if not model.n:

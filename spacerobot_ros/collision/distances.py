@@ -59,7 +59,7 @@ class Solid:
 
 @lru_cache(maxsize=1)
 def _coal() -> Any:
-    """Return the module coal; None: it is not installed, which is logged once an installation."""
+    """Return the module coal; None: it is not installed, which is logged once per installation."""
     try:
         import coal
     except ImportError:
@@ -115,8 +115,8 @@ class ExactDistances:
             return None
         points = self._coal.StdVec_Vec3s()
         points.extend(list(vertices))
-        # A vertex may have at most 254 neighbours. A disc that is cut into triangles can exceed
-        # this; left whole, only the tip of a cone can.
+        # A vertex may have at most 254 neighbours. A disc cut into triangles can exceed this; if it
+        # stays whole, only a cone's tip can.
         for triangles, options in ((True, "Qt"), (False, "")):
             with suppress(RuntimeError):
                 return self._coal.Convex.convexHull(points, triangles, options)
@@ -152,8 +152,8 @@ class ExactDistances:
     def _results(
         self, first: int, second: int, R_1: Array, r_1: Array, R_2: Array, r_2: Array
     ) -> Iterator[tuple[float, Any, Array, Array]]:
-        """Yield the distance of two solids, coal's result in the frame of the first one, and the
-        pose of the second one there.
+        """Yield the distance between two solids, coal's result in the frame of the first, and the
+        pose of the second in that frame.
         """
         coal = self._coal
         (one, R_a, r_a), (other, R_b, r_b) = self._geometries[first], self._geometries[second]
@@ -202,6 +202,6 @@ DistanceFunction = ExactDistances | EnclosureDistances
 
 
 def distance_function(solids: Sequence[Solid]) -> DistanceFunction:
-    """Return an exact distance function, or lower bounds if the package coal is not installed."""
+    """Return an exact distance function, or lower bounds if ``coal`` is not installed."""
     coal = _coal()
     return EnclosureDistances(solids) if coal is None else ExactDistances(solids, coal)

@@ -82,7 +82,7 @@ class BasePoses(NamedTuple):
     quaternion: Array
 
     def rows(self, rows: npt.NDArray[np.int64] | slice) -> BasePoses:
-        """Return some of them."""
+        """Return the selected poses."""
         return BasePoses(self.position[rows], self.quaternion[rows])
 
     def between(self, before: npt.NDArray[np.int64], share: Array) -> BasePoses:
@@ -114,7 +114,7 @@ class UnreadMesh:
     reason
         A sentence with the reason.
     is_collision_shape
-        Whether the mesh belongs to a ``<collision>``, not only to a ``<visual>``.
+        Whether the mesh belongs to a ``<collision>`` and not only to a ``<visual>``.
     """
 
     link: str
@@ -197,7 +197,7 @@ class CollisionGeometry:
     @cached_property
     def distance_function(self) -> DistanceFunction:
         """Distances between two solids, exact if the package coal is installed."""
-        # Where bounding balls never come near, the library of distances need not be imported.
+        # If bounding spheres never come close, the distance library need not be imported.
         return distance_function(self.solids)
 
     @property
@@ -322,7 +322,7 @@ class CollisionGeometry:
         required = np.broadcast_to(required, len(self.pairs))
         bounds = self.lower_bounds(poses) - required
         least = bounds.min(axis=0)
-        # Pairs that may be the nearest come first, so that most others need not be looked at.
+        # Pairs that may be the nearest come first, so that most others need not be checked.
         for pair in np.argsort(least, kind="stable").tolist():
             if least[pair] >= distances.max():
                 break
@@ -374,7 +374,7 @@ class CollisionGeometry:
         return np.array(found, dtype=np.int64).reshape(-1, 2)
 
     def _pairs_always_in_contact(self) -> npt.NDArray[np.bool_]:
-        """Return for every pair (P,) whether it is in contact at all random shapes."""
+        """Return whether each pair (P,) is in contact in every random shape."""
         contact = np.ones(len(self.pairs), dtype=np.bool_)
         if not len(self.pairs):
             return contact
@@ -384,7 +384,7 @@ class CollisionGeometry:
         contact[self.lower_bounds(poses).max(axis=0) > 0] = False
         R, r = poses
         for pair in np.flatnonzero(contact):
-            # Most pairs come apart within the first shapes.
+            # Most pairs separate within the first few shapes.
             for part in (slice(0, 10), slice(10, 100), slice(100, None)):
                 if self.distances(int(pair), (R[part], r[part])).max() > 0:
                     contact[pair] = False
@@ -437,7 +437,7 @@ class CollisionGeometry:
 
 
 def _spins_in_place(solid: Solid, link_pose: Pose, joint: Joint) -> bool:
-    """Whether a solid is a body of revolution about the axis of a joint that turns it.
+    """Whether a solid is a body of revolution about the axis of a joint that rotates it.
 
     ``link_pose`` is the pose of its link in the frame of the joint's body.
     """
@@ -503,7 +503,7 @@ def solids_of(
 
 
 def _convex_hull(points: Array) -> Any:
-    """Return the convex hull of points (V, 3) by scipy; None where all lie in a plane."""
+    """Return the convex hull of points (V, 3) by scipy; None if they are coplanar."""
     # Slow to import, and few robots have meshes.
     from scipy.spatial import ConvexHull, QhullError
 
@@ -540,7 +540,7 @@ def obstacle_visuals(
 
 
 def _mesh_of(solid: Solid) -> TriangleMesh:
-    """Return the triangles of a solid; of a flat hull there are none."""
+    """Return the triangles of a solid; none for a flat hull."""
     points = solid.vertices
     if points is None:
         return solid_mesh(solid.shape)
@@ -549,7 +549,7 @@ def _mesh_of(solid: Solid) -> TriangleMesh:
         return TriangleMesh(points, np.zeros((0, 3), np.int32))
     faces = hull.simplices.astype(np.int32)
     a, b, c = (points[faces[:, k]] for k in range(3))
-    # Corners go round counterclockwise, seen from outside.
+    # Corners are in counterclockwise order when viewed from outside.
     inward = np.einsum("ka,ka->k", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces[inward] = faces[inward][:, ::-1]
     return TriangleMesh(points, faces)

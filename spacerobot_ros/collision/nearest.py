@@ -61,10 +61,10 @@ class Approach:
 
 @dataclass(frozen=True)
 class _Path:
-    """A path of shapes (N + 1, n) at the ticks, with the base where obstacles count, else None.
+    """A path of shapes (N + 1, n) at the ticks, with the base poses if obstacles matter, else None.
 
-    ``distance_bounds`` (N + 1, P) are lower bounds of the distances of pairs, m;
-    ``largest_motions`` (N, P) how far pairs move against each other at most in each tick, m.
+    ``distance_bounds`` (N + 1, P) are lower bounds on the distances of pairs, m;
+    ``largest_motions`` (N, P) the largest relative motions of pairs in each tick, m.
     """
 
     positions: Array
@@ -80,7 +80,7 @@ class _Path:
         motion = moved @ reaches.T
         if base is not None and geometry.with_obstacles.any():
             straight = np.linalg.norm(np.diff(base.position, axis=0), axis=1)
-            # Quaternions turn by half the angle.
+            # Quaternions contain half the angle.
             chord = np.linalg.norm(np.diff(base.quaternion, axis=0), axis=1)
             turned = 4 * np.arcsin(np.minimum(np.minimum(chord, np.sqrt(4 - chord**2)) / 2, 1.0))
             motion += np.outer(turned, from_base) + np.outer(straight, geometry.with_obstacles)
@@ -183,7 +183,7 @@ def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) 
     left, right = starts.astype(float), starts + 1.0
     d_0, d_1, v = known[index], known[index + 1], motion[starts, pair]
     while True:
-        # Only where the distance may be less than any that is known, and matters.
+        # Only where the distance may be smaller than all known ones, and relevant.
         open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _MOTION_RESOLUTION)
         if not open_.any():
             break

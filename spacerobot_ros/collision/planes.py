@@ -125,7 +125,7 @@ def support_distance(
 def _relative_poses(
     robot: RobotDescription, first: Solid, second: Solid, q: ca.SX
 ) -> list[tuple[ca.SX, ca.SX]]:
-    """Return the poses of the links of two solids in the last body that carries both."""
+    """Return the link poses of two solids in the outermost body that carries both."""
     theta = joint_positions(robot, q)
     chains = [_chain_of(robot, each.body) for each in (first, second)]
     common = len([1 for a, b in zip(*chains, strict=False) if a == b])
@@ -156,7 +156,7 @@ def _pose_of_link(
 
 
 def _chain_of(robot: RobotDescription, body: int) -> list[int]:
-    """Return the bodies from the base out to one."""
+    """Return the bodies from the base to a given body."""
     chain = []
     while body >= 0:
         chain.append(body)

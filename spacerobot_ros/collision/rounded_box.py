@@ -21,7 +21,7 @@ import numpy as np
 from spacerobot_ros.model.description import Array, Pose, Shape
 
 _MAX_PROJECTIONS = 60
-"""Number of alternating projections; the bound holds after any number."""
+"""Number of alternating projections; the bound is valid after any number."""
 
 _PARALLEL_TOLERANCE = 1e-9
 """Length of the cross product of two unit vectors below which they are considered parallel."""
@@ -136,7 +136,7 @@ def separating_planes(
 
 
 def _support(box: RoundedBox, R: Array, directions: Array) -> Array:
-    """Return the points (N, 3) of a box, turned by R, that lie farthest in directions (N, 3)."""
+    """Return the points (N, 3) of a box, rotated by R, that lie farthest in directions (N, 3)."""
     axes = R @ box.pose.R
     corner = box.half * np.sign(np.round(np.einsum("nba,nb->na", axes, directions), 9))
     of_core = np.einsum("nab,nb->na", axes, corner)

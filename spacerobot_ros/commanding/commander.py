@@ -140,7 +140,7 @@ class Commander(ABC):
         self._fault_log_times: dict[str, float] = {}
         """Wall time of the last log line by kind of fault, s."""
 
-    # -- life ---------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------
 
     @property
     def active(self) -> bool:
@@ -335,7 +335,7 @@ class Commander(ABC):
             self.host.report_event(decision_event(status))
 
     def _publish_status(self, status: Status) -> None:
-        # A replaced goal ends before its successor begins: the last status is of the present goal.
+        # A replaced goal ends before its successor begins: the last status is for the current goal.
         self._fly_to.end_dropped_goals(self._active_goal_ids() | {status.goal_id})
         self.host.publish_status(status)
         if status.state.value != "waiting":
@@ -352,7 +352,7 @@ class Commander(ABC):
         pursued = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.active and self.executive is not None:
             pursued |= self.executive.unfinished_goals
-            # A status that waits for its publication tells the end of its own goal.
+            # A status waiting for publication reports the end of its own goal.
             outputs = self.executive.outputs
             pursued |= {each.goal_id for each in outputs if isinstance(each, Status)}
         return pursued
@@ -363,7 +363,7 @@ class Commander(ABC):
         self._fly_to.end_dropped_goals(self._active_goal_ids())
 
     def _abort_fly_to(self) -> None:
-        """Give up all goals if the client of one, or its time limit, asks for it."""
+        """Abort all goals if the client or the time limit of one of them requires it."""
         waiting = {goal.goal_id for goal in self._waiting_goals.values()}
         if self.executive is not None:
             waiting |= self.executive.waiting_goals
@@ -372,7 +372,7 @@ class Commander(ABC):
             self.abort(why)
 
     def _report_aborted(self, goal_id: str, message: str) -> Status:
-        """Publish that a goal of an action has been aborted, by the reason for a later goal."""
+        """Publish that an action goal was aborted; return the published status."""
         status = self._make_status("aborted", message, goal_id)
         self.host.publish_status(status)
         self.host.report_event(decision_event(status))
@@ -392,12 +392,12 @@ class Commander(ABC):
             return GoalErrors()
         try:
             return GoalErrors.between(self.robot, pose, self._decoder.q, goal)
-        except PlanningError:  # It is refused: the robot lacks a link.
+        except PlanningError:  # The goal is rejected: the robot lacks a link.
             return GoalErrors()
 
     def _base_pose(self) -> Array | None:
         odom, decoder = self.states.odom, self._decoder
-        # Before the first joints, there is no shape of the robot either.
+        # Before the first joint states, the robot's shape is unknown, too.
         if odom is None or decoder is None or self.states.joints is None:
             return None
         try:
@@ -406,7 +406,7 @@ class Commander(ABC):
             return None
 
     def _default_tolerance(self) -> Tolerance:
-        """Return the largest errors of a reached goal that has none of its own."""
+        """Return the tolerance of goals that do not specify their own."""
         config = self.config
         position = config.position_tolerance or DEFAULT_POSITION_TOLERANCE
         return Tolerance(position, config.attitude_tolerance, config.joint_tolerance)
@@ -431,7 +431,7 @@ class Commander(ABC):
         """Process an odom message with the current time, and handle its state if the state is
         complete."""
         if self.states.put_odom(stamp_ns, odom):
-            # One alone is a plant that was reset or restarted, whose status comes later.
+            # A single contradiction: the plant was reset or restarted; its status arrives later.
             since = (stamp_ns - self._contradicted_ns) / SECOND
             if 0.0 < since <= max(_LONGEST_REPETITION, 2 * self.config.control_period):
                 self._log_fault(
@@ -485,7 +485,7 @@ class Commander(ABC):
         return self.inputs.missing(self.config.control_period)
 
     def _report_missing(self) -> None:
-        """Report in the status what is missing, and when it is there again."""
+        """Report missing messages, and their return, in the status."""
         self.inputs.excuse_suspension()
         missing = self.missing
         goal_id = self._pursued_goal_id if missing else ""
@@ -493,7 +493,7 @@ class Commander(ABC):
         if known or not self.active:
             return
         if missing and self._reported_missing and self.inputs.just_begun:
-            return  # The rest is on its way.
+            return  # The other messages are on their way.
         self._reported_missing, self._reported_waiting = missing, goal_id
         if missing:
             goes_on = " The goal is pursued when they arrive." if goal_id else ""
@@ -508,10 +508,10 @@ class Commander(ABC):
         self.answer()
 
     def _take_states(self, odoms: Sequence[Stamped], states: Sequence[Stamped]) -> None:
-        """Take what waits, and of the states of the present time only the last one.
+        """Process waiting messages; of the states at the current time, only the last one.
 
-        An answer to one before it comes too late, and the motion of the joints before the first
-        answer does not tell whether they obey it.
+        An answer to an earlier state would be too late, and the joint motion before the first
+        answer does not show whether the joints obey it.
         """
         states = [each for each in states if self._is_of_robot(each.message)]
         present = [each.stamp_ns for each in states if self.stamps.is_present(each.stamp_ns)]
@@ -608,7 +608,7 @@ class Commander(ABC):
             return robot
 
     def give_up_goals(self, stopped: PlantStopped) -> None:
-        """Give up the goals, because the plant ignores commands or is silent."""
+        """Abort the goals, because the plant ignores commands or is silent."""
         if stopped.commanded_until_ns is None:
             self._goal_file.delete()
         if self.executive is not None:
@@ -623,11 +623,11 @@ class Commander(ABC):
 
     @abstractmethod
     def _use_obstacles(self) -> None:
-        """Have the executive plan around other obstacles."""
+        """Make the executive plan around other obstacles."""
 
     @abstractmethod
     def _make_status(self, state: str, message: str, goal_id: str) -> Status:
-        """Return a status of a goal that the executive does not have."""
+        """Return a status for a goal that is unknown to the executive."""
 
     @abstractmethod
     def _build_executive(self, robot: SpaceRobot, decoder: StateDecoder) -> None:
@@ -635,28 +635,28 @@ class Commander(ABC):
 
     @abstractmethod
     def _change_masses(self, robot: SpaceRobot) -> None:
-        """Have the executive command a robot of the same joints and other masses."""
+        """Make the executive command a robot with the same joints but other masses."""
 
     def reconfigure(self, config: Any) -> None:
-        """Set the parameters that may change at run time from another configuration."""
+        """Copy the parameters that may change at run time from another configuration."""
         adapted = self._adapted(config)
         self._given, self.config = config, adapted
         if self.executive is not None:
             self.executive.configure(adapted)
 
     def _adapted(self, config: Any) -> Any:
-        """Return a configuration for the robot and the plant: one in lockstep waits for plans."""
+        """Return a configuration for the robot and the plant; a lockstep plant waits for plans."""
         background = config.plan_in_background and not self.plant.in_lockstep
         config = replace(config, tick_rate=self.config.tick_rate, plan_in_background=background)
         return config if self._described is None else config.for_robot(self._described.description)
 
     @abstractmethod
     def _change_rate(self, robot: SpaceRobot) -> None:
-        """Have the executive command at the present rate of the configuration."""
+        """Make the executive command at the rate in the current configuration."""
 
     @property
     def _pursued_goal_id(self) -> str:
-        """Id of a goal that is pursued or waits; empty: none is."""
+        """Id of a pursued or waiting goal; empty: none."""
         return min(self._active_goal_ids(), default="")
 
     def _report_present_status(self) -> None:
@@ -669,7 +669,7 @@ class Commander(ABC):
     @property
     @abstractmethod
     def _actuation_refusal(self) -> str:
-        """Message on a plant that takes other commands than these; empty: it takes them."""
+        """Message about a plant that expects other commands; empty: it accepts these commands."""
 
     @abstractmethod
     def _resume_goals(self, saved: Mapping[str, IdentifiedGoal]) -> None:
@@ -677,7 +677,7 @@ class Commander(ABC):
 
     @abstractmethod
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
-        """Give a goal to the executive."""
+        """Pass a goal to the executive."""
 
     def answer(self) -> None:
         """Handle a ready state once, if the commander is active and the rate is known."""
@@ -692,17 +692,17 @@ class Commander(ABC):
 
     @abstractmethod
     def _forward_plant_state(self) -> None:
-        """Tell the executive whether the plant obeys commands."""
+        """Inform the executive whether the plant obeys commands."""
 
     def _awaits_odom(self) -> bool:
-        """Whether the commander uses an odom that comes after the joints of its state."""
+        """Whether the commander uses an odom message that arrives after its joint states."""
         return True
 
     def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
-        """Report that a goal waits, by a status with a message."""
+        """Report that a goal waits, in a status with a message."""
 
     def _forward_outputs(self) -> None:
-        """Publish the outputs that the executive has collected, and keep its goals on file."""
+        """Publish the outputs collected by the executive, and store its goals in the goal file."""
         while self.executive is not None and self.executive.outputs:
             match self.executive.outputs.popleft():
                 case Event() as event:
@@ -715,4 +715,4 @@ class Commander(ABC):
 
     @abstractmethod
     def _forward(self, output: Any) -> None:
-        """Publish a status, or another output that this executive alone has."""
+        """Publish a status, or another output that only this executive has."""

@@ -43,7 +43,7 @@ suspended."""
 
 @dataclass
 class _ReferenceWait:
-    """How long states have waited for a topic of references, since its last message."""
+    """How long states have waited for a reference topic since its last message."""
 
     missed_since_ns: int | None = None
     """Stamp of the first state without its reference, ns."""
@@ -180,7 +180,7 @@ class ControllerCommander(Commander):
         return warning
 
     def _watch_missed(self, missing: tuple[str, ...]) -> None:
-        """Do without references that states have missed for their timeout of simulated time."""
+        """Continue without references missed by states for their timeout of simulated time."""
         now, timeout = self.stamps.now_ns, self.config.reference_timeout
         for topic in missing:
             wait = self._references[topic]
@@ -189,13 +189,13 @@ class ControllerCommander(Commander):
                 self._do_without(topic)
 
     def _watch_waiting_state(self) -> None:
-        """Do without references for which time stands still for their timeout of wall time."""
+        """Continue without references that have stopped time for their timeout of wall time."""
         now, timeout = self._clock(), self.config.reference_timeout
         elapsed, self._looked = min(now - self._looked, _LONGEST_CHECK_PERIOD), now
         missing = () if self.executive is None else self.states.missing
         for topic in missing:
             wait = self._references[topic]
-            # A planner that plans for long answers afterwards, unless it is killed meanwhile.
+            # A planner that plans for a long time answers afterwards, unless it is killed.
             if not (self._partner_is_busy() and self.host.has_publisher(topic)):
                 wait.waited += elapsed
             if timeout and wait.waited >= timeout:
@@ -239,7 +239,7 @@ class ControllerCommander(Commander):
         if robot is None:
             return
         controller = build_controller(robot, self.config)
-        controller.gains_checked = True  # The first state that is measured says more.
+        controller.gains_checked = True  # The first measured state is more informative.
         executive = ControlExecutive(controller, self.config)
         q, rates = np.clip(np.zeros(robot.n), robot.lower, robot.upper), np.zeros(robot.n)
         upright = np.array([0.0, 0.0, 0.0, 1.0])
@@ -312,7 +312,7 @@ class ControllerCommander(Commander):
 
     def _leaves_to_planner(self, key: str, goal: IdentifiedGoal) -> bool:
         """Whether a goal that was sent to all commanders is for the planner whose reference the law
-        tracks; the client of an action has asked the controller, and waits for its answer.
+        tracks; action goals are not, because their client waits for the controller's answer.
         """
         assert self.executive is not None
         controlled = getattr(self.executive.controller.law.outputs.selection, key)
@@ -328,7 +328,7 @@ class ControllerCommander(Commander):
             self.executive.take_contacts(self.plant.status.contacts, self.plant.status.time_s)
 
     def _waits_for_first_pose(self) -> bool:
-        """Whether the last state came before odom was connected: its pose is not lost."""
+        """Whether the last state arrived before odom was connected; its pose is not lost."""
         if self._pose_has_come:
             return False
         before, self._odom_was_connected = self._odom_was_connected, self.host.has_publisher("odom")

@@ -124,7 +124,7 @@ class GoalErrors:
             "end_effector_position": status.end_effector_position_error_m,
             "end_effector_attitude": status.end_effector_attitude_error_rad,
         }
-        # A status has an angle of zero where no attitude is asked for.
+        # A status reports an angle of zero if no attitude is required.
         return replace(
             self,
             **{
@@ -277,7 +277,7 @@ class FlyToGoals:
             if served.request is None or served.client is None:
                 continue
             if served.first_state_ns is None or now_ns < served.first_state_ns:
-                # Also after a jump of time.
+                # Also after a time jump.
                 served.first_state_ns, served.last_feedback_ns = now_ns, None
             limit = served.request.time_limit
             if limit and now_ns - served.first_state_ns >= limit * SECOND:

@@ -91,7 +91,7 @@ class PlannerCommander(Commander):
 
     def _make_worker(self, robot: SpaceRobot) -> PlanningWorker:
         described = robot.description
-        # A given method is one for the robot without its payload.
+        # A given method is for the robot without its payload.
         method = self._method if robot is self._described else None
         if self._obstacles is not None:
             described = with_world(described, self._world)
@@ -142,7 +142,7 @@ class PlannerCommander(Commander):
         self._report_waiting_goal(goal, "Resuming an earlier goal.")
 
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
-        """Accept a goal; goals of one stamp, of end-effectors and of the base, are one goal."""
+        """Accept a goal; base and end-effector goals with the same stamp form one goal."""
         last = self._last_goal
         if last is not None and last.goal_id == goal.goal_id and goal.goal_id:
             goal = replace(goal, goal=last.goal.joined_with(goal.goal))
@@ -199,7 +199,7 @@ class PlannerCommander(Commander):
             self._warn_of_disturbances(begun)
 
     def _warn_of_disturbances(self, lines: Sequence[str]) -> None:
-        """Report disturbances that a schedule does not know; a controller holds against them."""
+        """Report disturbances unknown to a schedule; with a controller, they are compensated."""
         if lines and self._status is not None and self.config.output != "reference":
             message = (
                 "The plan assumes constant momenta, but a disturbance changes them: "
@@ -213,7 +213,7 @@ class PlannerCommander(Commander):
             self.executive.plant_rests = self.plant.has_no_command
 
     def _awaits_odom(self) -> bool:
-        # A goal to plan for or to evaluate needs every pose, even after its joints.
+        # Planning or evaluating a goal requires every pose, even if it arrives after its joints.
         return self.executive is not None and self.executive.measuring
 
     def _answer_state(self, pairing: Pairing) -> None:

@@ -31,7 +31,7 @@ class Stamped(NamedTuple):
 _NO_MESSAGE = Stamped(_NO_STAMP, None)
 
 
-# -- states of the present time ---------------------------------------------------------------
+# -- states at the current time ----------------------------------------------------------------
 
 _JUMP_CONFIRMATION_TIME = 0.5
 """Wall time without a state at the old time before a time jump is accepted, s."""
@@ -47,7 +47,7 @@ _MEETING_TIME = 1.0
 s."""
 
 _LATE_POSES = 6
-"""Poses that are older than this number of longest steps are late (the machine is busy), and are
+"""Poses older than this multiple of the longest step are late (the machine is busy), and are
 discarded without a message."""
 
 _MEASURED_STEPS = 8
@@ -102,7 +102,7 @@ class StampFilter:
             return SECOND / steps[-1]
         if len(steps) < _MEASURED_STEPS:
             return 0.0
-        # Sensors are read at whole rates, with some jitter; steps with losses are longer.
+        # Sensor rates are integers, with some jitter; steps with losses are longer.
         usual = median(steps)
         measured = SECOND / fmean(step for step in steps if step <= _STEP_SLACK * usual)
         return float(round(measured)) or measured
@@ -171,9 +171,9 @@ class StampFilter:
         self._jump = self._jump_odom = _NO_MESSAGE
 
     def _ignore_jump(self) -> None:
-        """Count the set-aside messages as ignored: the present time continues.
+        """Count the deferred messages as ignored: the current time continues.
 
-        While nodes meet, they receive one topic earlier than the other: such poses do not count.
+        During discovery, nodes receive one topic before the other; such poses are not counted.
         """
         meeting = self._wall - self._first_wall < _MEETING_TIME
         odom = _NO_MESSAGE if meeting else self._jump_odom
@@ -189,7 +189,7 @@ class StampFilter:
         self._jump = self._jump_odom = _NO_MESSAGE
 
 
-# -- whole states -----------------------------------------------------------------------------
+# -- complete states --------------------------------------------------------------------------
 
 
 class Pairing(str, Enum):
@@ -318,7 +318,7 @@ class StateSynchroniser:
         return Pairing.WITHOUT_POSE if self._without_pose else Pairing.WHOLE
 
 
-# -- the status of the plant ------------------------------------------------------------------
+# -- plant status -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -395,7 +395,7 @@ class PlantListener:
             if not was_blocked or status.latched_fault != before.latched_fault:
                 fault = status.latched_fault
                 changes.append(PlantStopped(f"{fault}." if fault else status.message))
-            # A plant that obeys nothing may still be reset, at once and to another pose.
+            # A plant that ignores all commands may still be reset, immediately and to another pose.
             if heard and status.resets > before.resets:
                 changes.append(PlantChange.RESET)
             return changes
@@ -428,7 +428,7 @@ def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
     return PlantStopped(why, round(last * SECOND), round(since * SECOND))
 
 
-# -- inputs that do not come ------------------------------------------------------------------
+# -- missing inputs ---------------------------------------------------------------------------
 
 _LONGEST_SILENCE, _SILENT_PERIODS = 1.0, 5
 """Wall time without a state after which states are reported as missing, s, and its minimum in

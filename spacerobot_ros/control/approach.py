@@ -38,7 +38,7 @@ from spacerobot_ros.model.target_motion import (
 )
 from spacerobot_ros.parameters import parameter
 
-_SAMPLE_PERIOD = 0.25  # s, of checks of limits
+_SAMPLE_PERIOD = 0.25  # s, between limit checks
 _COARSE_STRIDE = 8
 
 _START_PERIOD = 1.0  # s
@@ -185,7 +185,7 @@ class ArmReach:
         self._arm = FixedBaseArm(robot, link, self.base, axes)
         self._joint_names, self._rates = robot.joint_names, rates
         self.q = state.q.copy()
-        """Present shape (n,)."""
+        """Current shape (n,)."""
 
     def distance_to(self, motion: FrameMotion, k: int) -> float:
         """Return the smallest distance (m or rad) of the arm from pose k of a motion."""
@@ -253,9 +253,9 @@ def plan_approach(
     starts = np.arange(0.0, 0.0 if moving else options.horizon, _START_PERIOD)
     standoffs = [factor * np.array(options.standoff) for factor in _STANDOFF_FACTORS]
     ways = [(each, _closing_path(each, options, limits)) for each in standoffs]
-    ways.insert(0, ways[0])  # Relative to the grapple frame; the others are short in W.
+    ways.insert(0, ways[0])  # Short relative to the grapple frame; the others are short in W.
     at_rest, within = held.motion, f"within the next {options.horizon:g} s"
-    # Of two reasons for refusal, the greater one is that of the approach that came farther.
+    # The greater of two refusal reasons belongs to the approach that got farther.
     refused, blocked = (0, -math.inf, ""), 0
     longest = _LONGEST_PATH + options.standoff_time + ways[-1][1].duration + 2 * _SAMPLE_PERIOD
     samples = round((options.horizon + longest) / _SAMPLE_PERIOD)
@@ -295,9 +295,9 @@ def plan_approach(
                 refused = max(refused, (1, -distance, sentence))
                 if way:
                     continue
-                break  # A longer path meets the target later, which other start times do, too.
+                break  # A longer path meets the target later, as do other start times.
             near: NearestLinks | None = None
-            # Few samples refuse most of the paths beside the target.
+            # A few samples suffice to reject most blocked paths.
             for every in (_COARSE_STRIDE, 1):
                 shapes, why = reach.shapes_along(
                     motion.rows(slice(None, None, every)), every * _SAMPLE_PERIOD
@@ -307,7 +307,7 @@ def plan_approach(
                 ticks = np.r_[0:first:every, first:last:every]
                 waiting = np.tile(reach.q, (len(ticks) - len(shapes), 1))
                 shapes = np.concatenate([waiting, shapes])
-                # A hand that is planned for in motion may be beside the target already.
+                # When planning in motion, the hand may already be next to the target.
                 closes = 0 if moving else int(np.sum(ticks * _SAMPLE_PERIOD < plan.closing_time))
                 near = clearance.nearest(reach.base, shapes, grapple.rows(ticks), closes)
                 if near is not None and near.distance < clearance.min_distance:
@@ -327,7 +327,7 @@ def plan_approach(
 
 
 def _closing_path(standoff: Array, options: ApproachOptions, limits: MotionLimits) -> RelativePath:
-    """Return the path from a standoff to contact, at rest beside the grapple frame at both."""
+    """Return the path from a standoff to contact, at rest relative to the grapple frame at both."""
     length, speed = float(np.linalg.norm(standoff)), min(options.closing_speed, limits.speed)
     acceleration = _CLOSING_SHARE * limits.acceleration
     duration = max(quintic_duration(length, speed, acceleration), _SAMPLE_PERIOD)
@@ -344,7 +344,7 @@ def _outward_durations() -> Iterator[float]:
 def _largest_limit_share(
     motion: FrameMotion, limits: MotionLimits, axes: tuple[str, ...]
 ) -> tuple[float, str]:
-    """Return the largest share of a limit that a motion takes, and a clause about it."""
+    """Return the largest fraction of a limit used by a motion, and a clause about it."""
     linear = any(not axis.startswith("r") for axis in axes)
     angular = any(axis.startswith("r") for axis in axes)
     shares = [(0.0, "")]
@@ -373,7 +373,7 @@ class NearestLinks:
     links: LinkPair
 
     def describe(self, least: float) -> str:
-        """Return a clause on a distance below the permitted one, m."""
+        """Return a clause about a distance below the permitted one, m."""
         first, second = self.links
         if self.distance <= 0.0:
             return f"link '{first}' would touch '{second}' of the target"

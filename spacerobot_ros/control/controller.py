@@ -174,7 +174,7 @@ class CoordinatedController:
         end_effector: PoseReference | None = None,
         joints: Array | None = None,
     ) -> None:
-        """Start towards new goals; a group without a new goal keeps its previous goal.
+        """Start towards new goals; a group without a new goal keeps its previous one.
 
         If the end-effector has had no goal since the robot was held or brought to rest, the base
         carries the end-effector along and the arm keeps its shape. The error integral is reset. The
@@ -265,7 +265,7 @@ class CoordinatedController:
 
     @contextmanager
     def _failures_of_law(self, time: float) -> Iterator[None]:
-        """Name the law in errors of its code, which may be a user's and may even end Python."""
+        """Name the law in errors from its code, which may be user code and may even end Python."""
         try:
             yield
         except SpaceRobotError:
@@ -278,7 +278,7 @@ class CoordinatedController:
     def _carried_end_effector(
         self, before: Reference, base: PoseReference, state: ControlState
     ) -> PoseReference | None:
-        """Return the pose of an end-effector with the base in a goal, and the arm as before."""
+        """Return an end-effector pose with the base at a goal and the arm shape unchanged."""
         carrier, carried = before.base, before.end_effector
         if carrier is None or carried is None:
             return carried
@@ -421,12 +421,12 @@ class CoordinatedController:
         given = self._realised(commanded, around_B)
         kept = self.joint_rate_limits.apply(state, given, self._limits.effort, periods)
         if self.wheels is not None and kept is not given:
-            # Joints that are too fast have the wrench lowered.
+            # The wrench is lowered if joints are too fast.
             kept = self._realised(kept, around_B)
         return Saturated.of(commanded, kept)
 
     def _realised(self, wanted: Actuation, around_B: Array | None = None) -> Actuation:
-        """Return what wheels, if there are any, and then thrusters and joints give of a command."""
+        """Return the part of a command realised by wheels, if any, then by thrusters and joints."""
         if around_B is not None:
             correction = self._realised(wanted._replace(wrench_B=wanted.wrench_B - around_B))
             if self.wheels is not None:
@@ -525,8 +525,8 @@ class CoordinatedController:
     # -- parts --------------------------------------------------------------------------------
 
     def _periods_held(self, time: float) -> int:
-        """Return for how many control periods the last command was held, as this one probably will
-        be: on a machine that is too busy not every state is answered.
+        """Return the number of control periods for which the last command was held, as this one
+        probably will be: an overloaded machine does not answer every state.
         """
         before, self._commanded_at = self._commanded_at, time
         periods = (time - before) / self._control_period
@@ -547,7 +547,7 @@ class CoordinatedController:
     def _known_state(
         self, measured: ControlState | None, q: Array, qdot: Array
     ) -> ControlState | None:
-        """Return the measured state, its estimate, or None when it is not known any more."""
+        """Return the measured state, its estimate, or None if it is no longer known."""
         if measured is not None:
             if self._estimator is not None:
                 self._estimator.reset(measured)
@@ -567,9 +567,9 @@ class CoordinatedController:
         return self._estimator.step(self._sent, q, qdot)
 
     def _braking_command(self, q: Array, qdot: Array) -> Actuation:
-        """Return a command with thrusters off and joints to rest, whatever the pose of the base."""
+        """Return a command that turns off thrusters and stops joints, whatever the base pose."""
         if self._stopped_at is None:
-            # The joints stop where a smooth deceleration from their present rates ends.
+            # The joints stop where a smooth deceleration from their current rates ends.
             self._stopped_at = q + qdot / _BRAKE_RATE
         qddot = _BRAKE_RATE**2 * (self._stopped_at - q) - 2 * _BRAKE_RATE * qdot
         return Actuation(np.zeros(6), self.joint_rate_limits.efforts(q, qdot, qddot))
@@ -654,7 +654,7 @@ def controlled_outputs(
 def _require_torque(
     outputs: OutputSelection, robot: SpaceRobot, wheels: WheelControl | None
 ) -> None:
-    """Refuse outputs of a base without thrusters that its wheels do not move."""
+    """Reject outputs of a base without thrusters that its wheels do not move."""
     name, turns = robot.description.name, [axis for axis in outputs.base if axis.startswith("r")]
     if len(turns) < len(outputs.base):
         raise ParameterError(

@@ -96,7 +96,7 @@ def _grasp_wrench(robot: SpaceRobot, payload: Payload) -> ca.Function:
     index = robot.link_names.index(payload.link)
     R = R_BL[:, 3 * index : 3 * index + 3]
     twist = J @ z
-    # The rate of the twist in B, whose axes turn with the base.
+    # The rate of the twist in B, whose axes rotate with the base.
     rate = J @ zdot + ca.jtimes(twist, q, z[6:])
     omega_WB, v, omega = z[3:6], twist[:3], twist[3:]
     a = rate[:3] + ca.cross(omega_WB, v)
@@ -163,7 +163,7 @@ class Detumbling:
         v_cm = self.velocity(state)
         z = np.concatenate([v_cm, state.omega_WB_B, state.qdot])
         C = robot.bias(state.q, v_cm, state.omega_WB_B, state.qdot)
-        # A force at the base turns the robot about its centre of mass, too.
+        # A force on the base also rotates the robot about its centre of mass.
         to_cm = J[:3, 3:6].T
         n = limit_norm(-r * self.angular_momentum(state), self.torque)
         f = limit_norm(-r * robot.total_mass * v_cm, self._force)

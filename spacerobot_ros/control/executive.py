@@ -46,7 +46,7 @@ Output = ControllerStatus | Event | PursuedGoals
 
 
 class _Next(IntEnum):
-    """Reaction to the next measured state; a greater one counts for more."""
+    """Reaction to the next measured state; a greater one takes precedence."""
 
     GO_ON = 0
     BEGIN_ANEW = 1
@@ -164,7 +164,7 @@ class ControlExecutive:
             return ControllerState.STALLED if stalled else self._goal_state
         if mode is not Mode.ESTIMATED:
             return ControllerState.STOPPED
-        # One pose alone may come late.
+        # A single pose may arrive late.
         elapsed = self.controller.time_since_measurement
         late = elapsed <= _LATE_POSE_PERIODS * self._config.control_period
         return self._goal_state if late else ControllerState.ESTIMATING
@@ -250,14 +250,14 @@ class ControlExecutive:
         elif not (self._pursues or self._pending):
             return False
         self._give_up(f"Aborted by the plant: {why}")
-        # Reported at once, as the next measured state may come late; an earlier abort is, too.
+        # Reported immediately, as the next measured state may be late; so is an earlier abort.
         self._next = _Next.HOLD
         self._report_abort()
         return True
 
     def take_contacts(self, contacts: tuple[str, ...], time: float) -> None:
-        """Set the links that are in contact from a time (s) on; a new contact on the way makes a
-        goal fail."""
+        """Set the links that are in contact from a time (s) on; a new contact during the motion
+        makes a goal fail."""
         self._watch.take_contacts(contacts, time, pursues=self._pursues)
 
     def on_plant_obeying(self) -> None:
@@ -282,7 +282,7 @@ class ControlExecutive:
         if left < 2 * PLANNING_TIME:
             self._plan_next(_Next.BEGIN_ANEW)
         elif left < math.inf:
-            # Until the plan takes over, the robot goes on.
+            # Until the plan takes over, the robot continues.
             self._plan_anew(self._time + PLANNING_TIME * self._planning.in_background)
 
     def _plan_anew(self, time: float) -> None:
@@ -312,7 +312,7 @@ class ControlExecutive:
         self._plan_next(_Next.BEGIN_ANEW if self._pursues else _Next.HOLD)
 
     def _plan_next(self, reaction: _Next) -> None:
-        """Have the robot react to the next measured state, unless more was asked for before."""
+        """Set the reaction to the next measured state, unless a stronger one is pending."""
         self._next = max(self._next, reaction)
 
     def use_controller(
@@ -330,7 +330,7 @@ class ControlExecutive:
             self._plan_next(_Next.BEGIN_ANEW)
 
     def _give_up(self, message: str) -> None:
-        """Drop every goal; the message is that of the status from now on."""
+        """Drop all goals; the message becomes that of the status."""
         pursued = self._pending or self._pursues
         # A decided goal stays decided: an abort without an undecided goal has no goal id.
         self._goal_id = self._latest_id() if pursued else ""
@@ -433,7 +433,7 @@ class ControlExecutive:
         self._next_report = time + self._config.status_period
         self._reported_state, self._limited = state, result.limited
         self._command_report = CommandReport.of(self.controller, result)
-        # Whoever has sent a goal learns that it is being planned.
+        # The sender of a goal is informed that it is being planned.
         planned = state is ControllerState.HOLDING and self._planning.active
         self._publish(state, self._message(state), self._latest_id() if planned else self._goal_id)
 
@@ -479,7 +479,7 @@ class ControlExecutive:
             self._goal_state, self._goal_id = ControllerState.HOLDING, ""
 
     def _follow_goals(self, time: float, state: ControlState) -> None:
-        """Go on with the tasks before the pending goals, and start towards the goals after them."""
+        """Continue the tasks before the pending goals, and start towards the goals after them."""
         servicing = self.servicing
         if self._pending and not self._planning.is_for(self._pending):
             self._refuse_goals_by_state(state)
@@ -515,7 +515,7 @@ class ControlExecutive:
                 self._end_tasks(time, state, progress)
 
     def _refuse_goals_by_state(self, state: ControlState) -> None:
-        """Refuse pending goals that the law leaves unmet in an axis, or that are out of reach."""
+        """Reject pending goals that the law cannot meet along an axis, or that are out of reach."""
         for key, pending in list(self._pending.items()):
             goal = pending.goal.kept_at(state.r_WB, state.quaternion_WB)
             pose = PoseReference(goal.position, goal.quaternion)
@@ -588,7 +588,7 @@ class ControlExecutive:
             self.controller.begin(max(planned.job.begins, time), planned.job.result())
         else:
             if carried:
-                # Tasks have left the earlier reference behind.
+                # The tasks have moved the robot away from the earlier reference.
                 self.controller.hold_here(time, state)
             base, hand, joints = poses["base"], poses["end_effector"], poses["joints"]
             self.controller.set_goals(time, state, base=base, end_effector=hand, joints=joints)
@@ -609,7 +609,7 @@ class ControlExecutive:
     def _planned(self, time: float, state: ControlState, *, carried: bool) -> PlannedGoals | None:
         """Return the planned reference of the pending goals.
 
-        None: it is in the making, or the goals have been refused.
+        None: it is still being planned, or the goals have been rejected.
         """
         if carried and not self._planning.active:
             self.controller.hold_here(time, state)
@@ -656,7 +656,7 @@ class ControlExecutive:
         task = self.servicing.task
         name = "" if task is None else task.value
         ends = self.controller.reference_ends
-        settled = 0.0  # Also while another motion is planned, whose end is not known.
+        settled = 0.0  # Also while another motion is planned, whose end time is unknown.
         flies = state is ControllerState.TRACKING and task is None and not self._planning.active
         if flies and ends is not None:
             settled = ends + self._config.settle_time

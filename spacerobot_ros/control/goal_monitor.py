@@ -246,8 +246,8 @@ class StallMonitor:
         if not self._largest:
             self._begin(time, controller, config)
         elif not self._at_rest and controller.reference_at_rest(time):
-            # Errors of a reference at rest are compared only with each other: those before
-            # say how fast it moved.
+            # Errors of a reference at rest are compared only with each other: earlier ones depend
+            # on its speed.
             self._largest = []
             self._begin(time, controller, config)
         self._next_sample = time + self._window / _SAMPLES
@@ -284,8 +284,8 @@ class StallMonitor:
         if now <= 1.0 or progress >= _LEAST_PROGRESS * before:
             self.cause = ""
         elif not self._at_rest and self._share < (1 - _LEAST_PROGRESS) * now:
-            self.cause = ""  # The errors grew on the way, and shrink again.
-        # Robots with little thrust begin slowly, and make more and more way.
+            self.cause = ""  # The errors grew during the motion, and shrink again.
+        # Robots with little thrust start slowly and then speed up.
         elif progress > max(earlier, 0.0) and not self.cause:
             pass
         elif self._at_rest or (self._lag > _LAG_SHARE and progress <= 0.0):

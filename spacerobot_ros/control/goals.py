@@ -1,5 +1,5 @@
-"""Goals of a controller: their parts, what a law controls of them, how they end, and the planning
-of their references, in parallel with the control loop.
+"""Goals of a controller: their parts, which of these a law controls, their outcome, and the
+planning of their references, in parallel with the control loop.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def goal_parts(
         _require_output(controller, key)
     parts = _parts_of(controller, identified) if hands else {key: identified}
     if key == END_EFFECTOR and all(each.link == "" for each in hands):
-        # A pose on the topic of the end-effector is met by the axes that are controlled.
+        # A pose on the end-effector topic is pursued along the controlled axes only.
         parts[key] = replace(parts[key], goal=replace(parts[key].goal, asked=_PLACE))
     for part, each in parts.items():
         _require_controlled(controller, part, each)
@@ -250,8 +250,8 @@ def goals_to_save(
 ) -> dict[str, IdentifiedGoal]:
     """Return the goals of the current reference by robot part.
 
-    ``asked`` are the parts of the poses of base and end-effector that goals request, ``waypoints``
-    those of the base.
+    ``asked`` are the base and end-effector pose components that goals request, ``waypoints`` the
+    base waypoints.
     """
     goal, selection = controller.goal, controller.law.outputs.selection
     shape = goal.joints.q if goal.joints is not None and selection.joints else None
@@ -293,11 +293,11 @@ class GoalWatch:
         self._error_bounds: Array | None = None
         """Output errors (m,) beyond which control is lost."""
         self._contacts: tuple[str, ...] = ()
-        """The links that touch."""
+        """Links in contact."""
         self.asked: dict[str, frozenset[Controlled]] = dict.fromkeys(GOAL_KEYS, frozenset())
         """Base and end-effector pose components requested by the current goals."""
         self.touched = ""
-        """First contact on the way to the current goal, and its time; empty: none."""
+        """First contact during the motion to the current goal, and its time; empty: none."""
 
     def begin(self, time: float) -> None:
         """Begin a goal or a task at a time, s."""
@@ -305,7 +305,7 @@ class GoalWatch:
         self._begin_motion()
 
     def begin_anew(self) -> None:
-        """Begin the motion to the goal again, from another pose."""
+        """Restart the motion to the goal from another pose."""
         self.monitor.restart_settling()
         self._begin_motion()
 
@@ -360,7 +360,7 @@ class GoalWatch:
         at_rest, ends = controller.reference_at_rest(time), controller.reference_ends
         assert ends is not None
         if not at_rest and not self.monitor.is_late(time, ends, config):
-            # Errors decide nothing while the reference moves.
+            # Errors do not decide the goal while the reference moves.
             self.monitor.restart_settling()
             return None
         decision = self.monitor.decide_by_errors(time, at_rest, ends, controller.errors(), config)
@@ -521,7 +521,7 @@ class GoalPlanning:
         if waits:
             return None
         if self.in_background and -math.inf < job.begins < time:
-            # The reference has gone on: a plan from where it will be in twice the time.
+            # The reference has moved on: plan from its state after twice the time.
             self._lead *= 2
             self._begin(time, state, controller, pending, plan.aims, plan.asked)
             return None
@@ -547,7 +547,7 @@ class GoalPlanning:
             return planner.plan(motion, seen, cancellation)
 
         last, self._job = self._job, PlanningJob(work, begins)
-        # Known before the work begins, so that it can be cancelled.
+        # Set before the work begins, so that it can be cancelled.
         self._plan = PlannedGoals(dict(pending), aims, asked, self._job)
         self._job.start(in_background=self.in_background, after=last)
 

@@ -89,7 +89,7 @@ class Saturated(NamedTuple):
     @property
     def limited(self) -> bool:
         """Whether any limit has changed the command."""
-        # It is looked at once a tick: to keep it takes longer.
+        # It is read once per tick: storing it would take longer.
         return any(self.excess.wrench_B.tolist()) or any(self.excess.tau.tolist())
 
 
@@ -223,7 +223,7 @@ class JointRateLimits:
 
 
 def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float:
-    """Return the largest share in [0, 1] of an added effort that keeps the sum within limits.
+    """Return the largest fraction in [0, 1] of an added effort that keeps the sum within limits.
 
     Zero if there is none: motors that cannot brake joints are not loaded further.
     """
@@ -239,14 +239,14 @@ def _affordable_push_share(wanted: Array, pushed: Array, effort: Array) -> float
 
 
 def _joint_dynamics(robot: SpaceRobot) -> ca.Function:
-    """Return ``(q, omega_WB_B, qdot) -> (Js, Fs, G)``, whatever the velocity of the base is."""
+    """Return ``(q, omega_WB_B, qdot) -> (Js, Fs, G)``, for any base velocity."""
     q, qdot = ca.SX.sym("q", robot.n), ca.SX.sym("qdot", robot.n)
     omega = ca.SX.sym("omega", 3)
     H = robot.function("inertia_matrix", compile=False)(q)
     C = robot.function("bias", compile=False)(q, ca.SX(3, 1), omega, qdot)
     J = robot.function(f"jacobian:{robot.base_link}", compile=False)(q)
     D, D_q, D_qq = H[3:6, 3:6], H[3:6, 6:], H[6:, 6:]
-    # Generalised forces on omega and q of a force and torque at the origin of the base.
+    # Generalised forces on omega and q due to a force and torque at the base origin.
     to_omega = ca.horzcat(J[:3, 3:6].T, ca.SX.eye(3))
     to_joints = ca.horzcat(J[:3, 6:].T, ca.SX(robot.n, 3))
     solved = solve_positive_definite(D, ca.horzcat(D_q, C[3:6], to_omega))

@@ -180,7 +180,7 @@ two velocities and two accelerations."""
 
 
 class _OutputGroup(NamedTuple):
-    """Outputs of one kind: error, error rate, wanted acceleration, rows of J_z, bias."""
+    """Outputs of one kind: error, error rate, desired acceleration, rows of J_z, bias."""
 
     error: ca.SX
     error_rate: ca.SX
@@ -338,7 +338,7 @@ class OutputVector:
         p_des, quaternion_des, v_des, omega_des, a_des, alpha_des = ca.vertsplit(
             target, [0, 3, 7, 10, 13, 16, 19]
         )
-        # The rate of J_B(q) z0dot at constant z0dot, then that of the axes it is given along.
+        # The rate of J_B(q) z0dot at constant z0dot, then that of the axes it is expressed in.
         z0dot = ca.SX.sym("z0dot", self.N)
         twist_rate = ca.jtimes(J_B @ z0dot, self.q, self.qdot)
         # A centre of mass without thrust adds no acceleration.

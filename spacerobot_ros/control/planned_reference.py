@@ -98,7 +98,7 @@ class PlannedReference(ReferenceProfile):
 
     @property
     def path(self) -> BasePath:
-        """Planned base poses over the time since the start."""
+        """Planned base pose as a function of the time since the start."""
         _, base, times = self.configurations()
         return BasePath(times, *base)
 

@@ -192,7 +192,7 @@ def profile_expression(
     """
     sizes = _profile_sizes(base, end_effector, n)
     duration, *rest = ca.vertsplit(numbers, np.cumsum([0, *sizes]).tolist())
-    # The time of a plant that begins again is before the start, even of a profile of no duration.
+    # The time of a restarted plant is before the start, even of a zero-duration profile.
     time = ca.fmax(time, 0)
     s, rate, acceleration = _quintic(time / duration, duration)
     moving, resting = [], []
@@ -260,7 +260,7 @@ class _PoseInterpolation:
     """A straight line and a geodesic in W, from one pose to another, m and rad.
 
     With the pose of a ``carrier`` at the start, the line is that of the carrier's origin, about
-    which the pose turns: ``r(s) = r_C + s d + e cos(s phi) + c sin(s phi)``.
+    which the pose rotates: ``r(s) = r_C + s d + e cos(s phi) + c sin(s phi)``.
     """
 
     def __init__(
@@ -268,10 +268,10 @@ class _PoseInterpolation:
     ) -> None:
         self._start, self._goal = start, goal
         turn_B = attitude_error(start.quaternion, goal.quaternion)
-        # The axis of the turn is fixed in the body and in W alike.
+        # The rotation axis is fixed both in the body and in W.
         self._turn_W: Array = matrix_from_quaternion(start.quaternion) @ turn_B
         self.angle = float(np.linalg.norm(turn_B))
-        # The quaternion of a turn by phi is linear in sin(phi/2) and cos(phi/2).
+        # The quaternion of a rotation by phi is linear in sin(phi/2) and cos(phi/2).
         axis = self._turn_W / self.angle if self.angle > 0 else np.zeros(3)
         self._r, self._d = start.position, goal.position - start.position
         self._e, self._c = np.zeros(3), np.zeros(3)
@@ -290,7 +290,7 @@ class _PoseInterpolation:
         return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
 
     def _arm(self, s: float) -> tuple[Array, Array]:
-        """Return the arm (3,) from the carrier that turns, and its derivative by the angle."""
+        """Return the rotating arm (3,) from the carrier, and its derivative by the angle."""
         sine, cosine = math.sin(s * self.angle), math.cos(s * self.angle)
         return cosine * self._e + sine * self._c, cosine * self._c - sine * self._e
 

@@ -101,7 +101,7 @@ class MeasuredTarget:
     """Description and last measurement of the target; None: not received.
 
     The momenta of a free target are constant, so their average predicts its motion better than one
-    measurement: noise in a rate grows with the time of a prediction.
+    measurement: noise in a rate grows with the prediction time.
     """
 
     def __init__(self) -> None:
@@ -157,13 +157,13 @@ _LATEST_BEGIN = 0.1
 
 
 class _Deviation(Enum):
-    """Where a target deviates from the motion that was predicted for the present plan."""
+    """When a target deviates from the motion predicted for the current plan."""
 
     NONE = "none"
     NOW = "now"
-    """It does at present, or there is no plan yet."""
+    """It deviates now, or there is no plan yet."""
     AT_CONTACT = "at contact"
-    """It would at contact, according to the average of its momenta, but does not at present."""
+    """It would deviate at contact, according to its average momenta, but does not now."""
 
 
 class ApproachTask:
@@ -187,9 +187,9 @@ class ApproachTask:
         """The job that plans an approach."""
         self._lead = PLANNING_TIME
         self._reason = _Deviation.NOW
-        """Why the latest plan was asked for."""
+        """Reason for the latest plan."""
         self._looks_ahead = True
-        """Whether deviations at contact count: not after a plan for one was not found."""
+        """Whether deviations at contact count: not after planning for one has failed."""
 
     def step(
         self,
@@ -230,7 +230,7 @@ class ApproachTask:
             if self._reason is not _Deviation.AT_CONTACT:
                 why = str(error).rstrip(".")
                 return self._ended(f"{why[0].lower()}{why[1:]}")
-            # The target is where it was predicted to be: the robot goes on with the present plan.
+            # The target is where it was predicted to be: the robot continues with the current plan.
             self._looks_ahead = False
         if self._plan is None:
             return _ACTIVE
@@ -309,7 +309,7 @@ class ApproachTask:
         *,
         in_background: bool,
     ) -> None:
-        """Have base and arm planned together."""
+        """Start planning the base and the arm together."""
         options, target = self.config.target, self.target
         grapple = Grapple(
             target.free_motion().later(max(time - target.time, 0.0)),
@@ -328,7 +328,7 @@ class ApproachTask:
     def _take_plan(
         self, time: float, controller: CoordinatedController, *, in_background: bool
     ) -> None:
-        """Begin with a plan of base and arm that is ready; until then the robot goes on with an
+        """Begin with a completed plan for base and arm; until then, the robot continues with an
         earlier one.
         """
         options, job = self.config.target, self._job
@@ -338,7 +338,7 @@ class ApproachTask:
         planned = job.result()
         self._looks_ahead = True
         if time - job.begins > _LATEST_BEGIN and in_background:
-            # Robot and target have gone on.
+            # The robot and the target have moved on.
             self._lead *= 2
             return
         self._predicted, self._planned_at = planned.grapple.motion, job.begins
@@ -512,7 +512,7 @@ class Servicing:
 
     @property
     def task(self) -> Task | None:
-        """The present task."""
+        """The current task."""
         return self._remaining_tasks[0] if self._remaining_tasks else None
 
     @property
@@ -533,7 +533,7 @@ class Servicing:
         self._remaining_tasks = list(tasks)
 
     def restart(self) -> None:
-        """Restart the present task."""
+        """Restart the current task."""
         if isinstance(self._present, ApproachTask):
             self._present.close()
         self._present = None
@@ -557,7 +557,7 @@ class Servicing:
         *,
         in_background: bool = False,
     ) -> TaskProgress:
-        """Advance the present task; DONE after the last task. ``in_background``: a thread plans."""
+        """Advance the current task; DONE after the last task. ``in_background``: a thread plans."""
         while self._remaining_tasks:
             if self.task is not Task.APPROACH or self.payload is None:
                 if self._present is None and self.task is Task.APPROACH:

@@ -22,7 +22,7 @@ from spacerobot_ros.model.target_motion import FrameMotion
 
 
 def _zero() -> Array:
-    # One of their own for each: callers' libraries refuse arrays that cannot be written to.
+    # A new array for each: callers' libraries reject read-only arrays.
     return np.zeros(3)
 
 
@@ -158,7 +158,7 @@ class Reference:
             R_WB = matrix_from_quaternion(state.quaternion_WB)
             R_BE, r_BE_B = robot.link_pose(end_effector, state.q)
             pose = PoseReference(state.r_WB + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE))
-        # The arrays of a state may be used again for the next one.
+        # The arrays of a state may be reused for the next one.
         base = PoseReference(state.r_WB.copy(), state.quaternion_WB.copy())
         return cls(base, pose, JointReference.at_rest(state.q.copy()))
 
@@ -246,7 +246,7 @@ class DeadReckoning:
             self._step.evaluate()
             self._x[:] = self._step.outputs[0]
         if q is not None and qdot is not None:
-            # At the middle of the difference the connection is right to second order.
+            # At the midpoint of the difference, the connection is second-order accurate.
             A = self.robot.connection((self._q + q) / 2)
             turn = quaternion_from_rotvec(-A[3:] @ (q - self._q))
             self._quaternion[:] = quaternion_multiply(self._quaternion, turn)

@@ -38,7 +38,7 @@ _DUMP_TIME = 5.0
 _DUMPED_SHARE = 0.02
 
 _DUMP_TORQUE_SHARE = 0.5
-"""Fraction of the thruster torque used for dumping; control needs the rest."""
+"""Fraction of the thruster torque used for dumping; the rest is reserved for control."""
 
 _MOTION_SHARE = 0.5
 """Fraction of wheel torque and momentum available to references."""
@@ -90,7 +90,7 @@ class WheelAllocation:
     """
 
     def __init__(self, axes: Array, torque: Array) -> None:
-        # Few robots have wheels, and it loads slowly: in flight, commands would stop meanwhile.
+        # Few robots have wheels, and it loads slowly, which would interrupt commands in flight.
         from scipy.optimize import lsq_linear
 
         self._solve = lsq_linear
@@ -290,7 +290,7 @@ class WheelControl:
         )
 
     def _bounds(self) -> tuple[Array, Array]:
-        """Return the least and largest torques (k,) that keep torque and rate limits."""
+        """Return the smallest and largest torques (k,) within the torque and rate limits."""
         wheels = self.wheels
         soon = wheels.inertia / (_MIN_PERIODS_TO_LIMIT * self._period)
         upper = np.clip(soon * (wheels.rate - self.rates), 0.0, wheels.torque)

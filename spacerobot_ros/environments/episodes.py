@@ -335,7 +335,7 @@ class Episodes:
                 )
 
     def _remember_starts(self) -> None:
-        """Let each robot begin like the scenario or a draw of its own, for all later episodes."""
+        """Start each robot from the scenario or its own draw in all later episodes."""
         every = np.arange(len(self.goals))
         starts = self._source.first(len(every), self.flights)
         which = every % len(starts)
@@ -391,7 +391,7 @@ class Episodes:
         return link
 
     def _action_scale(self, config: EpisodeConfig, scenario: Scenario) -> tuple[Array, Counts]:
-        """Return the command of an action of ones, and the entries that actions have."""
+        """Return the command for an action of ones, and the command entries set by actions."""
         size, force, torque = self.flights.command_size, config.max_force, config.max_torque
         scale = np.array(config.action_scale)
         if not scale.size:
@@ -450,7 +450,7 @@ class Episodes:
             states = InitialStates.of(self.robot, initial)
         if self._plants:
             for row, k, rng in zip(numbers, which.tolist(), own, strict=True):
-                # Each episode has another noise of the actuators.
+                # Each episode has different actuator noise.
                 sensors = drawn[k].scenario.plant.sensors
                 seeded = replace(sensors, seed=int(rng.integers(2**31)))
                 self._plants[row] = replace(drawn[k].scenario.plant, sensors=seeded)
@@ -505,7 +505,7 @@ class Episodes:
 
     @cached_property
     def _camera(self) -> Any:
-        # Slow to import, and few environments are drawn.
+        # Slow to import, and few environments are rendered.
         from spacerobot_ros.environments.rendering import Camera
 
         return Camera(self.task)
@@ -533,10 +533,10 @@ class Episodes:
         if shares.shape != wanted:
             raise CommandError(f"The actions have shape {shares.shape}, not {wanted}.")
         under_way, errors = flights.has_not_ended.copy(), self.errors.copy()
-        # The former is a copy.
+        # Indexing makes the first one a copy.
         before, after = self._states[self._arrays.arange(len(shares))], self._states
         flights.step(command_of(shares, self._scale, self._taken), self._config.hold)
-        # Robots that stand still are not measured: they take no random numbers.
+        # Robots that are not stepped are not measured, so they draw no random numbers.
         measured = self._arrays.flatnonzero(under_way)
         self._observe(measured if self._source.has_sensor_errors else slice(None))
         alive = flights.has_not_ended

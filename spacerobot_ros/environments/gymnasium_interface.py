@@ -12,7 +12,7 @@ from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
 from spacerobot_ros.environments.tasks import require_names
 from spacerobot_ros.errors import ParameterError
 
-import_gymnasium()  # Says how to install it where it is missing.
+import_gymnasium()  # States how to install it if it is missing.
 
 import gymnasium  # noqa: E402
 from gymnasium.error import Error, ResetNeeded  # noqa: E402
@@ -27,7 +27,7 @@ def _prepare(
     environment: Any, count: int, arguments: Mapping[str, Any], render_mode: str | None, lanes: bool
 ) -> tuple[Any, Any]:
     if render_mode not in (None, "rgb_array"):
-        # Libraries make environments without one after this type of error.
+        # After this type of error, libraries create environments without render_mode.
         raise TypeError(f"There is no render_mode '{render_mode}': use 'rgb_array', or omit it.")
     if render_mode and arguments.get("device"):
         raise TypeError("Environments on a device have no pictures: omit render_mode.")
@@ -48,7 +48,7 @@ def _begin_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _seeds_of(seed: Any, count: int) -> list[int | None]:
-    """Return a seed for each environment: those of a list, or s + i of a number s."""
+    """Return a seed for each environment: those of a list, or s + i for a number s."""
     alone = not isinstance(seed, list | tuple | np.ndarray)
     each = [seed] * count if alone else list(seed)
     if len(each) != count:
@@ -130,8 +130,8 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
     """Many robots in SIMD lanes, with the same episodes as :class:`SpaceRobotEnv`.
 
     With seed s, lane i has the same episodes as a single environment with seed s + i. A copy
-    (also by pickling) has the same arguments but a new state. On a device, all arrays are those of
-    the device, one generator serves all robots, and ``final_obs`` is one array.
+    (also by pickling) has the same arguments but a new state. On a device, all arrays are device
+    arrays, one generator serves all robots, and ``final_obs`` is one array.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         return self.episodes.observations.copy(), self._info(mask)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Step all episodes; ended episodes are restarted according to the autoreset mode."""
+        """Step all environments; ended episodes are reset according to the autoreset mode."""
         episodes, mode = self.episodes, self.autoreset_mode
         if not self._begun.all():
             raise ResetNeeded(

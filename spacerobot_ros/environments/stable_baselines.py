@@ -44,7 +44,7 @@ class SpaceRobotVecEnv(VecEnv):
         return seen
 
     def step_async(self, actions: Any) -> None:
-        """Step all episodes; ended episodes are restarted."""
+        """Step all environments; those whose episode has ended are reset."""
         self._stepped = self.env.step(actions)
 
     def step_wait(self) -> tuple[Any, Any, Any, list[dict[str, Any]]]:

@@ -1,8 +1,8 @@
 """Environment tasks: goals, observations, rewards, episode ends, and the commands for actions.
 
 All functions take the states of N robots at once, so the same code can observe one robot in a
-plant, many robots in lanes, or a robot controlled through ROS topics. NumPy's functions work on
-arrays of a device, too, and return such arrays; constants go there by ``np.asarray(constant,
+plant, many robots in lanes, or a robot controlled through ROS topics. NumPy's functions also work
+on device arrays, and return such arrays; constants are moved there by ``np.asarray(constant,
 like=array)``. A custom task is a class derived from :class:`Task`.
 """
 
@@ -257,7 +257,7 @@ class _DrawnTogether(Task):
 
 
 def _directions_and_shares(rngs: Generators, count: int) -> tuple[Array, Array]:
-    """Return random vectors (N, 3), even in all directions, and numbers (N, 1) from 0 to 1."""
+    """Return isotropic random vectors (N, 3), and random numbers (N, 1) from 0 to 1."""
     if not isinstance(rngs, Sequence):
         return rngs.standard_normal((count, 3)), rngs.random((count, 1))
     drawn = np.array([(*rng.standard_normal(3), rng.random()) for rng in rngs])

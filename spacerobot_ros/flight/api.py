@@ -119,7 +119,7 @@ def _require_goal(scenario: Scenario) -> None:
 
 
 def _raise_if_refused(flight: Flight) -> Flight:
-    """Return a flight whose goal was accepted; else raise PlanningError with the reason."""
+    """Return a flight whose goal was accepted; otherwise raise PlanningError with the reason."""
     if flight.outcome is Outcome.REFUSED:
         raise PlanningError(flight.message)
     return flight
@@ -202,7 +202,7 @@ def plan(
             options["end_effector_pose"] = end_effector_pose
             options["end_effector"] = end_effector
         if method is None:
-            # Without a method's name, options are options of `optimal`.
+            # Without a method name, the options are those of `optimal`.
             of_method = options.keys() - signature(planning.plan).parameters.keys()
             method = "optimal" if of_method else PlannerConfig().method
         return planning.plan(what, goal, method=method, **{**chosen, **options})
@@ -213,7 +213,7 @@ def plan(
     name = method or scenario.planner.method
     method_options(
         name, options
-    )  # Names are checked here, so that a message has the names as given.
+    )  # Names are checked here, so that messages contain the names as given.
     settings |= {f"{name}.{option}": value for option, value in options.items()}
     problem = PlanningProblem.of(scenario.with_overrides("planner", settings))
     state, tolerance = robot_state_of(problem.plant()), problem.config.tolerance
@@ -222,7 +222,7 @@ def plan(
 
 
 def _is_scenario(what: SpaceRobot | Scenario | str | Path, *, aimed: bool) -> bool:
-    """Whether a name is a scenario's; a goal turns a shared name into a robot's."""
+    """Whether a name denotes a scenario; with a goal, a shared name denotes the robot."""
     if isinstance(what, SpaceRobot | Scenario):
         return isinstance(what, Scenario)
     name = str(what)

@@ -147,7 +147,7 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
     held = [(each, each.payload.attached_to(alone)) for each in held_bodies(flight)]
     values = np.empty((len(rows), len(BUDGET_PARTS)))
     for row, (time, state) in enumerate(zip(states.time[rows], states.values[rows], strict=True)):
-        # The state of the capture itself shows the motion before it.
+        # The state at the capture itself still shows the motion before it.
         robot = next((r for each, r in held if each.start < time <= each.end), alone)
         motion, others = _motion(state), wheels.other
         omega, q, qdot = motion.twist[3:], motion.q[others], motion.qdot
@@ -190,7 +190,7 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
         )
     prefix = "measured_" if len(flight.signal("measured_pose")) else ""
     states, alone = _states(flight, robot, prefix), SpaceRobot(robot)
-    # The state of the capture itself shows the motion before it.
+    # The state at the capture itself still shows the motion before it.
     spans = [
         (each.payload.link, states.between(each.start + 2 * _SAME_TIME, each.end)) for each in held
     ]
@@ -204,7 +204,7 @@ def _payload_estimate(
 ) -> PayloadEstimate:
     about = states.values[:, :3].mean(axis=0)
     impulses = _impulses(flight, states, about)
-    # No state is in two triples.
+    # No state belongs to two triples.
     triples = max(min(most, len(states)) // 3, 1)
     middle = 1 + np.linspace(0, len(states) - 3, triples).round().astype(np.int64)
     rows = (middle[:, np.newaxis] + np.arange(-1, 2)).reshape(-1)
@@ -229,7 +229,7 @@ def _payload_estimate(
 
 def _impulses(flight: Flight, states: Signal, about: Array) -> Array:
     """Return the impulses (N, 6) of the thrust since the first of N states, N s and N m s about a
-    point, in W. Wrenches are constant over a tick in the frame of the base.
+    point, in W. Wrenches are constant over a tick in the base frame.
     """
     wrench = _thrust_during_ticks_before(flight, states.time[1:])
     step = np.diff(states.time)[:, np.newaxis]
@@ -257,7 +257,7 @@ def _impulses(flight: Flight, states: Signal, about: Array) -> Array:
 
 
 def _thrust_during_ticks_before(flight: Flight, times: Array) -> Array:
-    """Return the wrench (N, 6) of the thrusters on the base in the ticks that end at times (N,)."""
+    """Return the thruster wrench (N, 6) on the base in the ticks that end at times (N,)."""
     fired, commands = flight.signal("thruster_wrench"), flight.commands.get("base_wrench")
     found = np.zeros((len(times), 6))
     if len(fired):

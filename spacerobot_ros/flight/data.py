@@ -427,7 +427,7 @@ class FlightData:
             case PlannerStatus(state=PlannerState.REACHED, position_error_m=float(left)) if left > (
                 self.tolerance("position") or math.inf
             ):
-                # Bags of earlier versions do not name the parts.
+                # Bags from earlier versions do not list these components.
                 return ("position",)
         method = METHODS.get(self.method)
         if method is None:
@@ -507,11 +507,11 @@ class FlightData:
     @cached_property
     def unexplained_momentum(self) -> Signal:
         """Momenta and energy (N, 7) without the change in momenta due to thrusters, at the times
-        for which this change is known; if it is for none, no thrust is assumed."""
+        for which this change is known; if it is never known, no thrust is assumed."""
         balance, expected = self.signal("momentum"), self.signal("expected_momenta")
         if not len(balance) or not len(expected):
             return balance
-        # Recordings may begin or end between the two, and log them at slightly different times.
+        # A recording may begin or end between the two, and logs them at slightly different times.
         gaps = np.diff(balance.time)
         near = _SAME_TICK_SHARE * float(np.median(gaps)) if len(gaps) else 0.0
         of = np.searchsorted(expected.time, balance.time - near).clip(max=len(expected) - 1)
@@ -588,7 +588,7 @@ class FlightData:
 
     @property
     def _largest_end_effector_errors(self) -> tuple[float, float]:
-        """Distance (m) and angle (rad) as :class:`Measures` has them."""
+        """Distance (m) and angle (rad) as defined in :class:`Measures`."""
         if errors := self.end_effector_errors:
             angles = [errors[link].angle for link in self._turned_links]
             return max(each.distance for each in errors.values()), max(angles, default=math.nan)
@@ -692,7 +692,7 @@ class FlightData:
             return Verdict(word, reached_message(errors, parts))
         fact = "The goal is reached" if reached else "The goal is not reached in time"
         if late and (touched or self.message.startswith(fact)):
-            # The message of a controller names what kept it from the goal, if that is known.
+            # A controller's message states what kept it from the goal, if known.
             fact = self.message.partition(": ")[0]
         fact += ", but the target is not captured" * missed
         return Verdict(word, f"{fact}: {errors}.", succeeded, succeeded and not left_out)
@@ -704,11 +704,11 @@ class FlightData:
 
     @property
     def _last_error(self) -> PoseError | None:
-        """The true error at the end, of base, joints and end-effectors; None without any."""
+        """The final true error of base, joints and end-effectors; None if there is none."""
         base, links = self.error, tuple(self.end_effector_errors.values())
         hand = self.end_effector_error
         if not links and hand is not None:
-            # A controller that does not turn the end-effector leaves its attitude free.
+            # If the controller does not control the end-effector attitude, it is free.
             turn = hand.rotvec if self.turns_end_effector else np.zeros(3)
             links = (PoseError(hand.position, turn),)
         if base is None and not links:
@@ -718,7 +718,7 @@ class FlightData:
 
     @property
     def _joint_errors(self) -> Array:
-        """Errors (k,) of joints with goals, m or rad; of a controller, those of its outputs."""
+        """Errors (k,) of joints with goals, m or rad; for a controller, those of its outputs."""
         wanted = None if self.goal is None else self.goal.joint_positions
         if wanted is not None and len(self.q) and wanted.shape == self.q[-1].shape:
             return wanted - self.q[-1]

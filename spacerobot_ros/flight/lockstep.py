@@ -100,7 +100,7 @@ class FlightLog:
         self._thrusters = plant.thrusters
         self._propellant = np.zeros(1)
         true = {"pose": plant.pose, "twist": plant.twist, "q": plant.q, "qdot": plant.qdot}
-        # Measurements of sensors without error are the true arrays.
+        # Without sensor errors, the measurements are the true arrays.
         unused = [f"true_{name}" for name in true]
         unused += [] if reported.sensors.used else [f"measured_{name}" for name in true]
         sources = {
@@ -124,7 +124,7 @@ class FlightLog:
         self._reported = reported
 
     def add_state(self, tick: int) -> None:
-        """Add the present state."""
+        """Add the current state."""
         if self._thrusters is not None:
             self._propellant[0] = self._thrusters.propellant
         self._states.append(np.concatenate(self._parts))
@@ -311,7 +311,7 @@ def fly_scenario(
 
 
 class _DecisionState(Enum):
-    """When a commander has decided about the goal, as the plant sees it."""
+    """When, from the plant's point of view, a commander has decided about the goal."""
 
     BEFORE_COMMAND = "before its command"
     AFTER_COMMAND = "after its command"
@@ -510,7 +510,7 @@ class LockstepFlight:
             self._report_plant_status(PlantState.RUNNING)
 
     def _step(self) -> bool:
-        """Step under the commands of the tick; return whether the plant could."""
+        """Step with the commands of the tick; return whether the plant could step."""
         commands = self._commands.begin_step()
         try:
             self._plant.step(*commands)
@@ -529,7 +529,7 @@ class LockstepFlight:
         quantities, now = self._reported.quantities, self._now_ns
         q, qdot = quantities["measured_q"], quantities["measured_qdot"]
         if self._controller is not None:
-            # Joints whose pose is lost are answered at the next tick.
+            # Joint states whose pose is lost are answered at the next tick.
             q, qdot = q.copy(), qdot.copy()
         pose, twist = quantities["measured_pose"], quantities["measured_twist"]
         state = StateArrays(now, q, qdot, pose, twist)
@@ -546,7 +546,7 @@ class LockstepFlight:
                 self._report_commander(name, now)
 
     def _report_commander(self, name: str, now: int) -> None:
-        """Report how a commander answers states: it misses none."""
+        """Report how a commander answers states; it misses no state."""
         robot = self._commanders[name].robot
         assert robot is not None
         last, ignored = self._statuses.get(name), {"ignored": 0}
@@ -564,7 +564,7 @@ class LockstepFlight:
         self._moment = _DecisionState.AFTER_COMMAND
 
     def _send_reference(self, stamp_ns: int) -> None:
-        """Give the setpoint of a planner to the controller."""
+        """Pass the planner's setpoint to the controller."""
         assert self._planner is not None
         assert self._controller is not None
         position, velocity = self._planner.setpoint.position, self._planner.setpoint.velocity
@@ -573,7 +573,7 @@ class LockstepFlight:
         self.log.add_command(JOINT_REFERENCE, self._tick, velocity, (position, velocity))
 
     def _send_actuation(self, _: int) -> None:
-        """Offer the commands of the controller; its later decisions follow them."""
+        """Offer the controller's commands; its later decisions come after them."""
         assert self._controller is not None
         now, effort = self._now_ns, self._controller.effort
         for source in reversed(self._commands.sources):  # The wrench is sent first.
@@ -600,7 +600,7 @@ class LockstepFlight:
             if refusal.latches:
                 self._report_plant_status(PlantState.RUNNING)
 
-    # -- the status of the plant --------------------------------------------------------------
+    # -- plant status -------------------------------------------------------------------------
 
     def _report_plant_status(self, activity: PlantState) -> None:
         self._injected_seen, self._moment = self._plant.injected, _DecisionState.AFTER_COMMAND
@@ -619,9 +619,9 @@ class LockstepFlight:
     # -- goals and statuses -------------------------------------------------------------------
 
     def _send_goals(self) -> None:
-        """Send the goals as the client of a mission does: before the first state."""
+        """Send the goals as a mission client does: before the first state."""
         scenario, goal = self._scenario, self._scenario.goal
-        # A pose is checked, and its quaternion scaled, where it is received.
+        # A pose is checked, and its quaternion normalised, on reception.
         given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
         hands, asked = goal.end_effectors, goal.asked
         given = replace(given, end_effectors=hands, base=goal.base, asked=asked)

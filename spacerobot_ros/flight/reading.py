@@ -223,7 +223,7 @@ class FlightBag(RecordedRobot):
             try:
                 event = Event.from_values(message.values, message.message, message.level)
             except SpaceRobotError:
-                continue  # Of a later version.
+                continue  # The event is from a later version.
             yield time_ns, replace(event, node=message.name.strip("/"))
 
     def goals(self, topic: str) -> tuple[SentGoal, ...]:
@@ -244,7 +244,7 @@ class FlightBag(RecordedRobot):
                 frame = poses[-1].header.frame_id or frame
             *through, (position, attitude) = map(_pose_of, poses)
             if topic != "goal_pose" and not any(attitude):
-                # Zeros ask for the position of an end-effector alone.
+                # Zeros request only the position of an end-effector.
                 attitude = _NO_GOAL.quaternion.tolist()
             try:
                 goal = Goal.received(position, attitude, shape)
@@ -259,7 +259,7 @@ class FlightBag(RecordedRobot):
         return tuple(goals)
 
     def _goal_shapes(self) -> list[tuple[int, list[float] | None]]:
-        """Return the shapes that goals after a time (ns) are to end in; None: any."""
+        """Return the final shapes required of goals after a time (ns); None: any."""
         names = self.names("joint_states")
         shapes: list[tuple[int, list[float] | None]] = []
         for time_ns, message in self.messages("goal_joint_states"):
@@ -289,7 +289,7 @@ class FlightBag(RecordedRobot):
 
 
 def _completed(true: Signal, measured: Signal) -> Signal:
-    """Return true values, and measured ones before the first and after the last of them."""
+    """Return the true values, with measured values before the first and after the last one."""
     if not (len(true) and len(measured)):
         return true if len(true) else measured
     before, after = measured.time < true.time[0], measured.time > true.time[-1]
@@ -346,7 +346,7 @@ def namespaces(bag: Bag) -> list[str]:
         for topic, kind in bag.topics.items()
         if topic.endswith("/odom") and kind == TOPICS["odom"].type
     }
-    # The target of a robot has an odometry, too.
+    # A robot's target also has odometry.
     return sorted(found - {f"{name}/target" for name in found})
 
 
@@ -376,7 +376,7 @@ def read_flight(bag: FlightBag) -> Flight:
         )
     )
     reports = [status for _, status in statuses[decider]]
-    # Bags of version 0.1 have no ids.
+    # Bags from version 0.1 have no ids.
     topics = [topic(link) for link in scenario.goal_links for topic in (goal_topic, path_topic)]
     sent = goals or next(filter(None, map(bag.goals, topics)), ())
     follower, status = GoalFollower(sent[-1].goal_id if sent else "", unnamed=True), None
@@ -405,10 +405,10 @@ def read_flight(bag: FlightBag) -> Flight:
         end_effector_goals=tool_goals,
         status=status,
         gait=follower.gait,
-        # The distances of a flight are to one set of obstacles.
+        # Clearances refer to a single set of obstacles.
         measures_clearance="clearance" in bag and not bag.obstacles_change,
     )
-    # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
+    # A thruster table in a separate file is not read, because a bag may name any file.
     in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF
     return with_propellant(flight, IN_URDF, bag.names("thrusters")) if in_urdf else flight
 
@@ -500,7 +500,7 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     urdf, own = bag.urdf, nodes.get("plant", {}).get("robot", "")
     for values in nodes.values():
         if urdf is not None and values.get("robot") in ("", own):
-            # The text of the robot carries its obstacles.
+            # The robot's URDF contains its obstacles.
             values |= {"robot_description": urdf.decode(errors="replace"), "world": ""}
     published: tuple[Published, ...] = ()
     goal = end_effector_goal = None
@@ -512,7 +512,7 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
     with suppress(KeyError, ValueError):
         goal, end_effector_goal = _sent_goal(about, "goal"), _sent_goal(about, "end_effector_goal")
     shape = next(bag.messages("goal_joint_states"), None)
-    # Without any joint positions the shape was free.
+    # Without joint positions, the shape was free.
     if goal is not None and shape is not None and len(shape[1].position):
         goal = replace(goal, joint_positions=np.array(shape[1].position))
     links = _parse_json(about.get("end_effector_goals", "{}"))
@@ -609,7 +609,7 @@ def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
     goal = Goal(position, quaternion)
     if name != "goal":
         return goal
-    # Bags of earlier versions do not tell what was asked for: numbers of the origin were not.
+    # Bags from earlier versions do not state what was requested: zero values were not.
     given = {"position": position.any(), "attitude": quaternion[:3].any()}
     parts = about.get("goal_asked", " ".join(part for part in given if given[part])).split()
     waypoints = about.get("goal_waypoints")

@@ -67,8 +67,8 @@ _PUBLISHED_QOS = QosProfile(depth=100)
 class _Stream:
     """The messages of a topic, published at ``time_ns`` (N,), ns, in ascending order.
 
-    ``messages`` returns the bytes of some of them; ``stamp_ns`` is the stamp of all, None: that is
-    the time of their publication.
+    ``messages`` returns the bytes of some messages; ``stamp_ns`` is the stamp of all messages;
+    None: each is stamped with its publication time.
     """
 
     topic: Topic
@@ -140,7 +140,7 @@ def write_flight(flight: FlightData, writer: BagWriter) -> None:
             ):
                 stamp = time if stream.stamp_ns is None else stream.stamp_ns
                 entries.append((time, channel, message, stamp))
-        # The sort is stable: messages of one time stay in the order of the streams.
+        # The sort is stable: messages with equal times keep the order of the streams.
         for time, channel, message, stamp in sorted(entries, key=lambda entry: entry[0]):
             writer.write(channel, message, time, stamp)
     counts = {"messages": str(writer.messages_written), "messages_lost": "0"}
@@ -148,7 +148,7 @@ def write_flight(flight: FlightData, writer: BagWriter) -> None:
 
 
 def _streams(flight: FlightData) -> Iterator[_Stream]:
-    """Yield all topics; those of one time in this order."""
+    """Yield all topics; messages with equal times are in this order."""
     yield from _description_streams(flight)
     yield from _goal_streams(flight)
     yield from _state_streams(flight)
@@ -202,7 +202,7 @@ def _state_streams(flight: FlightData) -> Iterator[_Stream]:
 def _stamped_stream(
     topic: Topic, stamps: NDArray[np.int64], message: bytes, columns: Mapping[str, Array]
 ) -> _Stream:
-    """Return the stream of copies of a message with other stamps and numbers."""
+    """Return a stream of copies of a message with other stamps and numbers."""
 
     def copies(rows: slice) -> list[bytes]:
         chosen = {path: values[rows] for path, values in columns.items()}
@@ -212,7 +212,7 @@ def _stamped_stream(
 
 
 def _clearance_streams(flight: FlightData) -> Iterator[_Stream]:
-    """Yield the clearances, where distances are exact, as those of the plant's node are."""
+    """Yield the clearances if the distances are exact, as those of the plant node are."""
     if flight.clearance is None or not flight.clearance.geometry.exact:
         return
     plant = flight.scenario.plant
@@ -223,10 +223,10 @@ def _clearance_streams(flight: FlightData) -> Iterator[_Stream]:
 
 
 def _frame_streams(flight: FlightData) -> Iterator[_Stream]:
-    """Yield the transforms of the measured frames, and the markers of the true ones."""
+    """Yield the transforms of the measured frames, and the markers of the true frames."""
     config, robot = flight.scenario.plant, flight.required_robot()
     period, quantities = config.period_ns, topic_quantities(flight)
-    # As those that the recorder writes where no node publishes transforms.
+    # Like those that the recorder writes if no node publishes transforms.
     every = config.ticks_of(flight.scenario.config("recorder").tf_period)
     if every:
         frames = RobotTransforms(robot, config.world_frame, config.prefix_for(robot), links=True)
@@ -263,7 +263,7 @@ def _marker_maker(
     def make(rows: slice) -> list[bytes]:
         chosen = ticks[rows]
         R, r = (each[:, order] for each in kinematics.link_poses(flight.q[chosen]))
-        # Attitudes of links stand side by side.
+        # The link attitudes are stacked side by side.
         R = R.transpose(0, 2, 1, 3).reshape(len(chosen), 3, -1)
         return [
             markers.message(
@@ -300,7 +300,7 @@ def _description_streams(flight: FlightData) -> Iterator[_Stream]:
 
 
 def _goal_streams(flight: FlightData) -> Iterator[_Stream]:
-    """Yield the goals as the client of a mission sends them: before the first state."""
+    """Yield the goals as a mission client sends them: before the first state."""
     scenario = flight.scenario
     world, goal = scenario.plant.world_frame, scenario.goal
     if goal.joint_positions is not None:
@@ -419,7 +419,7 @@ def table_of_flight(flight: FlightData, *, euler: bool = False) -> TopicTable:
 
 
 def _prefix(topic: Topic, *, erred: bool) -> str | None:
-    """Return the words before the columns of a topic; None: its numbers are in another one too."""
+    """Return the column prefix of a topic; None: its numbers are also in another topic."""
     if topic.name == "base_pose":
         return None
     if topic.name in _MEASURED_STATE_TOPICS:
@@ -430,12 +430,12 @@ def _prefix(topic: Topic, *, erred: bool) -> str | None:
 
 
 def _names(flight: FlightData, topic: Topic) -> Sequence[str]:
-    """Return the names in the messages of a topic, of joints or thrusters."""
+    """Return the joint or thruster names in the messages of a topic."""
     if topic.short_type != "sensor_msgs/JointState":
         return ()
     if topic.array_entries_of != "thrusters":
         return flight.joint_names
-    # A table of thrusters that is a file of its own is not looked for: a bag may name any file.
+    # A thruster table in a separate file is not read, because a bag may name any file.
     source, robot = flight.scenario.plant.thrusters, flight.robot
     return find_thrusters(source, robot).names if robot is not None and source == IN_URDF else ()
 
@@ -446,7 +446,7 @@ def _prismatic(flight: FlightData) -> dict[str, bool]:
 
 
 def _single_numbers(flight: FlightData, names: set[str]) -> Iterator[Field]:
-    """Yield the quantities of one number that no topic has."""
+    """Yield the scalar quantities that no topic contains."""
     for name, values in flight.quantities.items():
         if name in names and values.shape == (len(flight.time), 1):
             yield Field(name, values[:, 0], (_UNITS.get(name, ""),))

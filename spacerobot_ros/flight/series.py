@@ -116,7 +116,7 @@ def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | Non
         reported = Goal.checked(named[:3], named[3:])
     except PlanningError:
         return None
-    # Bags of earlier versions have no ids: the goal that was sent has more digits.
+    # Bags from earlier versions have no ids; the goal that was sent has more digits.
     for sent in reversed(goals):
         goal = sent.goal
         same = np.allclose(goal.position, reported.position, rtol=1e-7, atol=1e-8)

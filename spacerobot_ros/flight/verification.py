@@ -158,7 +158,7 @@ def verify_bag(
     initial, rates = _initial_state(first, published, flight)
     resimulation = _resimulate(flight, initial, rates, first, last, mujoco=mujoco)
     if flight.config.actuation == "velocity" and not _has_efforts(published):
-        # An earlier version, which did not compute the efforts of servos, published zeros.
+        # An earlier version did not compute servo efforts, and published zeros.
         resimulation.states["effort"][:] = 0.0
     published = [p for p in published if p.is_determined_by(resimulation.states)]
     missing = _missing_states(flight, published, resimulation)
@@ -182,8 +182,8 @@ class _RecordedPlant:
     """The plant of a bag that was flown in lockstep.
 
     Parameters that an earlier version did not have are at their defaults. By tick, ``injections``
-    are the injected faults and disturbances, ``grasps`` requested captures (true) and releases
-    (false).
+    are the injected faults and disturbances, and ``grasps`` the requested captures (true) and
+    releases (false).
     """
 
     recorded: FlightBag
@@ -242,7 +242,7 @@ class _RecordedPlant:
 
 
 def _injections(recorded: FlightBag, topic: str, period_ns: int) -> dict[int, list[str]]:
-    """Return the texts on a topic by tick: without a stamp, that of their log time."""
+    """Return the strings on a topic by tick; they have no stamp, so the log time is used."""
     by_tick: dict[int, list[str]] = {}
     for time_ns, message in recorded.messages(topic):
         by_tick.setdefault(time_ns // period_ns, []).append(message.data)
@@ -256,7 +256,7 @@ def _requested_grasps(recorded: FlightBag, config: PlantConfig) -> dict[int, lis
         captured = event.kind is EventKind.CAPTURED
         if event.time_s is None or not (captured or event.kind is EventKind.RELEASED):
             continue
-        # The plant itself finds the captures that were automatic.
+        # The plant itself detects automatic captures.
         if not captured or capture_values(event.about).get("requested"):
             tick = round(event.time_s * SECOND / config.period_ns)
             grasps.setdefault(tick, []).append(captured)
@@ -305,7 +305,7 @@ def _plant_config(recorded: FlightBag) -> PlantConfig:
 
 @dataclass(frozen=True)
 class _PublishedTopic:
-    """The messages of one topic: ticks (N,), numbers (N, m), and what each number is called."""
+    """The messages of one topic: ticks (N,), numbers (N, m), and the name of each number."""
 
     topic: Topic
     name: str
@@ -345,7 +345,7 @@ class _PublishedTopic:
 
 
 def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
-    """Read the state topics; the plant stamps those without a header like its odometry."""
+    """Read the state topics; topics without a header get the stamps of the odometry."""
     recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
     published: list[_PublishedTopic] = []
     clock = recorded["odom"].stamp_ns
@@ -372,7 +372,7 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
                 for each, words in zip(topic.state, labels, strict=True)
             ]
         )
-        # The message has a wrong number of values.
+        # The message has the wrong number of values.
         table[np.isnan(table).any(axis=1)] = np.nan
         flat = [label for words in labels for label in words]
         published.append(_PublishedTopic(topic, series.topic, ticks, table, flat))
@@ -409,7 +409,7 @@ def _initial_state(
 ) -> tuple[InitialState | None, Array]:
     """Return the first state in the bag, and its joint velocities (n,).
 
-    If it is the very first, the state is None, for the parameters, and the velocities are zero.
+    At tick 0, the state is None (the parameters apply), and the velocities are zero.
     """
     if first == 0:
         return None, np.zeros(flight.robot.n)
@@ -445,9 +445,10 @@ class _Resimulation:
     """A re-simulation of the commands.
 
     ``states`` are the quantities of the topics, (ticks + 1, size) each, from tick ``first`` to tick
-    ``end``; ``stopped`` says why the plant went no further, ``latched`` in which tick a fault
-    latched, after which nothing moved. ``commanded_ticks`` are those with a command for the joints,
-    ``refusals`` those whose command was refused, with its topic. ``engine`` has flown beside it.
+    ``end``; ``stopped`` is the reason why the plant stopped there; ``latched`` is the tick in which
+    a fault latched, after which nothing moved. ``commanded_ticks`` are the ticks with a command for
+    the joints, ``refusals`` those with a rejected command, with its topic. ``engine`` is the engine
+    that was run in parallel.
     """
 
     first: int
@@ -469,7 +470,7 @@ def _resimulate(
     *,
     mujoco: bool,
 ) -> _Resimulation:
-    """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as it goes."""
+    """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as possible."""
     plant = build_plant(flight.robot, flight.config, initial)
     state = ReportedState(plant, flight.config)
     commands = CommandValidator(plant, flight.config)
@@ -483,9 +484,9 @@ def _resimulate(
         )
     plant.tick = first
     if flight.config.actuation == "velocity":
-        # The efforts of servos follow from the change of the velocities.
+        # Servo efforts follow from velocity changes.
         plant.qdot[:] = rates
-        # Wheels keep their rates where no command came since.
+        # Wheels without a later command keep their rates.
         joints = commands.sources[0]
         joints.command[joints.kept] = rates[joints.kept]
     recorded = [flight.commands(source) for source in commands.sources]
@@ -500,7 +501,7 @@ def _resimulate(
         done.engine = EngineFlight(plant, flight.config.period_ns / SECOND)
     for tick in range(first, last + 1):
         if state.update() or tick == first:
-            # Sensors that begin to err add the true states.
+            # Sensor errors that begin in flight add the true states.
             for quantity, values in state.quantities.items():
                 states.setdefault(quantity, np.full((last - first + 1, values.size), np.nan))
         for quantity, values in state.quantities.items():
@@ -510,10 +511,10 @@ def _resimulate(
         for inject, by_tick in zip((plant.inject, plant.disturb), flight.injections, strict=True):
             for text in by_tick.get(tick, ()):
                 with suppress(ParameterError):
-                    inject(text)  # A refused line changes nothing.
+                    inject(text)  # A rejected line has no effect.
         if plant.capturing is not None:
             for captures in flight.grasps.get(tick, ()):
-                with suppress(CommandError):  # The states show a capture that differs.
+                with suppress(CommandError):  # A different capture shows in the states.
                     (plant.capturing.capture if captures else plant.capturing.release)()
         now = tick * flight.config.period_ns
         for source, commanded in zip(commands.sources, recorded, strict=True):
@@ -538,7 +539,7 @@ def _resimulate(
 def _second_opinion(
     resimulation: _Resimulation, published: list[_PublishedTopic]
 ) -> EngineComparison | None:
-    """Return the differences of the engine to the true states in the bag; None: none has flown."""
+    """Return the engine's differences from the true states in the bag; None: no engine was run."""
     if resimulation.engine is None:
         return None
     topics = {p.topic.name: p for p in published}
@@ -551,7 +552,7 @@ def _second_opinion(
 def _require_no_reset(
     flight: _RecordedPlant, published: list[_PublishedTopic], resimulation: _Resimulation
 ) -> None:
-    """Refuse a bag in which a state is published a second time, and is the initial one again."""
+    """Reject a bag in which a state is published twice, the second time as the initial state."""
     for p in published:
         if p.topic.name != "joint_states" or not p.values.shape[1]:
             continue
@@ -759,7 +760,7 @@ class EngineFlight:
         self._shapes.append(self._engine.q.copy())
 
     def _unknown_force(self) -> str:
-        """Return a clause on a force in the last tick that the commands do not have; or none."""
+        """Return a clause about a force in the last tick that the commands lack; empty if none."""
         plant, before = self._plant, self._faults
         self._faults = plant.active
         names = plant.robot.joint_names

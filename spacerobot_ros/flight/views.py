@@ -172,7 +172,7 @@ _ICONS = {
 
 
 def _without_remote_icons(html: str) -> str:
-    """Return matplotlib's page with characters for icons, which it would take from a server."""
+    """Return matplotlib's page with characters in place of icons from a server."""
     html = re.sub(r"<link\b[^>]*>", "", html)
     return re.sub(
         r'<i class="fa fa-([^"]*)"></i>', lambda found: _ICONS.get(found[1], found[1]), html

@@ -33,8 +33,8 @@ _SHORT_TYPE_NAME = re.compile(
     r"([a-zA-Z]\w*)/(?:(msg|srv|action)/)?([a-zA-Z][a-zA-Z0-9]*)(\w*)", re.ASCII
 )
 
-# rosbag2's own expression for the type at the start of a field or constant: with any other one the
-# text of a schema could differ from the text that `ros2 bag record` writes.
+# rosbag2's own expression for the type at the start of a field or constant: with a different one,
+# the schema text could differ from the text written by `ros2 bag record`.
 _FIELD_TYPE = re.compile(r"(?:^|\n)\s*([a-zA-Z0-9_/]+)(?:\[[^\]]*\])?\s+", re.ASCII)
 
 _EVENT = """\
@@ -291,7 +291,7 @@ def _parsed(text: str, type_name: str) -> Any:
     # The parser is slow to import, and tools that read no messages do not need it.
     from rosbags.typesys import get_types_from_msg
 
-    # It takes messages of services for others: their names as those of messages are left alone.
+    # The parser would rename service types, but leaves names in the form of messages unchanged.
     parsed_name = type_name.replace("/srv/", "/msg/")
     types = get_types_from_msg(text, parsed_name)
     return {type_name if name == parsed_name else name: of for name, of in types.items()}

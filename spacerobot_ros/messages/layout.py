@@ -60,7 +60,7 @@ class Leaf:
     offset, size
         First byte and number of bytes; for a string, excluding the terminating zero.
     dtype
-        Type of the numbers; None for a text.
+        Type of the numbers; None for a string.
     shape
         ``()`` for one number or string, ``(k,)`` for an array.
     """
@@ -186,7 +186,7 @@ class Layout:
         begin = self.end
         self._advance(length)
         if path is not None:
-            # A serialised string ends with a zero; without it middlewares take all bytes.
+            # A serialised string ends with a zero; without it, middlewares use all bytes.
             zero = length > 0 and self._message[self.end - 1] == 0
             self.leaves[path] = Leaf(begin, length - zero, None, ())
 

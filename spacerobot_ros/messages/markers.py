@@ -73,7 +73,7 @@ def _erased(namespace: str, number: int) -> dict[str, Any]:
 
 
 def _line(namespace: str, number: int, places: Array, frame: str) -> dict[str, Any]:
-    """Return the fields of the marker of a line through places (K, 3)."""
+    """Return the marker fields of a line through points (K, 3)."""
     return {
         "header": {"frame_id": frame},
         "ns": namespace,
@@ -105,7 +105,7 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
     given = [each.path_values for each in goal.end_effectors if each.waypoints is not None]
     if given:
         markers.append(_line("given_path", 0, given[0][:, :3], frame))
-    else:  # One of an earlier goal is erased.
+    else:  # The path of an earlier goal is deleted.
         markers.append(_erased("given_path", 0))
     return encode(MARKER_ARRAY, {"markers": markers})
 
@@ -116,7 +116,7 @@ class RobotMarkers:
     Parameters
     ----------
     robot, target
-        The robot and the target; None for one that does not exist.
+        The robot and the target; None if it does not exist.
     frame
         Name of the world frame.
     """

@@ -223,7 +223,7 @@ class TemplateReader:
 
 
 def _as_little_endian(raw: bytes, type_name: str) -> bytes:
-    """Return a big-endian message as little-endian; IndexError if it is not of the type."""
+    """Return a big-endian message as little-endian; IndexError if it does not have the type."""
     kind = message_type(type_name, message_definition(type_name).encode())
     try:
         return kind.serialise(kind.decode(raw))
@@ -264,7 +264,7 @@ class JointReader:
         """Number of ignored parts of accepted messages, by description."""
         max_size = math.inf
         if measured:
-            # Every joint adds a name with its length and three numbers; a machine has other joints.
+            # Each joint adds its name, a length and three numbers; a machine also has other joints.
             own = sum(len(name.encode()) + 32 for name in joint_names)
             max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
@@ -304,7 +304,7 @@ class JointReader:
         if self._measured and "velocity" in self.values:
             rates = self.values["velocity"]
             if not math.isfinite(sum(rates.tolist())):
-                # Drivers without a measured rate say NaN.
+                # Drivers without a measured rate report NaN.
                 rates[~np.isfinite(rates)] = 0.0
                 self.ignored[_NOT_FINITE_RATES] += 1
 
@@ -341,7 +341,7 @@ class JointReader:
         return f"no message names {', '.join(absent)}"
 
     def require(self, raw: bytes) -> None:
-        """Reject a message that :meth:`accept` would reject; ``values`` stay.
+        """Reject a message that :meth:`accept` would reject; ``values`` are not changed.
 
         Raises
         ------
@@ -385,7 +385,7 @@ class JointReader:
 
     def _order_of(self, named: Sequence[str]) -> _JointOrder:
         """Return the order of named joints; a measured state may lack joints and name others, if it
-        names any of the model.
+        names at least one joint of the model.
         """
         joints = {name: i for i, name in enumerate(self._joints)}
         places = [i for i, name in enumerate(named) if name in joints]

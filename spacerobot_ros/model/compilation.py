@@ -38,7 +38,7 @@ _FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off")
 depend on the processor."""
 
 announcement_listeners: list[Callable[[str], None]] = []
-"""Functions called with a message when a long computation begins, which the log has too."""
+"""Functions called with a message, which is also logged, when a long computation begins."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ class BufferedFunction:
             (self.outputs, self._buffer.set_res),
         ):
             for i, memory in enumerate(memories):
-                # CasADi stores matrices by columns.
+                # CasADi stores matrices in column-major order.
                 setter(i, memory.ravel(order="K").data)
         if held is not None:
             *inputs, self._held = self.inputs
@@ -108,7 +108,7 @@ class BufferedFunction:
 
 
 def _dense_memory(size: tuple[int, int], sparsity: ca.Sparsity) -> Array:
-    """Return zeros for an argument or a result; of vectors 1-D, of matrices by columns."""
+    """Return zeros for an argument or a result; vectors are 1-D, matrices column-major."""
     if not sparsity.is_dense():
         raise ValueError("a buffered function has dense arguments and results")
     memory = np.zeros(size[0] * size[1])
@@ -198,7 +198,7 @@ def load_library(
             stored = cache.store(file_name, key, built.read_bytes())
         except OSError as error:
             raise NoLibraryError(error.strerror or str(error)) from None
-        # A loaded object stays when its file is deleted.
+        # An object stays loaded when its file is deleted.
         return _loaded(load, stored or built)
 
 
@@ -255,7 +255,7 @@ def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca
     Parameters
     ----------
     name
-        The function's own.
+        Name of the function.
     key
         Hash of everything the function depends on.
     build
@@ -299,7 +299,7 @@ def _compiler(*candidates: str | None) -> str | None:
 
 
 def cache_directory() -> Path:
-    """Return the cache folder of compiled objects; the folder may not exist."""
+    """Return the cache folder for compiled objects; the folder may not exist."""
     chosen = os.environ.get("SPACEROBOT_CACHE_DIR")
     if chosen:
         return Path(chosen)

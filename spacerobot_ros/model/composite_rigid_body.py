@@ -450,8 +450,8 @@ def _state_symbols(kin: TreeKinematics, *, loaded: bool) -> tuple[ca.SX, ca.SX]:
 
 @dataclass(frozen=True)
 class _Equations:
-    """The equations of motion in a state: of the shape, with ``omega_WB_B``, the moment over force
-    ``external`` of the wrench on the base, ``Q``, and the external loads, if any.
+    """The equations of motion in a state: the shape system, ``omega_WB_B``, the base wrench as
+    moment over force ``external``, ``Q``, and the external loads, if any.
     """
 
     system: ShapeSystem
@@ -476,7 +476,7 @@ def _equations(kin: TreeKinematics, x: ca.SX, command: ca.SX, *, loaded: bool) -
 
 
 def _joint_motion(kin: TreeKinematics, k: int) -> ca.SX:
-    """Return the motion (6,) of unit rate of joint k, as seen at the system's centre of mass."""
+    """Return the motion (6,) for a unit rate of joint k, at the system's centre of mass."""
     if kin.is_revolute(k):
         return ca.vertcat(kin.axis[k], ca.cross(kin.p[k] - kin.r_BC_B, kin.axis[k]))
     return ca.vertcat(ca.SX(3, 1), kin.axis[k])

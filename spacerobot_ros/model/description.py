@@ -426,7 +426,7 @@ def plane_normal(description: RobotDescription) -> Array | None:
     slides = []
     for body in description.bodies[1:]:
         assert body.joint is not None
-        # All turns are about the one normal, or the robot is spatial: the shape q = 0 tells both.
+        # All rotations are about the normal, or the robot is spatial: shape q = 0 shows both.
         rotations.append(rotations[body.parent] @ body.origin.R)
         axis = rotations[-1] @ body.joint.axis
         if body.joint.kind is JointKind.PRISMATIC:

@@ -297,7 +297,7 @@ def grasp_impact(
     link
         The end-effector; the impulse is given at the origin of the end-effector frame.
     motion, body
-        The motions before it.
+        The motions before the grasp.
     inertia
         Mass properties of the body in the body frame T.
     """
@@ -335,7 +335,7 @@ def combined_momenta(
     Parameters
     ----------
     masses
-        Of the two, kg.
+        Masses of the two systems, kg.
     centers
         Centres of mass of the two systems in W (3,), m.
     momenta
@@ -344,7 +344,7 @@ def combined_momenta(
     """
     first, second = momenta
     arm = centers[1] - centers[0]
-    # About the common centre of mass only the motion of one relative to the other counts.
+    # About the common centre of mass, only the relative motion counts.
     share = masses[0] / (masses[0] + masses[1])
     relative = share * second[:3] - (1.0 - share) * first[:3]
     return np.concatenate([first[:3] + second[:3], first[3:] + second[3:] + cross(arm, relative)])

@@ -242,7 +242,7 @@ class LinkPlacement:
         function = dense_function("placed", inputs, {"poses": ca.vertcat(*placed)})
         self._function = BufferedFunction(function)
         self._base, self._R, self._r = self._function.inputs
-        self._r = self._r.reshape(3, links)  # Of a single link, it is a vector.
+        self._r = self._r.reshape(3, links)  # For a single link, it is a vector.
         self.poses = self._function.outputs[0].reshape(len(frames), 7)
 
     def update(self, base: Array, link_R: Array, link_r: Array) -> None:

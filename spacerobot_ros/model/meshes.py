@@ -53,7 +53,7 @@ Faces = npt.NDArray[np.int32]
 class TriangleMesh:
     """Triangles: ``vertices`` (N, 3) in m, ``faces`` (M, 3) of vertex indices.
 
-    Face corners keep their order in the file, normally counterclockwise seen from outside.
+    Face corners keep their order in the file, normally counterclockwise viewed from outside.
     """
 
     vertices: Array
@@ -71,7 +71,7 @@ class TriangleMesh:
     def coarsened(self, most: int) -> TriangleMesh:
         """Return a simplified mesh of at most ``most`` faces.
 
-        Vertices in the same grid cell are replaced by their mean, and faces without area are
+        Vertices in the same grid cell are replaced by their mean, and zero-area faces are
         removed. The cells are cubes, obtained by halving the bounding cube as often as ``most``
         allows.
         """
@@ -249,7 +249,7 @@ def _mesh_error(name: str, error: Exception) -> MeshError:
 
 
 def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
-    """Return a mesh without faces of zero area; refuse invalid coordinates and indices."""
+    """Return a mesh without faces of zero area; reject invalid coordinates and indices."""
     vertices, faces = mesh.vertices, mesh.faces
     if len(faces) > _MAX_TRIANGLES:
         raise _DamagedError(f"it has {len(faces)} triangles, and at most {_MAX_TRIANGLES} are read")
@@ -300,7 +300,7 @@ def mesh_from_corners(corners: npt.NDArray[Any]) -> TriangleMesh:
 
 
 def _read_obj(data: bytes) -> TriangleMesh:
-    """Read vertices and faces of OBJ; a face of many corners becomes a fan of triangles."""
+    """Read vertices and faces of OBJ; a polygonal face becomes a fan of triangles."""
     corners: list[tuple[float, float, float]] = []
     faces: list[tuple[int, int, int]] = []
     for line in data.replace(b"\\\n", b" ").replace(b"\\\r\n", b" ").splitlines():
@@ -324,7 +324,7 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
         import trimesh
 
         if path.suffix.lower() == ".dae":
-            import collada  # noqa: F401  # What trimesh reads COLLADA with
+            import collada  # noqa: F401  # Used by trimesh to read COLLADA
     except ImportError:
         raise MeshError(
             f"The mesh {path} requires trimesh, which is not installed: "
@@ -335,13 +335,13 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
         found = load(path, force="mesh", process=False, skip_materials=True)
         vertices = np.asarray(found.vertices, dtype=float).reshape(-1, 3)
         faces = np.asarray(found.faces, dtype=np.int32).reshape(-1, 3)
-    except Exception as error:  # Each parser of trimesh raises exceptions of its own.
+    except Exception as error:  # Each trimesh parser raises its own exceptions.
         raise _DamagedError(f"trimesh says {type(error).__name__}") from error
     return TriangleMesh(vertices * _unit_in_metres(path, data), faces)
 
 
 def _unit_in_metres(path: Path, data: bytes) -> float:
-    """Return the unit of a COLLADA file in m; other formats have metres."""
+    """Return the unit of a COLLADA file in m; other formats use metres."""
     if path.suffix.lower() != ".dae":
         return 1.0
     found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)

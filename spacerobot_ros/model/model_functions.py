@@ -203,7 +203,7 @@ class ModelFunctions:
         )
 
     def _state_symbols(self, v: str, *, quaternion: bool = False) -> dict[str, ca.SX]:
-        """Return symbols of shape and velocities by name; ``v`` is the name of the linear one."""
+        """Return shape and velocity symbols by name; ``v`` is the name of the linear velocity."""
         attitude = {"quaternion_WB": ca.SX.sym("quaternion", 4)} if quaternion else {}
         return {
             **attitude,
@@ -238,7 +238,7 @@ class ModelFunctions:
         )
 
     def _servo_efforts(self, *, loaded: bool = False) -> ca.Function:
-        """Return the efforts of servos that change the rates of the joints within ``h``."""
+        """Return the servo efforts that change the joint rates within ``h``."""
         n, quaternion = self.n, ca.SX.sym("quaternion", 4)
         before, after = ca.SX.sym("before", n), ca.SX.sym("after", n)
         L_W, h = ca.SX.sym("L_W", 3), ca.SX.sym("h")
@@ -263,10 +263,10 @@ class ModelFunctions:
 
     def _curvature(self) -> ca.Function:
         K = curvature(self._connection, self._kin.q)
-        # Columns run over i fastest: reshaped in Fortran order this is (6, i, j).
+        # Index i varies fastest: reshaped in Fortran order, this is (6, i, j).
         stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
         inputs = {"q": self._kin.q} | self.mass_inputs
-        # It has few common subexpressions, and looking for them takes several times as long.
+        # It has few common subexpressions, and searching for them takes several times as long.
         names = [*inputs], ["result"]
         return ca.Function("curvature", [*inputs.values()], [ca.densify(stacked)], *names)
 
@@ -323,7 +323,7 @@ _MAX_SYMBOLIC_MODELS = 8
 
 @dataclass(frozen=True)
 class _RobotKey:
-    """A robot identified by a hash of facts about it."""
+    """A robot identified by a hash of its relevant properties."""
 
     key: str
     robot: RobotDescription = field(compare=False)

@@ -7,7 +7,7 @@ qdot`` (paper 1, eq. 3). For a vector ``eta``, ``eta' L`` is a sum over the bodi
 motion of body k at ``omega`` and ``qdot``. Spatial vectors and inertias are as in
 :mod:`.composite_rigid_body`: angular part first, base components, at the system's centre of mass.
 
-Joint i moves all bodies that it carries. Seen from those bodies, the rest of the system moves in
+Joint i moves all bodies that it carries. Relative to those bodies, the rest of the system moves in
 the opposite direction: V1 changes by ``a_i = V1 x S_i``, and the motion V2 of the carrier of joint
 i by ``b_i = V2 x S_i``. Let ``h1_i = I^c_i V1`` and ``h2_i = sum_k I_k V2_k`` be the momenta of the
 bodies that joint i carries, ``S x*`` the cross product of motion and force, and P_j the momentum
@@ -24,7 +24,7 @@ and if joint i carries joint j or is joint j, the second derivatives are
 The second derivatives are zero for joints on different branches. All derivatives are for a given
 motion of the centre of mass. To keep the centre of mass at rest, subtract
 ``(f1_x' f2_y + f2_x' f1_y) / M``, where f1 and f2 are the linear momenta of the two motions, and
-subscripts denote derivatives by the variables x and y.
+subscripts denote derivatives with respect to x and y.
 
 These formulas need a tenth of the operations of CasADi's derivatives. The formulas are derived
 here; the derivative of a subtree's momentum with respect to its joint is from R. Featherstone,
@@ -62,7 +62,7 @@ def momentum_derivatives(
     motion = {0: ca.vertcat(omega, -linear * kin.per_mass)}
     for k in joints:
         motion[k] = motion[kin.parent(k)] + S[k] * rates[k - 1]
-    # Of the bodies beyond joint k, without those that it carries as if rigidly.
+    # Momenta of the bodies beyond joint k due to the joints beyond it.
     beyond = {k: ca.SX(6, 1) for k in range(len(joints) + 1)}
     for k in reversed(joints):
         beyond[kin.parent(k)] += beyond[k] + P[k] * rates[k - 1]

@@ -174,7 +174,7 @@ def estimate_payload(
     shares = np.sqrt(np.sum(fit.undetermined**2, axis=0))
     spread = np.sqrt(
         np.sum((fit.determined * fit.deviations[:, np.newaxis]) ** 2, axis=0)
-        # The part in undetermined directions is left out; it is about as large as the others.
+        # The part in undetermined directions is omitted; it is about as large as the others.
         + (shares * np.linalg.norm(x)) ** 2
     )
     unknown = shares > _MIN_UNDETERMINED_SHARE
@@ -200,7 +200,7 @@ class _Fit:
 
 
 def _fit(rows: Array) -> _Fit:
-    """Return the fit of rows (T, 3, 6, 11) of triples of states: the last column by the others."""
+    """Return the fit of the last column of rows (T, 3, 6, 11) of state triples by the others."""
     flat, between = rows.reshape(-1, 11), _usual_differences(rows).reshape(-1, 11)
     errors = len(flat) / len(between) * between.T @ between
     signal = flat.T @ flat - errors
@@ -213,7 +213,7 @@ def _fit(rows: Array) -> _Fit:
     inverse = determined.T / power[found]
     x = inverse @ (determined @ signal[:10, 10])
     left = rows[..., :10] @ x - rows[..., 10]
-    # Each row by its own error.
+    # Each row is weighted by its own error.
     gains = (rows[..., :10] @ inverse) * left[..., np.newaxis]
     deviations = np.sqrt(np.sum(gains**2, axis=(0, 1, 2)))
     rounding = _ROUNDING * max(float(np.linalg.norm(x)), 1e-300)
@@ -223,7 +223,7 @@ def _fit(rows: Array) -> _Fit:
 def _usual_differences(rows: Array) -> Array:
     """Return the second differences (N, 6, 11) of triples of rows, with the variance of a row.
 
-    Errors are in all states; a jerk of the motion itself is in few, which are left out.
+    Errors affect all states; jerks of the motion itself affect few, which are omitted.
     """
     differences = (rows[:, 0] - 2.0 * rows[:, 1] + rows[:, 2]) / np.sqrt(6.0)
     size = np.linalg.norm(differences, axis=(1, 2))
@@ -239,8 +239,8 @@ def _errors_of_means(rows: Array) -> Array:
 def _weighted_by_modes(fit: _Fit, modes: Array, errors: Array, least: float) -> _Fit:
     """Return the fit of modes (K, 6, 11) in the directions that another fit has determined.
 
-    What is not determined is about as large as the rest, and has no errors to be subtracted.
-    ``errors`` (6, 11, 11) are covariances of errors of the modes, ``least`` is the least standard
+    The undetermined part is about as large as the rest, and has no errors to subtract.
+    ``errors`` (6, 11, 11) are error covariances of the modes, ``least`` is the smallest standard
     deviation of a momentum.
     """
     known, size = len(fit.determined), float(np.linalg.norm(fit.x))
@@ -252,7 +252,7 @@ def _weighted_by_modes(fit: _Fit, modes: Array, errors: Array, least: float) -> 
     combined = basis @ np.append(fit.x, -1.0)
     for _ in range(_ROUNDS):
         variances = _mode_variances(modes @ combined, least)
-        # Second differences have jerks of the motion beside the noise, which is in all modes.
+        # Second differences contain jerks of the motion besides noise, which affects all modes.
         noise = variances[-1] / (np.einsum("cij,i,j->c", errors, combined, combined) + least**2)
         of_errors = np.einsum("kc,cij->ij", np.minimum(noise, 1.0) / variances, errors)
         power = np.einsum("kci,kc,kcj->ij", modes, 1.0 / variances, modes)
@@ -271,8 +271,8 @@ def _weighted_by_modes(fit: _Fit, modes: Array, errors: Array, least: float) -> 
 def _mode_variances(left: Array, least: float) -> Array:
     """Return the variances (K, 6) of the momenta in K modes, of which ``left`` (K, 6) are samples.
 
-    They are the likeliest ones of white noise, which is equal in all modes, and a random walk,
-    which falls with the square of the frequency.
+    They are the most likely sums of white noise, equal in all modes, and a random walk, which falls
+    with the square of the frequency.
     """
     frequency = 2.0 * np.sin(0.5 * np.pi * np.arange(1, len(left) + 1) / (len(left) + 1))
     shapes = 1.0 + _WALK_SHARES[:, np.newaxis] * frequency**-2

@@ -39,11 +39,11 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def _components(quaternion: Any) -> Any:
-    """Return the numbers x, y, z and w of a quaternion (4,), or their arrays (...) of many (...,
-    4), which may be on a device."""
+    """Return x, y, z and w of a quaternion (4,), or their arrays (...) for quaternions (..., 4),
+    which may be on a device."""
     if getattr(quaternion, "ndim", 1) > 1:
         return [quaternion[..., k] for k in range(4)]
-    # Arithmetic of Python's numbers is the same to the last bit, and several times faster.
+    # Python's float arithmetic is bit-identical and several times faster.
     return np.asarray(quaternion, dtype=float).tolist()
 
 
@@ -75,7 +75,7 @@ def rpy_from_matrix(R: npt.ArrayLike) -> Array:
     m = np.asarray(R, dtype=float)
     yaw = math.atan2(m[1, 0], m[0, 0])
     c, s = math.cos(yaw), math.sin(yaw)
-    # The roll of what is left without the yaw is as exact near a right angle as elsewhere.
+    # Without the yaw, the roll of the rest is as exact near a right angle as elsewhere.
     roll = math.atan2(s * m[0, 2] - c * m[1, 2], c * m[1, 1] - s * m[0, 1])
     return np.array([roll, math.atan2(-m[2, 0], math.hypot(m[0, 0], m[1, 0])), yaw])
 
@@ -209,11 +209,11 @@ def unit_quaternion(quaternion: npt.ArrayLike) -> Array:
 
 def quaternion_from_matrix(R: Array) -> Array:
     """Return the unit quaternion (x, y, z, w) of a rotation matrix (3, 3)."""
-    # In Python's numbers, which are faster than entries of arrays.
+    # In Python floats, which are faster than array entries.
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
     trace = xx + yy + zz
     squares = (1 + 2 * xx - trace, 1 + 2 * yy - trace, 1 + 2 * zz - trace, 1 + trace)
-    # The divisor is the largest of four squares, which keeps precision near half turns.
+    # The divisor is the largest of four squares, which keeps precision near rotations by pi.
     largest = max(squares)
     s = 0.5 / math.sqrt(largest)
     match squares.index(largest):

@@ -196,8 +196,8 @@ class SpaceRobot:
 
     @cached_property
     def _acceleration_jacobians(self) -> ca.Function:
-        """Return the function of the derivatives of ``[vdot; omegadot; qddot]`` in B by the
-        velocities, ``q``, and the actuation.
+        """Return the function for the derivatives of ``[vdot; omegadot; qddot]`` in B with respect
+        to the velocities, ``q``, and the actuation.
         """
         n = self.n
         q, v, omega, qdot = (ca.SX.sym("x", m) for m in (n, 3, 3, n))
@@ -247,7 +247,7 @@ class SpaceRobot:
             There is no such link.
         """
         J = self.jacobian(link, q)
-        # The centre of mass rests, and the base turns by -A qdot.
+        # The centre of mass is at rest, and the base rotates at -A qdot.
         return np.asarray(J[:, 6:] - J[:, 3:6] @ self.connection(q)[3:])
 
     def connection(self, q: npt.ArrayLike) -> Array:
@@ -391,7 +391,7 @@ class SpaceRobot:
         return self._buffers[name](*(np.asarray(a, dtype=float) for a in arguments))
 
     def _require_positive_inertia(self) -> None:
-        """Refuse a robot whose inertia matrix is singular; the message names the joint or link."""
+        """Reject a robot whose inertia matrix is singular; the message names the joint or link."""
         H = self._model.function("inertia_matrix", compile=False)
         p = [] if self._p is None else [self._p]
         middle = np.clip(np.zeros(self.n), self.lower, self.upper)

@@ -74,7 +74,7 @@ def disabled_pairs(root: Element, links: list[str], source: str) -> frozenset[fr
 
 
 def _with_pairs(urdf: str, pairs: frozenset[frozenset[str]]) -> str:
-    """Return a URDF text that carries these pairs alone."""
+    """Return a URDF text that contains only these pairs."""
     root = editable_root(urdf)
     for each in root.findall("disable_collisions"):
         root.remove(each)

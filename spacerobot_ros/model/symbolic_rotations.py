@@ -24,7 +24,7 @@ def quaternion_from_matrix(R: ca.SX) -> ca.SX:
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (ca.horzsplit(row) for row in ca.vertsplit(R))
     trace = xx + yy + zz
     squares = [1 + 2 * xx - trace, 1 + 2 * yy - trace, 1 + 2 * zz - trace, 1 + trace]
-    # The divisor is the largest of four squares, which keeps precision near half turns.
+    # The divisor is the largest of four squares, which keeps precision near rotations by pi.
     largest = ca.mmax(ca.vertcat(*squares))
     whole, s = ca.sqrt(largest) / 2, 0.5 / ca.sqrt(largest)
     about_x = ca.vertcat(whole, (yx + xy) * s, (zx + xz) * s, (zy - yz) * s)

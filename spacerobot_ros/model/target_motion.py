@@ -218,7 +218,7 @@ class RelativePath:
 
 
 def _quintic(start: Sequence[Array], end: Sequence[Array], T: float) -> Array:
-    """Return the coefficients (6, m) of polynomials of fifth order in time."""
+    """Return the coefficients (6, m) of fifth-order polynomials in time."""
     (y, v, a), (y_1, v_1, a_1) = (
         (value, rate * T, acceleration * T**2) for value, rate, acceleration in (start, end)
     )
@@ -419,7 +419,7 @@ class TargetExpression(NamedTuple):
 
 
 def _rotate_vectors(R: Array, vectors: Array) -> Array:
-    """Return vectors (K, 3) turned by matrices (K, 3, 3)."""
+    """Return vectors (K, 3) rotated by matrices (K, 3, 3)."""
     return np.asarray(np.einsum("kij,kj->ki", R, vectors))
 
 

@@ -270,7 +270,7 @@ def _read_vector(
         vector = np.array([float(x) for x in entry.get(key, default)])
     except (TypeError, ValueError):
         vector = np.empty(0)
-    # Larger numbers are slips, and their squares overflow.
+    # Larger numbers are typing errors, and their squares overflow.
     if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_TABLE_NUMBER):
         raise ParameterError(
             f"The {key} of {where} is {entry.get(key, 'missing')}; it must be three finite numbers "
@@ -368,14 +368,14 @@ class ThrusterAllocation:
         return Allocation(levels, self._wrenches @ levels)
 
     def _correct_levels(self, levels: Array, target: Array, free: npt.NDArray[np.bool_]) -> Array:
-        """Return levels, at least zero, of which the free ones remove the error from the target."""
+        """Return nonnegative levels; the free ones are corrected to remove the target error."""
         columns = self._columns[:, free]
         corrected = levels.copy()
         corrected[free] += np.linalg.lstsq(columns, target - self._columns @ levels, rcond=None)[0]
         return np.maximum(corrected, 0.0)
 
     def _largest_part(self, target: Array, bounds: Array) -> Array:
-        """Return the cheapest levels within bounds that make the largest part of the target."""
+        """Return the cheapest levels within bounds that produce the largest part of the target."""
         from scipy.optimize import linprog
 
         cost = np.append(self._cost[self._usable], -_WRENCH_WEIGHT)
@@ -421,7 +421,7 @@ class ThrusterModulator:
         self.table, self._control_period = table, control_period
         self._wrenches, self._shortest = table.wrenches, table.min_on_time
         count = len(table.names)
-        # Numbers without rational relations: no sums of costs are equal either.
+        # Rationally independent numbers, so that sums of costs differ, too.
         tie_break = 1.0 + TIE_BREAK * np.sin(np.arange(1.0, count + 1.0) ** 2)
         self.allocation = ThrusterAllocation(self._wrenches, table.mass_flow * tie_break)
         """Distributes wrenches over the thrusters."""
@@ -497,7 +497,7 @@ class ThrusterModulator:
         return on_time
 
     def _pulses(self, levels: Array) -> tuple[Array, Array]:
-        """Return the on-times (m,) of a period, and the parts of ``levels`` that pulses take, s."""
+        """Return the on-times (m,) of a period, and the parts of ``levels`` used by pulses, s."""
         h, remaining = self._control_period, self._remaining
         levels = np.where(levels > _ROUNDING * h, levels, 0.0)
         whole = (levels > 0.0) & (levels >= (1.0 - _ROUNDING) * self._shortest)

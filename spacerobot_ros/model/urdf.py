@@ -125,7 +125,7 @@ def require_found_meshes(world: RobotDescription) -> None:
 
 
 def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescription:
-    """Return the description of a file, whose paths of meshes become absolute."""
+    """Return the description in a file, with absolute mesh paths."""
     text = _read_text(path)
     try:
         return parse(text)
@@ -137,7 +137,7 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
 
 
 def _read_text(path: Path) -> str:
-    """Return the URDF text of a file, expanded and with absolute paths of meshes."""
+    """Return the URDF text of a file, expanded and with absolute mesh paths."""
     try:
         text = read_regular(path).decode("utf-8").replace("\r\n", "\n")
     except OSError as error:
@@ -298,7 +298,7 @@ def parse_world(text: str) -> RobotDescription:
 
 
 def _read_tree(text: str) -> RobotDescription:
-    """Return the links and joints of a URDF text, whatever their masses."""
+    """Return the links and joints of a URDF text, regardless of their masses."""
     root = _root_of(text)
     elements = {kind: _named_elements(root, kind) for kind in ("link", "joint")}
     if len(elements["link"]) > _MAX_LINKS:
@@ -412,7 +412,7 @@ _ATTRIBUTES = {
     },
     "color": {"rgba": (4, "red, green, blue and opacity, from 0 to 1")},
 }
-"""Count of numbers (0: a text), and meaning or unit, of every attribute that is read."""
+"""Count of numbers (0: text), and meaning or unit, of every attribute that is read."""
 
 _GEOMETRIES = ("box", "cylinder", "sphere", "capsule", "mesh")
 
@@ -426,7 +426,7 @@ _REMEDIES = {
 
 
 class _MalformedError(RobotDescriptionError):
-    """A flaw of the form of a URDF, with the text to write instead."""
+    """A formal error in a URDF, with the text to write instead."""
 
     def __init__(self, flaw: str, remedy: str) -> None:
         super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
@@ -504,7 +504,7 @@ def _is_number(word: str) -> bool:
 
 
 def _require_known_attributes(element: Element, where: str) -> None:
-    """Refuse unknown attributes of an element whose attributes are optional: they are misspelt."""
+    """Reject unknown attributes of an element whose attributes are optional: they are misspelt."""
     known = _ATTRIBUTES[element.tag]
     if unknown := set(element.keys()).difference(known):
         flaw = f"the <{element.tag}> of {where} has the unknown attribute '{min(unknown)}'"
@@ -550,7 +550,7 @@ def _read_link(name: str, link: Element, colours: dict[str, tuple[float, ...]]) 
 
 
 def _is_supported(collision: Element, where: str) -> bool:
-    """Warn of forms of other programs, such as planes."""
+    """Warn about shapes known only to other programs, such as planes."""
     form = next((each.tag for each in collision.iterfind("geometry/*")), None)
     if form not in _GEOMETRIES:
         warn_once(
@@ -624,7 +624,7 @@ def _nearest_inertia(about: Array) -> Array:
 
 
 def _refuse_impossible_inertia(welded: list[Link]) -> NoReturn:
-    """Refuse a body of impossible inertia; the message names the worst of its welded links."""
+    """Reject a body with impossible inertia; the message names the worst of its welded links."""
 
     def excess(link: Link) -> float:
         low, middle, high = np.linalg.eigvalsh(link.inertia.about_com)

@@ -181,7 +181,7 @@ def _box_corners() -> Array:
 
 
 def _surface_of_revolution(radii: list[float], heights: Array) -> TriangleMesh:
-    """Return the surface of revolution of a profile in the plane of x and z about z."""
+    """Return the surface of revolution of a profile in the x-z plane about z."""
     angles = np.linspace(0.0, 2 * np.pi, _FACETS_AROUND, endpoint=False)
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_FACETS_AROUND)])
     rings = [r * circle + [0.0, 0.0, z] for r, z in zip(radii, heights, strict=True)]
@@ -303,7 +303,7 @@ class MeshFolder:
             mesh = mesh_of_stl(data, resource).coarsened(_MAX_FACES_IN_BAG)
         except MeshError:
             return None
-        # Name and bytes are not copied from the bag, which a stranger may have written.
+        # Name and bytes are not copied from the bag, which may come from a stranger.
         path = Path(self._folder.name, f"{len(self._files)}.stl")
         path.write_bytes(stl_of(mesh))
         return path

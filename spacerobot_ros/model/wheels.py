@@ -108,7 +108,7 @@ class ReactionWheels:
         Parameters
         ----------
         L_B
-            (3,) in the base, kg m^2/s.
+            (3,) in base components, kg m^2/s.
         near
             (k,) preferred rates of redundant wheels, rad/s; by default zero.
         largest
@@ -135,7 +135,7 @@ class ReactionWheels:
             return np.asarray(nearest)
         from scipy.optimize import linprog  # Slow to import, and few robots have wheels.
 
-        # The shares x of the limits whose largest one, t, is the least: |x| <= t.
+        # The fractions x of the limits with the smallest maximum t: |x| <= t.
         k = len(self)
         U, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
         rows = U.T[sizes > _MOMENTUM_ROUNDING * sizes[0]]
@@ -209,7 +209,7 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
 
 
 def _imbalance_clause(body: Body, axis: Array) -> str:
-    """Return a clause on a wheel that is no body of revolution; empty if it is one."""
+    """Return a clause on a wheel that is not a body of revolution; empty if it is one."""
     inertia = body.inertia
     offset = float(np.linalg.norm(np.cross(axis, inertia.com)))
     if offset > _MAX_OFFSET:

@@ -74,8 +74,8 @@ def main(file: str, seconds: int, arguments: Sequence[str]) -> int:
         substitution_args._eval_find = find
         given = _Arguments(each.split(":=", 1) for each in arguments)
         text = str(xacro.process_file(file, mappings=given).toxml())
-    except Exception as error:  # Of xacro, its expressions, the XML parser
-        # xacro's exceptions repeat the one that they wrap.
+    except Exception as error:  # From xacro, its expressions or the XML parser; xacro's exceptions
+        # repeat the wrapped one.
         error = getattr(error, "exc", None) or error
         reason = " ".join(str(error).split()) or type(error).__name__
         print(f"REASON {reason}", file=sys.stderr)

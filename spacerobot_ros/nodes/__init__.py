@@ -37,7 +37,7 @@ _CLASSES_BY_NODE = {
     "viewer": "ViewerNode",
 }
 
-# A node starts in half of the time without the modules of the others.
+# Without the modules of the other nodes, a node starts in half the time.
 _class_named = lazy_names(
     __name__,
     {

@@ -63,7 +63,7 @@ class CoordinatedControlNode(CommanderNode):
     config: ControllerConfig
     commander: ControllerCommander
 
-    # -- life ---------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------
 
     def make_commander(self) -> ControllerCommander:
         """Return the ROS-independent controller used by this node."""
@@ -165,7 +165,7 @@ class CoordinatedControlNode(CommanderNode):
         awaited = status.message if status.state is ControllerState.WAITING else ""
         decision = status.state, status.goal_id, awaited
         lasts, self._published = self._published == decision, decision
-        # One lost message is no matter for the log.
+        # A single lost message is not logged.
         if status.state is ControllerState.ESTIMATING:
             if lasts:
                 self.get_logger().warning(status.message, throttle_duration_sec=5.0)

@@ -78,7 +78,7 @@ class PlannerNode(CommanderNode):
         """Numbers and computation times of plans and commands so far."""
         return self.commander.statistics
 
-    # -- life ---------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------
 
     def make_commander(self) -> PlannerCommander:
         """Return the ROS-independent planner used by this node."""

@@ -70,7 +70,7 @@ _PRELIMINARY_TOPICS = tuple(
         *("events", "diagnostics", "heartbeat", "goal_pose", "goal_path", _DESCRIPTION_TOPIC),
     )
 )
-"""Ends of topics on which commanders and clients publish before a plant starts."""
+"""Suffixes of topics on which commanders and clients publish before a plant starts."""
 
 _TEXT_TYPE = "std_msgs/msg/String"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
@@ -123,12 +123,12 @@ class RecorderNode(FlightNode):
         still be requested."""
         super().__init__(name, **kwargs)
 
-    # -- life ---------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Open the bag and subscribe to topics, which are recorded once the node is active."""
         config = self.config
-        # What may be refused comes before the bag, which would stay open.
+        # Checks that may fail come before the bag is opened, as it would stay open.
         descriptions = _read_descriptions(config.describe)
         self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
         self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
@@ -221,7 +221,7 @@ class RecorderNode(FlightNode):
             path, count = self.recording.writer.path, self.recording.messages
             self.get_logger().info(f"{count} messages are recorded in {path}.")
 
-    # -- what it has ---------------------------------------------------------------------------
+    # -- contents ------------------------------------------------------------------------------
 
     @property
     def messages_recorded(self) -> int:
@@ -271,10 +271,10 @@ class RecorderNode(FlightNode):
             self._warn_of_clocks(self.recording, clocks)
 
     def _warn_of_clocks(self, recording: Recording, publishers: int) -> None:
-        """Warn of a second clock, between which the times of the bag jump.
+        """Warn of a second clock, because times in the bag jump between the clocks.
 
-        The middleware lists a killed plant for a while beside the one that is started again, but
-        the clock goes back once only for each plant that is listed after the first.
+        For a while, the middleware lists a killed plant together with the restarted one, but the
+        clock jumps back only once for each listed plant after the first.
         """
         if publishers < 2:
             self._steps_back_of_one_clock = recording.clock_steps_back
@@ -289,7 +289,7 @@ class RecorderNode(FlightNode):
     # -- subscriptions ------------------------------------------------------------------------
 
     def _is_chosen(self, topic: str, type_name: str) -> bool:
-        """Whether a topic is recorded: one that is asked for, or else all of the stack."""
+        """Whether a topic is recorded: a requested one or, by default, any topic of the stack."""
         if self._chosen_topics:
             return topic in self._chosen_topics
         if topic in self._shared_topics:
@@ -349,7 +349,7 @@ class RecorderNode(FlightNode):
         qos = _subscribed_qos(offered)
         if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
             recording.latched[channel] = None
-        # Latched topics keep their last message: one that is replaced in transit is not lost.
+        # Latched topics keep their last message: a message replaced in transit is not lost.
         events = None if channel in recording.latched else loss_events(recording, topic)
         self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
 
@@ -416,8 +416,8 @@ class RecorderNode(FlightNode):
 class _RecordedTransforms:
     """Writes transforms of one robot, computed from its recorded topics.
 
-    A state is taken when its odom and its joint_states are there, whichever comes first; so the
-    transforms have the stamps of states, and at least ``period`` s of bag time between them.
+    A state is used once its odom and its joint_states have arrived, in either order. So the
+    transforms have the stamps of states, and are at least ``period`` s of bag time apart.
     ``topics`` are the names of /tf and /tf_static in the bag, ``sources`` those of odom,
     joint_states and robot_description. While ``is_published``, a node publishes /tf itself: its
     messages are recorded, and none are written here.
@@ -462,7 +462,7 @@ class _RecordedTransforms:
         self._state = StateFrames(description)
 
     def _write_complete_state(self) -> None:
-        """Write the transforms if the period is over, or time has gone back."""
+        """Write the transforms if the period is over, or time has jumped back."""
         if self._odom[HEADER_STAMP] != self._joint_states[HEADER_STAMP]:
             return
         state, time_ns = self._state, first_time_ns(self._odom)
@@ -474,12 +474,12 @@ class _RecordedTransforms:
             state.accept(self._odom, self._joint_states)
             frames = self._frames or self._begin(state, time_ns)
         except (CommandError, RecordingError):
-            return  # It is of another robot. The next message reports a failed write.
+            return  # The state is of another robot. The next message reports a failed write.
         self._last_ns, self._next_ns = time_ns, time_ns + self._period_ns
         self._recording.record(self._channel, frames.message(time_ns, state.pose, state.q), time_ns)
 
     def _begin(self, state: StateFrames, time_ns: int) -> RobotTransforms:
-        """Return the transforms of the robot of a first state; write those of fixed links."""
+        """Return the transforms for the robot in the first state; write those of fixed links."""
         assert self._description is not None
         writer, (moving, fixed) = self._recording.writer, self._topics
         frames = RobotTransforms(self._description, state.world, state.prefix, links=True)
@@ -500,7 +500,7 @@ def _recording_callback(
     clock: str,
     listener: RawCallback | None,
 ) -> RawCallback:
-    """Return the callback of a topic's messages: the clock sets the time of all others."""
+    """Return the callback for a topic's messages; the clock sets the time of all others."""
     record = recording.record
     urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
 

@@ -66,7 +66,7 @@ class ReplayNode(FlightNode):
     and ends its process at the end of the bag. Meshes in ``robot_description`` that are not on
     this machine are written from the bag to temporary files.
 
-    Services: The services are ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step``
+    Services: ``~/pause`` (SetBool), ``~/resume`` and, while paused, ``~/step``
     (Trigger), which sends the next message. A time on ``replay/seek`` sets the position, and
     ``replay/status`` reports it.
     """
@@ -82,11 +82,11 @@ class ReplayNode(FlightNode):
         self._meshes: MeshFolder | None = None
         super().__init__(name, **kwargs)
 
-    # -- life ---------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Open the bag and create the publishers and services."""
-        # A failed configuration leaves its bag and files open.
+        # A failed configuration may have left its bag and files open.
         self.cleanup()
         config = self.config
         if not config.bag:
@@ -120,8 +120,8 @@ class ReplayNode(FlightNode):
         """Wait for readers, then continue the replay."""
         self._begun = False
         self._wait = SubscriberWait(_READER_CHECK_PERIOD, self.config.wait)
-        # One timer for the next message, always set anew: half the load of looking every
-        # millisecond. Its first period is never waited for.
+        # One timer, which is reset for each message: half the load of a check every millisecond.
+        # Its first period never elapses.
         self._timer = self.create_timer(1.0, self._send_due_messages, clock=self._steady)
         self._timer.cancel()
         self._waiting = self.create_timer(
@@ -177,7 +177,7 @@ class ReplayNode(FlightNode):
             if own_clock and topic.name == _CLOCK_TOPIC:
                 continue
             if topic.name in own:
-                continue  # The bag recorded the status of another replay, which is left out.
+                continue  # The bag contains the status of another replay, which is omitted.
             name = new_names.get(topic.name, topic.name)
             try:
                 publisher = self.create_publisher(
@@ -190,7 +190,7 @@ class ReplayNode(FlightNode):
                 ) from None
             except SpaceRobotError as error:
                 message = f"Topic '{topic.name}' is not replayed: {error}"
-                # Every bag has transforms, and few machines without ROS have their type.
+                # Every bag contains transforms, but few machines without ROS have their type.
                 if topic.type_name == TRANSFORM_TYPE:
                     self.get_logger().info(message)
                 else:
@@ -362,7 +362,7 @@ def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Calla
 
 
 def _publisher_qos(qos: QosProfile) -> QoSProfile:
-    """Return the QoS of a publisher; a depth that a bag lacks is that of the stack."""
+    """Return the QoS of a publisher; without a depth in the bag, the stack's depth is used."""
     latched = qos.durability == "transient_local"
     best_effort = qos.reliability == "best_effort"
     return QoSProfile(

@@ -143,7 +143,7 @@ def analyze(
 
 
 def _reason_against_method(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
-    """Return the reason why a method plans no goal of a robot; None if it plans some."""
+    """Return the reason why a method cannot plan for a robot at all; None if it can."""
     try:
         method.require_suitable(robot)
     except PlanningError as refusal:

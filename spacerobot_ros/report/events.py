@@ -42,8 +42,8 @@ _GOOD, _BAD, _WARN, _PLAIN = PALETTE[2], "#c62f2f", PALETTE[1], PALETTE[0]
 class _Mark:
     """How events of a kind are drawn.
 
-    ``row`` 0 is for goals and plans, 1 for faults, 2 for the robot; ``strong`` ones are marked over
-    the full height of a chart.
+    ``row`` 0 is for goals and plans, 1 for faults, 2 for the robot; ``strong`` marks span the full
+    height of a chart.
     """
 
     label: str
@@ -118,7 +118,7 @@ def event_text(event: Event) -> str:
 
 
 def shown_events(events: Iterable[Event]) -> list[tuple[float, Event]]:
-    """Return the events that are drawn with their times, s, in the order of time."""
+    """Return the events that are drawn with their times, s, in chronological order."""
     # The comparison is false for NaN.
     timed = [(each.time_s, each) for each in events if each.kind in _MARKS]
     found = [(time, each) for time, each in timed if time is not None and abs(time) < 1e12]
@@ -147,7 +147,7 @@ def draw_events(axes: Axes, events: Sequence[tuple[float, Event]]) -> None:
     for kind, mark in _MARKS.items():
         times = [time for time, each in shown if each.kind is kind]
         if times:
-            # Without texts, faults need no row of their own.
+            # Without labels, faults need no separate row.
             height = 0 if mark.row else 1
             lane.plot(times, [height] * len(times), clip_on=False, **_marker_style(mark))
     kinds = {each.kind for _, each in shown}

@@ -126,7 +126,7 @@ def _shipped_style(name: str) -> Path:
 
 
 def _apply_style(path: Path) -> None:
-    import matplotlib.style as styles  # This import reads all styles of matplotlib.
+    import matplotlib.style as styles  # This import reads all matplotlib styles.
 
     shipped = _shipped_style(str(path))
     warnings: list[str] = []
@@ -250,14 +250,14 @@ def sheet(
 
 
 EVENTS = "events"
-"""Label of the axes of event strips."""
+"""Label of event strip axes."""
 
 _LETTER_WIDTH = 0.32
 """Space for the letter above a panel, inches."""
 
 
 def letter_panels(figure: Figure) -> None:
-    """Begin the titles of panels by (a), (b) and so on if there are several."""
+    """Prefix the panel titles with (a), (b) and so on if there are several panels."""
     panels = [each for each in figure.axes if each.get_visible() and each.get_label() != EVENTS]
     where = mpl.rcParams["axes.titlelocation"]
     for number, axes in enumerate(panels if len(panels) > 1 else ()):
@@ -367,7 +367,7 @@ def flight_dashes(number: int) -> tuple[float, ...]:
 def draw_traces(
     axes: Axes, signal: Signal, colours: Sequence[str], dashes: tuple[float, ...] = ()
 ) -> None:
-    """Draw every column of a signal; of dense ones the extremes in each time slice."""
+    """Draw every column of a signal; for a dense signal, the extremes in each time slice."""
     for index, tint in enumerate(colours if len(signal) else ()):
         part = thinned(Signal(signal.time, signal.values[:, [index]]), TRACE_TIME_SLICES)
         axes.plot(
@@ -406,7 +406,7 @@ def set_range(
 
 
 def log_range(values: Array, decades: int) -> tuple[float, float]:
-    """Return the ends of a logarithmic axis: ``decades`` powers of ten up to the largest value."""
+    """Return logarithmic axis limits: ``decades`` powers of ten up to the largest value."""
     largest = float(np.nanmax(values, initial=0.0))
     top = float(np.ceil(np.log10(largest))) if largest > 0 else -15.0
     return 10.0 ** (top - decades), 10.0**top

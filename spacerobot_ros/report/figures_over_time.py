@@ -104,7 +104,7 @@ def draw_group(axes: Axes, group: TraceGroup, end: float, later: Sequence[float]
 
 
 def _set_value_axis(axes: Axes, group: TraceGroup) -> None:
-    """Set the y axis to the values of a group; on a logarithmic one, smaller values are at the
+    """Set the y axis to the values of a group; on a logarithmic axis, smaller values are at the
     lower edge.
     """
     if group.decades:
@@ -138,8 +138,8 @@ def time_figure(
 ) -> ReportFigure | str:
     """Return a figure with one panel per group; a sentence if nothing was recorded over time.
 
-    ``caption`` is its beginning. ``flights``: labels of the flights whose traces the groups
-    contain.
+    ``caption`` is the beginning of its caption. ``flights``: labels of the flights whose traces
+    the groups contain.
     """
     if all(len(signal) < 2 for group in groups for signal in group.signals):
         return ONE_STATE_TEXT
@@ -214,12 +214,12 @@ def figure_of_flights(
 
 
 def _draw_rows(axes: Axes, group: TraceGroup) -> None:
-    """Draw each trace as a band in a row of its own, the first on top."""
+    """Draw each trace as a band in its own row, the first on top."""
     count = len(group.names)
     signal = thinned(group.signal, TRACE_TIME_SLICES)
     for index, tint in enumerate(group.colours):
         values, foot = signal.values[:, index], count - 1 - index
-        # A value holds from the sample before.
+        # A value applies from the previous sample on.
         on = values > 0
         on[:-1] |= on[1:]
         top = foot + _DUTY_ROW_HEIGHT * values
@@ -565,7 +565,7 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
     if touching:
         caption += "; below the dotted line, links touch according to the URDF geometry"
     if not clearance.geometry.exact:
-        caption += "; distances are lower bounds, since the package coal is not installed"
+        caption += "; distances are lower bounds, since coal is not installed"
     return time_figure(flight, "clearance", "Clearance", caption, [group])
 
 
@@ -657,7 +657,7 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 def _error_decades(values: Array, tolerance: float | None) -> int:
-    """Return the powers of ten of an axis that has the largest error and the tolerance on it."""
+    """Return the number of decades of an axis that shows the largest error and the tolerance."""
     _, top = log_range(values, 0)
     down_to = 0.1 * tolerance if tolerance else 1e-4 * top
     return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MAX_DECADES))
@@ -684,7 +684,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
 
 
 def _match_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
-    """Return the measured samples that have a true one of equal time, and its index."""
+    """Return the measured samples with a true sample at the same time, and its index."""
     if not len(true):
         return Signal.empty(measured.width), np.zeros(0, int)
     at = np.clip(np.searchsorted(true.time, measured.time - 1e-9), 0, len(true) - 1)

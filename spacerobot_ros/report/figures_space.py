@@ -125,8 +125,8 @@ def view_of(flight: FlightReport) -> View:
 def _choose_instants(flight: FlightReport) -> list[int]:
     """Return up to six recorded states with about equal motion in between.
 
-    Of a gait that ends with equal cycles, three are before the cycles and three at one phase of the
-    cycles.
+    If a gait ends with equal cycles, three states are before the cycles, and three are at the same
+    phase of the cycles.
     """
     time, cycles = flight.time, flight.cycles
     if cycles is not None and cycles.start > 0.0:
@@ -143,7 +143,7 @@ def _choose_instants(flight: FlightReport) -> list[int]:
 
 
 def _indices_ending_at(last: int, found: Indices) -> list[int]:
-    """Return indices, each once, the last one replaced by that of the last recorded state."""
+    """Return unique indices; the last one is replaced by that of the last recorded state."""
     return np.unique([*np.minimum(found[:-1], last), last]).tolist()
 
 
@@ -227,7 +227,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
         goals.append(flight.base_goal.position)
     goals += [sent.goal.position for sent in flight.tool_goals[-1:]]
     goals += [goal.position for goal in flight.link_goals.values()]
-    # Beside the reach of an arm, the path of a base without thrust would be a dot.
+    # Compared with an arm's reach, the path of a base without thrust would be a dot.
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
     flown = [flight, *(other for other in beside if len(other.time))]
     tints = [_FLIGHT_COLOURS[k % len(_FLIGHT_COLOURS)] for k in range(len(flown))]
@@ -295,8 +295,8 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
 def _square_panels(
     count: int, across: int, stacked: float, beside: float
 ) -> tuple[Figure, list[Axes]]:
-    """Return so many panels: above each other in a narrow figure, else ``across`` in a row; each of
-    a height in inches.
+    """Return ``count`` panels: stacked in a narrow figure, else ``across`` per row; the heights are
+    ``stacked`` and ``beside``, inches.
     """
     if narrow():
         figure, panels = sheet([[1.0]] * count, [stacked] * count, gap=0.75)
@@ -313,7 +313,7 @@ _LOOP_JOINTS, _SHOWN_CYCLES = 3, 3
 
 def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Joint positions plotted against each other, for pairs of the first three joints; None without
-    joints, which the figure of joint positions says."""
+    joints, which the joint position figure reports."""
     columns = flight.shape_columns[:_LOOP_JOINTS]
     names = [flight.joint_names[i] for i in columns]
     if not names and flight.robot is not None:

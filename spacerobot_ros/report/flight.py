@@ -117,7 +117,7 @@ class FlightReport(Flight):
     def efforts(self) -> Signal:
         """Commanded joint efforts (N, n), in the joint order of the states."""
         names = self.joint_names
-        # Commands of velocities hold no efforts, and reading them takes a while.
+        # Velocity commands contain no efforts, and reading them takes a while.
         velocity = self.parameter("plant", "actuation") == "velocity"
         given = [] if velocity else self.bag.names("joint_commands")
         if not given or sorted(given) != sorted(names):

@@ -118,7 +118,7 @@ def _outcome_html(flight: FlightReport) -> str:
             "(planner/status, controller/status).</p>"
         )
     statuses, verdict = [each for _, each in flight.timed_statuses], flight.verdict
-    # A controller holds its pose after it has refused a goal.
+    # A controller holds the pose after it has refused a goal.
     of_goals = (x for x in reversed(statuses) if isinstance(x, str) or x.state.value not in _IDLE)
     last = next(of_goals, statuses[-1])
     tone = "" if isinstance(last, str) else last.state.value
@@ -129,7 +129,7 @@ def _outcome_html(flight: FlightReport) -> str:
         word, sentence = verdict.word, verdict.sentence
     if tone.startswith("reached"):
         tone = "reached" if verdict.complete else "reached partly"
-    sentence = sentence_case(sentence.removeprefix(f"{word}: "))  # Aborted goals say so, too.
+    sentence = sentence_case(sentence.removeprefix(f"{word}: "))  # Such as 'Aborted: '.
     state = f"<b>{escape(word)}</b>" if word else ""
     return f'<p class="outcome {escape(tone)}">{state}{unbroken(sentence)}</p>'
 
@@ -193,7 +193,7 @@ def _figures_html(figures: Figures, *, has_events: bool) -> list[str]:
 
 
 def _events_html(events: Sequence[tuple[float, Event]]) -> list[str]:
-    """Return the table of events by time; of very many the first rows."""
+    """Return the table of events by time; if there are very many, only the first rows."""
     if not events:
         return []
     rows = [(f"{time:.6g}", event_text(event), event.message, event.node) for time, event in events]
@@ -256,7 +256,7 @@ def charts_of(
 
 
 def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
-    """Return the events of a flight; the last of several of one kind and time counts them."""
+    """Return the events of a flight; simultaneous events of one kind are numbered."""
     found = []
     together: dict[tuple[float, EventKind], list[str]] = {}
     for time, event in flight.timed_events[:_MAX_CHART_EVENTS]:
@@ -277,7 +277,7 @@ def _chart_data(group: TraceGroup, labels: Sequence[str]) -> dict[str, Any]:
         values = np.hstack([each.at(time) for each in signals])
         names += [f"{name}, {label}" for label in labels for name in group.names]
     if group.decades:
-        # uPlot's own logarithmic axes go wrong with numbers as small as rounding errors.
+        # uPlot's own logarithmic axes fail with numbers as small as rounding errors.
         floor, _ = log_range(values, group.decades)
         values = np.log10(np.maximum(values, floor))
         limits = [[k, float(np.log10(each))] for k, each in group.limits if each > floor]

@@ -89,7 +89,7 @@ def _scripts_html(parts: Sequence[PagePart]) -> str:
     for part in parts:
         for identity, content in part.data.items():
             text = json.dumps(content, separators=(",", ":"))
-            # The name of a link must not end the script element that contains it.
+            # A link name must not close the script element that contains it.
             text = text.replace("</", "<\\/").replace("<!--", "<\\u0021--")
             made.append(f'<script type="application/json" id="{identity}">{text}</script>')
     made += [f"<script>{program}</script>" for part in parts for program in part.programs]
@@ -120,7 +120,7 @@ def tiles(rows: Sequence[tuple[str, str, str]]) -> str:
     made = []
     for label, value, note in rows:
         small = f"<small>{unbroken(note)}</small>" if note else ""
-        # Names may be broken where they have an underscore.
+        # Names may be broken at underscores.
         shown = unbroken(value).replace("_", "_<wbr>")
         made.append(f"<div><dt>{escape(label)}</dt><dd>{shown}{small}</dd></div>")
     return f'<dl class="tiles">{"".join(made)}</dl>' if made else ""

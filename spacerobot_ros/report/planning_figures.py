@@ -126,7 +126,7 @@ def draw_rings(axes: Axes, workspaces: Workspaces) -> None:
 
 
 def _planar_figure(found: Analysis) -> Figure:
-    """Draw H over the plane of two joints, and the phase of squares round its peak."""
+    """Draw H over the plane of two joints, and the phase of squares around its peak."""
     robot = found.robot
     i, j = sorted(robot.joint_names.index(name) for name in found.planar.joints)
     plane = PlanarPhase(robot).plane(found.shape, i, j)
@@ -152,7 +152,7 @@ def _planar_figure(found: Analysis) -> Figure:
         return float(np.minimum(robot.upper[[i, j]] - point, point - robot.lower[[i, j]]).min())
 
     if distance_to_limits(centre) < _MIN_LIMIT_DISTANCE:
-        # The peak is on a joint limit: squares need one that is not.
+        # The peak is on a joint limit; squares require a peak away from the limits.
         quarter = (upper - lower) / 4
         inner = np.array([[lower + quarter, upper - quarter]])
         centre = curvature_peaks(plane, np.zeros(2), inner)[0]
@@ -161,7 +161,7 @@ def _planar_figure(found: Analysis) -> Figure:
 
 
 def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float) -> None:
-    """Draw the turn by a square round a centre against its side (paper 3, figure 3)."""
+    """Draw the rotation due to a square around a centre against its side (paper 3, figure 3)."""
     sides = np.linspace(0.0, min(np.pi, room), _SQUARE_COUNT)
     turns = np.abs(plane.turns_by_squares(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
     small = abs(float(plane.curvature(centre))) * sides**2
@@ -181,7 +181,7 @@ def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float
 
 
 def _spatial_figure(found: Analysis) -> Figure:
-    """Draw the entries of M where joints turn, and the condition number of M in any case."""
+    """Draw the entries of M unless all joints are prismatic, and the condition number of M."""
     assert found.nominal is not None
     joints = found.nominal.joints
     movable = found.robot.description.movable_joints
@@ -203,7 +203,7 @@ def _spatial_figure(found: Analysis) -> Figure:
             _mark_shape(axes, found, pair)
             first, second = (_joint_symbol(pair, k) for k in (0, 1))
             axes.set_title(f"rotation about {_AXIS_NAMES[column]} by loops of {first}, {second}")
-        # A turn in rad for an area in the plane of the two joints.
+        # A rotation in rad per area in the plane of the two joints.
         first, second = (movable[joints[k]].unit for k in pair)
         area = f"{first}²" if first == second else f"({first} {second})"
         label = f"curvature K (rad/{area})"
@@ -248,7 +248,7 @@ def _curvature_over_plane(
 
 
 def _mark_shape(axes: Axes, found: Analysis, pair: tuple[int, int]) -> None:
-    """Mark the shape of the analysis, and name the joints of the plane."""
+    """Mark the analysed shape, and label the axes with the joints of the plane."""
     assert found.nominal is not None
     i, j = (found.nominal.joints[k] for k in pair)
     axes.plot(found.shape[i], found.shape[j], marker="+", color=TEXT_COLOUR, ms=8, mew=1.3)

@@ -97,7 +97,7 @@ def _licence_notices() -> tuple[tuple[str, str], ...]:
             own = file.read_text()
         elif file.name.endswith("THIRD_PARTY_LICENSES.json"):
             others += json.loads(file.read_text())
-    # A library without the text of its licence has the MIT licence, as in MeshCat's own.
+    # A library without a licence text has the MIT licence, whose text is in MeshCat's licence.
     mit = own[own.find("Permission is hereby granted") :]
     found = [("MeshCat", own)]
     for each in others:
@@ -185,7 +185,7 @@ def _place(path: str, pose: Array) -> Command:
 
 
 def _set_object(path: str, points: Array, material: Command, kind: str, index: Any = ()) -> Command:
-    """Set the object at a path: points (k, 3), and how they are connected."""
+    """Set the object at a path: points (k, 3) and their connections."""
     names = {"geometry": f"{path} geometry", "material": f"{path} material"}
     position = {"itemSize": 3, "normalized": False, "type": "Float32Array"}
     data: Command = {"attributes": {"position": position | {"array": _rounded(points)}}}
@@ -204,7 +204,7 @@ def _set_object(path: str, points: Array, material: Command, kind: str, index: A
 
 
 def _lines(path: str, points: Array, color: str, opacity: float = 1.0) -> Command:
-    """Draw a line through points (k, 3), or separate ones between ends (k, 2, 3)."""
+    """Draw a line through points (k, 3), or separate segments with ends (k, 2, 3)."""
     look = {"type": "LineBasicMaterial", "color": _color_number(color), **_see_through(opacity)}
     kind = "Line" if points.ndim == 2 else "LineSegments"
     return _set_object(path, points.reshape(-1, 3), look, kind)
@@ -221,10 +221,10 @@ def _triad(path: str, length: float) -> list[Command]:
 def _solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[Command]:
     """Draw a solid and its sharp edges, if it has any."""
     ghost = opacity < 1.0
-    # Keep edges and ghosts visible in the surface of a solid.
+    # Keep edges and ghosts visible on the surface of a solid.
     offset = {"polygonOffset": True, "polygonOffsetFactor": -1 if ghost else 1}
     look = {"type": "MeshPhongMaterial", "color": _color_number(color), "shininess": 15}
-    # Both sides are drawn, because files of meshes differ in which one is outside.
+    # Both sides are drawn, because mesh files differ in which side is the outside.
     look |= {"flatShading": True, "side": 2, **offset, "polygonOffsetUnits": -1 if ghost else 1}
     look |= _see_through(opacity) | ({"depthWrite": False} if ghost else {})
     mesh, edges = visual.mesh, visual.edges.lines
@@ -331,7 +331,7 @@ def _body_commands(bodies: Iterable[Body], opacity: float = 1.0) -> list[Command
 
 
 def _visible_points(flight: FlightReport) -> Array:
-    """Return points (N, 3) of robot, paths, goals and target in W, m, which are to be seen."""
+    """Return the points (N, 3) of robot, paths, goals and target in W, m, that must be visible."""
     clouds = [flight.pose[:, :3], flight.tool.values[:, :3], flight.target_pose.values[:, :3]]
     rows = flight.samples(12)
     bodies = bodies_of(flight, rows, _MAX_MESH_FACES)
@@ -344,11 +344,12 @@ def _visible_points(flight: FlightReport) -> Array:
 
 
 def _camera_position(points: Array, flat: bool) -> Array:
-    """Return the position (3,) from which the origin is looked at and all points (N, 3) are seen.
+    """Return the camera position (3,) at which all points (N, 3) are visible.
 
-    It is the nearest one in the direction of the view, with a margin.
+    The camera looks at the origin from the nearest such position in the viewing direction, with a
+    margin.
     """
-    # Its up is not to be along its direction.
+    # The up vector must not be parallel to the viewing direction.
     view = View(-90.0, 89.9) if flat else View()
     backwards, (right, up) = view.viewing_direction, view.paper_axes
     slope = math.tan(math.radians(_FIELD_OF_VIEW / 2))

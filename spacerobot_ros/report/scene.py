@@ -145,6 +145,6 @@ def is_flat(flight: FlightReport) -> bool:
 
 
 def _moved(visual: Visual, frame: Pose) -> Visual:
-    """Return a solid whose link has a pose in another frame, in that frame."""
+    """Return a solid in the frame in which its link has the pose ``frame``."""
     shape = replace(visual.shape, pose=frame @ visual.shape.pose)
     return replace(visual, shape=shape, mesh=visual.mesh.moved(frame))

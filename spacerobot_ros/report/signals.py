@@ -91,11 +91,11 @@ def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
 
 
 def _farthest_sample(motion: Signal, a: int, b: int) -> tuple[float, int, int, int]:
-    """Minus the largest distance from the line between samples a and b, a, b, and where it is."""
+    """The negative largest distance from the line between samples a and b, a, b, and its sample."""
     if b - a < 2:
         return 0.0, a, b, a
     time, values = motion.time[a : b + 1], motion.values[a : b + 1]
-    span = float(time[-1] - time[0])  # Below zero where a plant was started again.
+    span = float(time[-1] - time[0])  # Negative if a plant was restarted.
     share: Array = ((time - time[0]) / (span if abs(span) > 1e-12 else np.inf))[:, np.newaxis]
     off = np.abs(values - values[0] - share * (values[-1] - values[0])).max(axis=1, initial=0.0)
     k = 1 + int(np.argmax(off[1:-1]))
@@ -110,7 +110,7 @@ def rotvecs(quaternions: Array) -> Array:
     """
     wrapped = rotvecs_from_quaternions(quaternions)
     lengths = np.linalg.norm(wrapped, axis=1)
-    # The direction turns over at half turns and at zero: there the angle about it changes its sign.
+    # The axis flips at half revolutions and at zero, where the angle about it changes sign.
     turned_over = np.einsum("ij,ij->i", wrapped[1:], wrapped[:-1]) < 0
     signs = np.append(1, np.cumprod(1 - 2 * turned_over))[: len(wrapped)]
     added = signs * np.unwrap(signs * lengths) - lengths
@@ -164,13 +164,13 @@ def find_cycles(rates: Signal) -> Cycles | None:
     if len(moving) < 4 * _MIN_CYCLES:
         return None
     values = rates.values[: int(moving[-1]) + 1] / np.where(peak > 0, peak, 1.0)
-    # What comes before the cycles may be a good part of all.
+    # The cycles may be preceded by a large part of the gait.
     looks = (values[-min(_MAX_PERIOD_SAMPLES, len(values) // part) :] for part in (1, 2, 4))
     lag = next((lag for look in looks if (lag := _period_in_samples(look))), None)
     if lag is None:
         return None
     different = np.abs(values[lag:] - values[:-lag]).max(axis=1) > 0.1
-    # The last stretch, between samples that are different, of enough cycles.
+    # The last stretch between differing samples that contains enough cycles.
     bounds = np.concatenate([[-1], np.flatnonzero(different), [len(different)]])
     enough = np.flatnonzero(np.diff(bounds) - 1 >= (_MIN_CYCLES - 1) * lag)
     if not len(enough):
@@ -179,17 +179,17 @@ def find_cycles(rates: Signal) -> Cycles | None:
     last = min(stop, len(rates) - 1)
     start, end = float(rates.time[first]), float(rates.time[last])
     if end <= start:
-        return None  # Log times that are the same for all messages.
+        return None  # All messages have the same log time.
     return Cycles(start, end, lag * (end - start) / (last - first))
 
 
 def _period_in_samples(values: Array) -> int | None:
-    """Shortest shift, in samples, by which the columns match themselves; None without one."""
+    """Shortest shift, in samples, at which the columns match themselves; None if there is none."""
     n = len(values)
     spectrum = np.fft.rfft(values, 2 * n, axis=0)
     product = np.fft.irfft((spectrum * spectrum.conj()).sum(axis=1))[:n]
     energy = np.cumsum((values**2).sum(axis=1))
-    # Energy of the parts that overlap: the first n - lag samples, and the last ones.
+    # Energy of the overlapping parts: the first and the last n - lag samples.
     lags = np.arange(n // 3)
     first, last = energy[n - 1 - lags], energy[-1] - np.append(0.0, energy)[lags]
     match = product[lags] / np.maximum(np.sqrt(first * last), 1e-300)
@@ -199,6 +199,6 @@ def _period_in_samples(values: Array) -> int | None:
     good = np.flatnonzero(match[below[0] :] > 0.97) + below[0]
     if not len(good):
         return None
-    # The top of the first hill that is high enough.
+    # The maximum of the first peak that is high enough.
     hill = np.split(good, np.flatnonzero(np.diff(good) > 1) + 1)[0]
     return int(hill[np.argmax(match[hill])])

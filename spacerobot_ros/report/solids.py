@@ -95,7 +95,7 @@ class View:
         self._light = light / np.linalg.norm(light)
 
     def __call__(self, points: Array) -> Array:
-        """Return points (..., 3) on the paper (..., 2)."""
+        """Return the image plane coordinates (..., 2) of points (..., 3)."""
         return np.asarray(points @ self.paper_axes.T)
 
     def shade(self, fill: Array, normal: Array) -> Array:
@@ -152,7 +152,7 @@ class Canvas:
         return image[::-1]
 
     def _to_pixels(self, points: Array) -> Array:
-        """World points (k, 3) to column, row and nearness (k, 3)."""
+        """Convert world points (k, 3) to column, row and nearness (k, 3)."""
         at = (self._view(points) - self._low) * self._scale
         return np.column_stack([at, points @ self._view.viewing_direction])
 
@@ -184,7 +184,7 @@ class Canvas:
         self._pixels[row, column] = [*fill, 1.0]
 
     def _plane_depth(self, place: Array, normal: Array, x: Floats, y: Floats) -> Array:
-        """Nearness of the plane through a place at points in pixels."""
+        """Nearness of the plane through a point, at pixel coordinates."""
         across, up = self._view.paper_axes @ normal
         offset = float(normal @ place) - self._low @ (across, up)
         depth = offset - (across * x + up * y) / self._scale
@@ -194,7 +194,7 @@ class Canvas:
         self, ends: Array, color: str = EDGE_COLOUR, pixels_nearer: float = 2.0 * _EDGE_WIDTH
     ) -> None:
         at = self._to_pixels(ends)
-        # An edge lies in the faces beside it and is drawn a little nearer.
+        # An edge lies in the adjacent faces and is drawn slightly nearer.
         at[:, 2] += pixels_nearer / self._scale
         rows, columns = self._depth.shape
         brush = np.arange(_EDGE_WIDTH) - (_EDGE_WIDTH - 1) / 2

@@ -88,7 +88,7 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
 def _end_effector_row(
     flight: FlightReport, label: str, error: PoseError, turns: bool
 ) -> tuple[str, str, str]:
-    """Return the row of an end-effector: its distance, its angle if that counts, tolerances."""
+    """Return the row of an end-effector: distance, angle if relevant, and tolerances."""
     limits = _tolerance_text(flight, "position")
     if limits and turns:
         limits += f", {_tolerance_text(flight, 'attitude')}"
@@ -165,7 +165,7 @@ _FREE_BASE = "of the base"
 
 
 def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
-    """Return the goal of the base by its parts, as texts; empty if there is none."""
+    """Return the components of the base goal as strings; empty if there is none."""
     goal = flight.base_goal
     if goal is None:
         return {_FREE_BASE: "not controlled"} if flight.link_goals else {}
@@ -236,7 +236,7 @@ def joint_table(flight: FlightReport) -> Table | None:
         unit = joint_unit(flight, name)
         ends = [numbers([x]) for x in flight.q[[0, -1], i].tolist()]
         if i in flight.wheel_columns:
-            ends = [_NO_VALUE] * 2  # The angle of a body of revolution means nothing.
+            ends = [_NO_VALUE] * 2  # The angle of a body of revolution is meaningless.
         limits = limit = share = peak_text = _NO_VALUE
         if joint is not None:
             if math.isfinite(joint.limits.lower) and math.isfinite(joint.limits.upper):
@@ -303,7 +303,7 @@ def _tolerance_text(flight: FlightReport, part: Literal["position", "attitude"])
 
 
 def _time_to_end_texts(flight: FlightReport) -> list[str]:
-    """Return the time to the end if it differs from that of the schedules; else nothing."""
+    """Return the time to the end if it differs from that of the schedules; otherwise nothing."""
     planned = [(time, each) for time, each in flight.reports if isinstance(each, PlannerStatus)]
     whole, flown = time_to_end(planned, flight.end), flight.time_flown
     if whole is None or flown is None or abs(whole - flown) < _EQUAL_TIME_TICKS * flight.tick:

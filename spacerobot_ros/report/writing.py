@@ -187,7 +187,7 @@ def write_figures(
             except (ValueError, ArithmeticError, RuntimeError, TypeError) as error:
                 if style is None:
                     raise
-                # Of the settings in a style file matplotlib refuses some only when it draws.
+                # matplotlib rejects some style file settings only when it draws.
                 raise SpaceRobotError(
                     f"Figures cannot be drawn with the style file {style}: {error}."
                 ) from error

@@ -52,7 +52,7 @@ def ros() -> Iterator[None]:
         yield
     finally:
         rclpy.try_shutdown()
-        # The level is the process's: it would hold for nodes that are made after the run.
+        # The level is global: it would also apply to nodes created after the run.
         set_logger_level("", level)
 
 
@@ -133,7 +133,7 @@ _NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)\b")
 
 
 class _StatusPrinter:
-    """Prints the message of a status if it differs from the one before by more than quantities."""
+    """Prints a status message if it differs from the previous one in more than its quantities."""
 
     def __init__(self, show: Callable[[str], None]) -> None:
         self._show, self._shown = show, ""
@@ -225,7 +225,7 @@ def send_goal(
             )
             for decider in ("planner", "coordinated_control")
         ]
-        # In a namespace the stack may have its own clock, by a remap.
+        # In a namespace, the stack may have its own clock, through a remapping.
         node = clients[0].node
         for topic, which in {"/clock": "global", node.resolve_topic_name("clock"): "own"}.items():
             node.create_subscription(Clock, topic, partial(on_clock, which=which), 10)
@@ -291,7 +291,7 @@ def _find_goal_commander(
 
 
 def _await_active(client: MissionClient, executor: EventsExecutor, deadline: float) -> None:
-    """Wait until a commander that is a managed node is active: before, it refuses goals."""
+    """Wait until a commander that is a managed node is active; before that, it rejects goals."""
     service = client.node.create_client(GetState, f"{client.decider}/get_state")
     while time.monotonic() < deadline and service.service_is_ready():
         answer = service.call_async(GetState.Request())

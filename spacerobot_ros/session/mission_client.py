@@ -261,5 +261,5 @@ class MissionClient:
 
 
 def _names_of(endpoints: Sequence[TopicEndpointInfo]) -> set[tuple[str, str]]:
-    """Return the namespaces and names of the nodes of endpoints."""
+    """Return the node namespaces and names of endpoints."""
     return {(each.node_namespace, each.node_name) for each in endpoints}

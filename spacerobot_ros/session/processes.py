@@ -161,7 +161,7 @@ class MultiProcessStack:
             names = robot.joint_names if robot is not None else ()
             if robot is not None:
                 scenario.require_shape_of(robot)
-        # A planner decides goals; without one the controller does.
+        # A planner decides about goals; without a planner, the controller does.
         decider = scenario.commanders[0]
         self.client = MissionClient(
             decider,
@@ -208,7 +208,7 @@ class MultiProcessStack:
         """Start or restart one node of the scenario, with additional parameters."""
         overrides: dict[str, Any] = dict(self.scenario.parameters(name))
         if name in COMMANDERS and self.scenario.lockstep:
-            overrides["plan_in_background"] = False  # Known before the plant says so.
+            overrides["plan_in_background"] = False  # Set before the plant reports lockstep.
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
             record = Path(self._folder.name, "scenario.json")
@@ -227,7 +227,7 @@ class MultiProcessStack:
             self.processes[name] = start_child(words, self._environment(), stdout=log, stderr=log)
 
     def _environment(self) -> dict[str, str]:
-        """Return the environment of a node; variables that the user has set stay."""
+        """Return the environment of a node; variables set by the user are kept."""
         environment = {**_SETTINGS_WITHOUT_SHARED_MEMORY, **os.environ}
         if not any(name in environment for name in FASTDDS_FILE_VARIABLES):
             file = Path(self._folder.name, "fastdds.xml")
@@ -504,7 +504,7 @@ _CRASHED_AT = re.compile(r"^Current thread .*\n  File (.*)$", re.MULTILINE)
 
 
 def _last_error(log: str) -> str:
-    """Return the last error that a node logged, or the last line of a traceback; else nothing."""
+    """Return the last error that a node logged, or the last line of a traceback, if any."""
     found = ""
     for line in log.splitlines():
         prefix = _LOG_PREFIX.match(line)
@@ -520,7 +520,7 @@ def end_message(name: str, code: int, log: str) -> str:
     """Return a sentence that explains why a node has ended: the signal and the crash, or the
     exit code and the error."""
     if code < 0:
-        # Of a signal Python logs a crash alone: other errors in the log are not its cause.
+        # For a signal, Python logs only a crash; other errors in the log are not the cause.
         how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
         crash, at = _CRASH.search(log), _CRASHED_AT.search(log)
         if crash is None:

@@ -42,7 +42,7 @@ class Viewer:
     Parameters
     ----------
     parameters, show, namespace
-        As of :func:`viewing`.
+        As for :func:`viewing`.
     folder
         Folder for the log and the parameters of the viewer.
     """
@@ -85,13 +85,13 @@ class Viewer:
         self._show(announcement)
         for line in _read_log_lines(self.log):
             self._show(line)  # The viewer warns of an address that other machines can reach.
-        # Pages that are open come back to a viewer at the same address.
+        # Open pages reconnect to a viewer at the same address.
         port = urlsplit(announcement.split()[1]).port if " " in announcement else None
         if port is not None:
             self._parameters["port"] = port
 
     def restart_within(self, restarts: int) -> None:
-        """Allow up to this number of restarts per minute."""
+        """Set the maximum number of restarts per minute."""
         self._restarts = RestartLimit(restarts)
 
     def supervise(self) -> None:

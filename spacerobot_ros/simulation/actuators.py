@@ -358,7 +358,7 @@ class PlantWithFaults(WrappedPlant):
         realised = [self._factor * disturbed]
         if wrench and self.thrusters is None:
             realised.append(self._wrench_factor * wrench[0] + self._wrench_held)
-        elif wrench:  # The thrusters apply the faults of the wrench themselves.
+        elif wrench:  # The thrusters apply wrench faults themselves.
             realised.append(wrench[0])
         return realised
 
@@ -436,7 +436,7 @@ def build_plant(
     description = load_target(config.target)
     plant: Plant
     if config.engine == "mujoco":
-        # Slow to import, and few plants are.
+        # Slow to import, and few plants need it.
         from spacerobot_ros.simulation import mujoco_plant
 
         step = step or mujoco_plant.DEFAULT_INTEGRATION_STEP

@@ -131,7 +131,7 @@ class Target:
 
     @property
     def motion(self) -> BodyMotion:
-        """Its present motion."""
+        """Its current motion."""
         return BodyMotion.of(self.pose, self.twist)
 
     @property
@@ -346,7 +346,7 @@ class CapturePlant(WrappedPlant):
         self._compile(initial)
 
     def _compile(self, initial: InitialState) -> None:
-        """Call all functions of a capture once: compiling them would delay the flight then."""
+        """Call all functions of a capture once: compiling them later would delay the flight."""
         robot, motion, inertia = self.robot, self._motion(), self.target.inertia
         grasp_impact(robot, self.link, motion, self._body(), inertia)
         joined = Payload(self.link, inertia.moved(_GENERIC_POSE)).attached_to(robot)
@@ -425,7 +425,7 @@ class CapturePlant(WrappedPlant):
         self._resume_dynamics(joined, motion, momenta, body)
         self._changed = None
         self._update()
-        # What hinders a capture now did so before.
+        # Conditions that prevent a capture now already did so before.
         self._ready = bool(self._config.misses(self.approach()))
 
     def _resume_dynamics(
@@ -496,7 +496,7 @@ class CapturePlant(WrappedPlant):
         if self.payload is None:
             raise CommandError(f"'{self.link}' does not hold a target.")
         motion, body, robot = self._motion(), self._body(), self._alone.robot
-        # The target takes its share of the momenta along, the robot keeps the rest.
+        # The target keeps its share of the momenta, and the robot the rest.
         self.target.release(body)
         momenta = separated_momenta(
             (robot.total_mass, self.target.inertia.mass),

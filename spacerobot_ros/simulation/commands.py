@@ -174,7 +174,7 @@ class CommandValidator:
                 CommandSource("joint_commands", "effort", robot.effort_limit),
                 CommandSource("base_wrench", "wrench", np.full(6, np.inf)),
             ]
-            # Velocity servos stop at once; motors have to brake.
+            # Velocity servos stop immediately; motors have to brake.
             self._brakes = _JointBrakes(plant, config.control_period)
         self._commands = [source.command for source in self.sources]
         self._lockstep = config.time_mode == "lockstep"
@@ -246,7 +246,7 @@ class CommandValidator:
             if not stamp_ns and (
                 self._earliest or now_ns > (self._timeout or _START_TIME) * SECOND
             ):
-                # A stamp of zero means the present state, at the start the first state.
+                # A stamp of zero means the current state, at the start the first state.
                 stamp_ns, unset = now_ns, True
             elif stamp_ns % self._period:
                 stamp_ns = self._round_to_tick(stamp_ns)
@@ -263,7 +263,7 @@ class CommandValidator:
             return None
         refusal = self._refuse(source, refusal, now_ns)
         if self._lockstep:
-            # Time must go on: a tick with a refused command is flown at rest.
+            # Time must advance: a tick with a refused command is executed at rest.
             source.rest()
             source.arrived = True
         return refusal
@@ -333,7 +333,7 @@ class CommandValidator:
         for source in self.sources[1:]:
             source.required = source.commanders > 0
             if not source.required:
-                # Without a commander nobody would turn the thrusters off.
+                # Without a commander, nothing would turn the thrusters off.
                 source.rest()
                 source.arrived = False
 

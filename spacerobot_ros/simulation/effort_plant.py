@@ -383,7 +383,7 @@ class EffortPlant:
                 self._state[:] = after[: self._state.size]
                 self._update_outputs()
         except SpaceRobotError:
-            # The plant keeps the state before the tick.
+            # The plant keeps the state from before the tick.
             self._command[:] = 0.0
             self._update_outputs()
             raise
@@ -447,7 +447,7 @@ def tick_function(
 
 
 def _effort_bounds(robot: SpaceRobot, qdot: ca.MX) -> tuple[ca.MX | Array, ca.MX | Array]:
-    """Return the least and the largest efforts (n,) of the motors."""
+    """Return the smallest and the largest efforts (n,) of the motors."""
     limit, wheels = robot.effort_limit, robot.description.wheel_names
     if not wheels:
         return -limit, limit

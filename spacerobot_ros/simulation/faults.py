@@ -122,7 +122,7 @@ def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
     Parameters
     ----------
     line
-        As the module describes.
+        The line; see the module docstring.
     targets
         Targets of this plant.
     now
@@ -221,7 +221,7 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
     Parameters
     ----------
     line
-        As the module describes.
+        The line; see the module docstring.
     links
         Link names of the robot.
     now
@@ -297,7 +297,7 @@ def parse_times(
     now
         Start time if the words specify none, s.
     refusal
-        Of the line.
+        Function that returns the error for the line.
 
     Raises
     ------
@@ -388,7 +388,7 @@ class Timeline(Generic[Entry]):
         Raises
         ------
         ParameterError
-            As :meth:`read`.
+            As for :meth:`read`.
         """
         if text.strip() == "clear":
             self.entries.clear()

@@ -61,7 +61,7 @@ def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
     root = ElementTree.fromstring(description.urdf)
     for link in root.iter("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
-            link.remove(shape)  # MuJoCo would look for the files of meshes.
+            link.remove(shape)  # MuJoCo would look for the mesh files.
         link.set("name", body_name(link.get("name", "")))
     for origin in root.iter("origin"):
         if quaternion := origin.attrib.pop("quat_xyzw", ""):  # MuJoCo would not read it.
@@ -75,14 +75,14 @@ def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
     except ValueError as error:
         raise _refused(description, error) from error
     spec.compiler.boundinertia = _MIN_INERTIA
-    spec.compiler.fusestatic = False  # Loads act on links without mass, too.
+    spec.compiler.fusestatic = False  # Loads also act on massless links.
     spec.worldbody.first_body().add_freejoint()
     return spec
 
 
 def _add_motors(mujoco: Any, spec: Any, description: RobotDescription) -> None:
     """Add actuators to a specification: six for the wrench on the base in B, one for each joint."""
-    # The wrench turns with the base, at every stage of every step.
+    # The wrench rotates with the base, at every stage of every step.
     spec.worldbody.first_body().add_site(name="wrench")
     for axis in np.eye(6):
         spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="wrench", gear=axis.tolist())
@@ -181,7 +181,7 @@ def _add_contacts(
             if solid.body != hand:
                 pairs += [(name, shape) for shape in shapes]
             else:
-                # Not by pairs, which could not be switched off while the hand holds the target.
+                # Not listed as pairs, which could not be disabled while the hand holds the target.
                 spec.geom(name).contype = 1
         for shape in shapes:
             spec.geom(shape).conaffinity = 1
@@ -214,7 +214,7 @@ def _set_inertia(body: Any, inertia: Inertia) -> None:
     moments, axes = np.linalg.eigh(inertia.about_com)
     axes = axes * np.linalg.det(axes)
     body.mass, body.ipos = inertia.mass, inertia.com
-    body.fullinertia = np.full(6, np.nan)  # Not given.
+    body.fullinertia = np.full(6, np.nan)  # Unspecified.
     body.inertia, body.iquat = moments, np.roll(quaternion_from_matrix(axes), 1)
 
 
@@ -236,7 +236,7 @@ def _add_target(spec: Any, target: RobotDescription) -> None:
 def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = "") -> str:
     body = spec.worldbody if solid.is_obstacle else spec.body(body_name(f"{prefix}{solid.link}"))
     kinds, size = mujoco.mjtGeom, solid.shape.size
-    # Pairs that push are named one by one.
+    # Pairs with contact forces are listed individually.
     about: dict[str, Any] = {"name": name, "mass": 0.0, "contype": 0, "conaffinity": 0}
     if solid.vertices is not None:
         spec.add_mesh(name=name, uservert=solid.vertices.ravel().tolist())
@@ -260,7 +260,7 @@ def _add_shape(mujoco: Any, spec: Any, solid: Solid, name: str, prefix: str = ""
 
 
 def _set_options(mujoco: Any, model: Any, step: float) -> None:
-    """Have a model integrate by Runge-Kutta 4 with steps of ``step`` s, with contacts alone."""
+    """Set Runge-Kutta 4 with steps of ``step`` s, and disable effects other than contacts."""
     for flag in ("GRAVITY", "SENSOR", "SPRING", "DAMPER", "FRICTIONLOSS", "ISLAND", "AUTORESET"):
         model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"))
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4

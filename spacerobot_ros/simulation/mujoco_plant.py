@@ -310,9 +310,7 @@ class MujocoPlant:
     # -- a tick -------------------------------------------------------------------------------
 
     def _effort_bounds(self) -> tuple[Array, Array]:
-        """Return the least and the largest efforts (n,); a wheel at its largest rate gets no
-        faster.
-        """
+        """Return the least and largest efforts (n,); a wheel at its largest rate gets no faster."""
         limit, rate = self.robot.effort_limit, self.robot.velocity_limit
         slowest, fastest = (
             self._is_wheel & (self.qdot <= -rate),
@@ -350,7 +348,7 @@ class MujocoPlant:
         self._stage = (self._stage + 1) % len(_SHARES)
 
     def _step_at_rates(self, rates: Array) -> None:
-        """Advance a tick in free motion at these joint rates (n,); no momentum changes by them."""
+        """Advance a tick in free motion at these joint rates (n,); they change no momentum."""
         model, data = self._model, self._data
         M = np.zeros((model.nv, model.nv))
         self._mujoco.mj_fullM(model, data, M)
@@ -376,7 +374,7 @@ class MujocoPlant:
             mujoco.mj_fwdVelocity(model, data)
             mujoco.mj_fullM(model, data, M)
             H, bias = M[np.ix_(own, own)], data.qfrc_bias[own]
-            # The base is pushed by nothing but the reaction of the joints.
+            # Only the joint reactions act on the base.
             by_base = np.linalg.solve(H[:6, :6], np.column_stack([H[:6, 6:], bias[:6]]))
             K = H[6:, 6:] - H[6:, :6] @ by_base[:, :-1]
             reaction = bias[6:] - H[6:, :6] @ by_base[:, -1]
@@ -390,7 +388,7 @@ class MujocoPlant:
         self.effort[:] = total / self._steps
 
     def _center(self) -> Array:
-        """Return the centre of mass (3,) of what moves together."""
+        """Return the centre of mass (3,) of the bodies that move together."""
         masses, centers = self._model.body_subtreemass, self._data.subtree_com
         if not self.holds_target:
             return np.array(centers[self._root])
@@ -407,7 +405,7 @@ class MujocoPlant:
         self.twist[:3], self.twist[3:] = R_WB.T @ data.qvel[:3], data.qvel[3:6]
         self.q[:], self.qdot[:] = data.qpos[self._q], data.qvel[self._qdot]
         link_R, link_r = self._link_poses(self.q)
-        self.link_R[:], self.link_r[:] = link_R, link_r.reshape(3, -1)  # A vector, of one link.
+        self.link_R[:], self.link_r[:] = link_R, link_r.reshape(3, -1)  # A vector for one link.
         momenta = self._momenta_of(self._root)
         if self.holds_target:
             target = self._target_body

@@ -39,7 +39,7 @@ _ROWS_DRAWN_TOGETHER = 32
 
 
 class NormalNumbers:
-    """Independent standard normal numbers, computed from a seed and their place alone.
+    """Independent standard normal numbers, computed only from a seed and their position.
 
     Row k has the numbers of Philox 4x64 for the counters k B + 1 to (k + 1) B, where B is a quarter
     of the row's size, rounded up. Pairs become normal by Box and Muller's transform. Therefore,

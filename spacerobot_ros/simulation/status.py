@@ -84,12 +84,12 @@ class PlantStatus:
         Stamp of the last command before the most recent timeout, s; None if there was no such
         command.
     actuation
-        What joint_commands carry: ``velocity`` or ``effort``; ``auto``: not yet determined by a
+        Quantity in joint_commands: ``velocity`` or ``effort``; ``auto``: not yet determined by a
         command; empty if the plant is not configured.
     tick_rate_hz
         Ticks per second of simulated time, Hz; 0 if the plant is not configured.
     time_mode
-        Who drives time: ``realtime`` or ``lockstep``; empty if the plant is not configured.
+        What drives time: ``realtime`` or ``lockstep``; empty if the plant is not configured.
     """
 
     state: PlantState
@@ -314,7 +314,7 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
             case PlantState.PAUSED:
                 add(EventKind.PAUSED, now.message)
             case _:
-                pass  # The other changes have events of their own.
+                pass  # The other changes have their own events.
     elif now.reason != before.reason and now.state is PlantState.RESTING:
         level = 1 if now.reason == "timeout" else 0
         add(EventKind.RESTING, now.message, level, reason=now.reason)

@@ -101,7 +101,7 @@ class VelocityPlant:
         self._state[robot.n :] = start.attitude()
         self._momenta[:] = start.momenta()
         self._r_cm[:] = start.system_position(robot)
-        # A step of zero duration computes all outputs of the present state.
+        # A step of zero duration computes all outputs of the current state.
         self._command[:] = self._before[:] = 0.0
         self._h[:] = 0.0
         self._advance.evaluate()

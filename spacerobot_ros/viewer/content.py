@@ -97,9 +97,9 @@ def time_to_go(state: StackState) -> float | None:
 
 
 def _to_go_text(left: float | None) -> str:
-    """Return the end of a line about the time to go, s; None: nothing is flown to.
+    """Return the end of a line about the time to go, s; None: no goal is being pursued.
 
-    Once its reference has ended, the robot is to come to rest on the goal.
+    After the end of its reference, the robot settles at the goal.
     """
     if left is None:
         return ""
@@ -182,14 +182,14 @@ def status_html(
 def _distance_lines(
     state: StackState, errors: Mapping[Part, GoalErrors], tolerance: Tolerance | None
 ) -> list[str]:
-    """Return a line on each part with a goal: how far it is from it, and the time to go."""
+    """Return a line about each part with a goal: its distance from the goal, and the time to go."""
     left = time_to_go(state) if state.planner is None else None
     to_go, planner = _to_go_text(left), state.planner
     flies = planner is not None and planner.state is PlannerState.EXECUTING
     lines = []
     for part, error in errors.items():
         of_link = bool(state.goals[part].end_effectors)
-        # Once a planner has decided on a goal of the base, its message has the numbers.
+        # Once a planner has decided about a base goal, its message contains the numbers.
         by_planner = flies if not of_link else planner is not None
         if by_planner or (not of_link and state.controller is not None):
             text = _errors_text(error, tolerance, not_controlled(state, part))
@@ -243,7 +243,7 @@ def padded(html: str) -> str:
 
 
 def _node_html(state: StackState, key: str, word: str, message: str, level: int) -> str:
-    """Return the status of a node; that of one that is offline is called its last one."""
+    """Return the status of a node; the status of an offline node is labelled as its last one."""
     offline, color = key in state.absent, _LEVEL_COLORS[level]
     if offline:
         word, color = f"offline, last {word}:", "inherit"
@@ -484,7 +484,7 @@ def momentum_html(state: StackState) -> str:
     command = control.command
     rows = [(escape(part), f"{numbers([value], 3)} N m s", "") for part, value in budget.items()]
     for name, share in command.wheels.items():
-        # 0, 1 or 2: how many of the two shares it reaches.
+        # 0, 1 or 2: the number of thresholds that it reaches.
         level = sum(abs(share) >= each for each in (_WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE))
         title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
         bar = _bar_html((1.0 + share) / 2, level)
@@ -532,7 +532,7 @@ def faults_html(lines: Sequence[str]) -> str:
 
 
 def hint_html(text: str) -> str:
-    """Return an explanation, greyed."""
+    """Return an explanation in grey."""
     return padded(f'<span style="color:{_FAINT_COLOR}">{escape(text)}</span>')
 
 
@@ -565,7 +565,7 @@ class RecentItems(Generic[T]):
         times = self._times
         begin, end = (bisect_left(times, each) for each in (time_s - self._span, time_s))
         if end - begin > 1 and times[end - 1] - times[end - 2] < self._step:
-            end -= 1  # The latest item stays alone, however near to the one before.
+            end -= 1  # Only the latest item may be closer than a step to the previous one.
         self._times, self._items = [*times[begin:end], time_s], [*self._items[begin:end], item]
         if len(self._times) > self._most:
             self._step = 2.0 * (time_s - self._times[0]) / self._most

@@ -164,7 +164,7 @@ class GoalEditor:
         react(self._to_robot.on_click, self._defer, lambda _: act())
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
-        """Start again with another robot, in an empty scene; None: there is none."""
+        """Start again with another robot, in an empty scene; None: no robot."""
         self._gizmos.clear()
         self._marks.clear()
         self._poses.clear()
@@ -279,7 +279,7 @@ class GoalEditor:
             shape = q if final is None else final
             self._ghost.set_joint_positions(shape)
         goal = self._ghost_pose(pose)
-        # The ghost hangs on the gizmo of the base, so that it follows the mouse at once.
+        # The ghost is attached to the base gizmo, so that it follows the mouse immediately.
         self._ghost.place(relative_pose(self._poses[_BASE_GIZMO], goal))
         hidden = self._is_at_goal(goal, pose, q, shape)
         self._ghost.base.visible = self._ghost_shown and not hidden
@@ -291,7 +291,7 @@ class GoalEditor:
             self.update_robot(*self._present)
 
     def _ghost_pose(self, pose: Array) -> Array:
-        """Return the pose (7,) of the ghost's base: where it will end, or else that of the goal."""
+        """Return the ghost's base pose (7,): the predicted final pose, or else the goal pose."""
         if self._check.base is not None:
             return self._check.base
         free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
@@ -329,7 +329,7 @@ class GoalEditor:
         """Offer goals for the links whose goals the planner accepts."""
         offered = tuple(links)
         if offered == self._parts.links:
-            return  # The choice of users stays.
+            return  # The user's choice is kept.
         for link in self._parts.links:
             if _link_gizmo(link) in self._gizmos:
                 self._gizmos[_link_gizmo(link)].visible = False
@@ -428,14 +428,14 @@ class GoalEditor:
             self._defer_edit(lambda: self._on_gizmo_moved(name, pose))
 
     async def _on_field(self, event: Any) -> None:
-        if event.client is not None:  # Else the page itself wrote the value.
+        if event.client is not None:  # Otherwise, the page itself set the value.
             position, angles = self._position.value, self._angles.value
             self._defer_edit(lambda: self._on_fields_typed(position, angles))
 
     def _on_gizmo_moved(self, name: str, pose: Array) -> None:
         if name not in self._gizmos or not np.all(np.isfinite(pose)):
-            return  # The gizmo of an earlier robot, or a pose that is not finite.
-        # What the fields show is what is sent.
+            return  # The gizmo belongs to an earlier robot, or the pose is not finite.
+        # The values shown in the fields are sent.
         goal = Goal.from_rpy(*_fields_of(pose))
         self._set_goal(name, np.concatenate([goal.position, goal.quaternion]))
         self._show_fields()
@@ -473,7 +473,7 @@ class GoalEditor:
         self._gizmos[name].wxyz = wxyz(pose[3:])
 
     def _on_parts_chosen(self, part: Part) -> None:
-        """Take over the choice of users for a part, or another part whose numbers are shown."""
+        """Apply a user's choice for a part, or the choice of the part whose numbers are shown."""
         if part != BASE_GOAL_KEY and self._parts.asked(part) is not RequestedPart.NOTHING:
             gizmo = self._gizmos.get(_link_gizmo(part))
             if gizmo is None or not gizmo.visible:
@@ -492,7 +492,7 @@ class GoalEditor:
         self._move_gizmo(name, self._kinematics.link_in_world(link, *self._present))
 
     def _show_parts(self) -> None:
-        """Show the gizmos of the parts that the goal asks for, and their handles."""
+        """Show the gizmos of the parts that the goal specifies, and their handles."""
         for link in self._parts.links:
             gizmo = self._gizmos.get(_link_gizmo(link))
             if gizmo is not None:
@@ -501,7 +501,7 @@ class GoalEditor:
                 gizmo.disable_rotations = asked is RequestedPart.POSITION
         base = self._gizmos.get(_BASE_GIZMO)
         if base is not None:
-            # Its node stays visible, because the ghost hangs on it.
+            # Its node stays visible, because the ghost is attached to it.
             free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
             hidden = free or self._in_flight
             base.disable_axes = base.disable_sliders = base.disable_rotations = hidden
@@ -514,11 +514,11 @@ class GoalEditor:
 
 
 class _PartMenu:
-    """Controls of the parts of the robot that a goal for a planner asks for.
+    """Controls for the robot parts that a planner goal specifies.
 
-    Without end-effectors, or without a planner, that is the pose of the base. ``edit`` queues the
-    changes of users that change the goal; ``on_change`` is called with the part when users have
-    changed the parts of its goal, or the part whose numbers are shown.
+    Without end-effectors, or without a planner, that is the base pose. ``edit`` queues user
+    changes that modify the goal; ``on_change`` is called with the part when a user has changed
+    what its goal specifies, or the part whose numbers are shown.
     """
 
     def __init__(
@@ -594,7 +594,7 @@ class _PartMenu:
 
     def _on_chosen(self, part: Part) -> None:
         if part not in self._menus:
-            return  # The menu of an earlier robot.
+            return  # The menu belongs to an earlier robot.
         base, for_links = self._menus[BASE_GOAL_KEY], self.requested_links()
         chosen = self.asked(part)
         if not for_links:
@@ -602,13 +602,13 @@ class _PartMenu:
                 self._on_note("A goal is for the base or for an end-effector: choose one of them.")
             base.value = RequestedPart.POSE.value
         elif list(for_links) == [part] and self._numbers.options == (BASE_GOAL_KEY,):
-            # The first end-effector of a goal for the base: the base is free until users fix it.
+            # The first end-effector in a base goal: the base is free until users constrain it.
             base.value = RequestedPart.NOTHING.value
         self._update(part)
         self._on_change(part)
 
     def _update(self, part: Part | None = None) -> None:
-        """Show the numbers of a part, if the goal asks for it, else of those of before."""
+        """Show the numbers of a part if the goal specifies it, otherwise of the previous part."""
         self._folder.visible = self._there
         parts = [BASE_GOAL_KEY] if self.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING else []
         parts += self.requested_links()
@@ -619,9 +619,9 @@ class _PartMenu:
 
 
 class _FinalShape:
-    """Controls of the joint positions at the end of the manoeuvre.
+    """Controls for the joint positions at the end of the manoeuvre.
 
-    ``edit`` queues the changes of users; ``on_change`` is called when users have changed them.
+    ``edit`` queues user changes; ``on_change`` is called when a user has changed the positions.
     """
 
     def __init__(self, gui: viser.GuiApi, edit: Defer, on_change: Callable[[], None]) -> None:
@@ -658,7 +658,7 @@ class _FinalShape:
         self._update_folder()
 
     def _add_joint_field(self, joint: Joint) -> Any:
-        """Return a slider between the limits of a joint, or a number field if it has none."""
+        """Return a slider between the limits of a joint, or a number field if it has no limits."""
         label, name = f"{shortened(joint.name)} ({joint.unit})", joint.name
         low, high = joint.limits.lower, joint.limits.upper
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -705,7 +705,7 @@ def _fields_of(pose: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _link_gizmo(link: str) -> str:
-    """Return the path of the gizmo of a link; its name may have slashes."""
+    """Return the gizmo path of a link, whose name may contain slashes."""
     return f"/end_effector_goals/{link.replace('/', '%')}"
 
 

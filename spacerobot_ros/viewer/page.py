@@ -173,7 +173,7 @@ class LookBack:
         async def _(event: Any) -> None:
             if event.client is not None:
                 at, end = float(event.target.value), float(event.target.max)
-                # At once, so that nothing is written over it meanwhile.
+                # Set immediately, so that the value is not overwritten in the meantime.
                 self._left_alone_until = until = time.monotonic() + _SLIDER_HOLD_S
                 defer(lambda: self._look(None if at >= end else at, until))
 
@@ -198,8 +198,8 @@ class LookBack:
         if self._left_alone_until is None:
             self._slider.value = at
         elif time.monotonic() >= self._left_alone_until:
-            # The browser may have received an older value after the one that it has sent, and viser
-            # sends none that it has already.
+            # The browser may have received an older value after sending its own, and viser does not
+            # send a value that it already has.
             self._left_alone_until = None
             self._slider.value = low if at == high else high
             self._slider.value = at
@@ -354,7 +354,7 @@ class Plots:
     def _show_parts(self, errors: Mapping[Part, content.GoalErrors]) -> None:
         """Show one plot for each part with an error, and none for others.
 
-        A hidden plot is used again: browsers complain about curves of removed ones.
+        Hidden plots are reused, because browsers report errors about curves of removed plots.
         """
         shown = [(part, len(error)) for part, error in errors.items()]
         for part, count in shown:
@@ -386,9 +386,9 @@ _LEAST_ON_LOGARITHMIC_AXIS = 1e-3
 class _Plot:
     """A plot and its history; its colours can be seen on white and on black.
 
-    There is an axis for each of at most two ``units``, those of ``names``. ``least`` is the least
-    upper end of the axes, so that rounding errors do not look like peaks; ``signed``: the numbers
-    may be negative; ``limited``: each has a limit.
+    There is an axis for each of at most two ``units``, those of ``names``. ``least`` is the
+    smallest upper limit of the axes, so that rounding errors do not look like peaks; ``signed``:
+    the numbers may be negative; ``limited``: each has a limit.
     """
 
     def __init__(
@@ -410,7 +410,7 @@ class _Plot:
         for i, name in enumerate(names):
             turn, color = divmod(i, len(_CURVE_COLORS))
             look = {"label": shortened(name), "stroke": _CURVE_COLORS[color], "width": 1.5}
-            # Colours repeat with dashes, shorter each time.
+            # Colours are reused with dashes that become shorter each time.
             dashes = {"dash": (max(12 // turn, 2), 4)} if turn else {}
             series.append(look | dashes | {"scale": scales[i]})
         limit = {"label": "tolerance", "dash": (2, 4), "width": 1}
@@ -423,7 +423,7 @@ class _Plot:
             | {"labelSize": 16 * bool(units)}
             for scale, side in zip(dict.fromkeys(scales), (3, 1), strict=False)  # Left, right.
         ]  # fmt: skip
-        # Mode 1 of uPlot's "soft limits": the axis ends there unless numbers go beyond.
+        # Mode 1 of uPlot's "soft limits": the axis ends there unless numbers exceed it.
         end = {"pad": 0.1, "mode": 1}
         ends = {"min": end | {"soft": -least if signed else 0.0}, "max": end | {"soft": least}}
         time: dict[str, Any] = {"x": {"time": False}, "line": {"auto": False, "range": (0, 1)}}
@@ -456,7 +456,7 @@ class _Plot:
         self.handle.data = self._data(time_s, limits)
 
     def _data(self, time_s: float | None, limits: Sequence[float]) -> tuple[Array, ...]:
-        """Return times, curves, their limits, and an upright line at a time, s."""
+        """Return times, curves, their limits, and a vertical line at a time, s."""
         # A plot without numbers has no scale.
         rows = np.array(self._rows.items or [np.zeros(1 + len(self.names))])
         rows[:, 1:] = np.maximum(rows[:, 1:], self._least)
@@ -468,7 +468,7 @@ class _Plot:
             line = np.insert(line, [at] * 3, (-1.0, 1.0, -1.0))
         curves = np.ascontiguousarray(rows.T)
         lines = [np.full(len(rows), limit) for limit in limits[: len(self.names)]]
-        # A limit that is not known is hidden behind its curve.
+        # An unknown limit is hidden behind its curve.
         known = (lines or [*curves[1:]]) if self._limited else []
         return *curves, *known, line
 
@@ -716,7 +716,7 @@ class Page:
         self._drawn_obstacles = scene.draw_obstacles(self._server.scene, _OBSTACLES_PATH, world)
 
     def _draw_body(self, path: str, body: RobotDescription) -> scene.RobotDrawing:
-        """Draw a body, which is hidden until its first state comes."""
+        """Draw a body, which is hidden until its first state arrives."""
         drawn = scene.RobotDrawing(
             self._server.scene, path, body, on_note=lambda text: self.note(Notice(text, 1))
         )
@@ -807,12 +807,12 @@ class Page:
         return actions
 
     def _shown(self, state: StackState) -> StackState:
-        """Return the present state, or the earlier one that a user looks back at."""
+        """Return the current state, or the earlier state that a user looks back at."""
         at = self._look_back.time_s
         return state if at is None or self._past.span is None else self._past.at(at)
 
     def _take(self, state: StackState, measured: Measured) -> None:
-        """Add a new state to plots, paths and the past, and tell the editor of goals."""
+        """Add a new state to plots, paths and history, and inform the editor about goals."""
         if measured is self._last:
             return
         self._last = measured
@@ -821,7 +821,7 @@ class Page:
             self._around = scene.Surroundings(self._server.scene, self._reach, _ROBOT_PATH, center)
             self._show_layers()
             self._aim_camera(self._server.initial_camera)
-            # Browsers receive the initial camera at the end of this update, and go there.
+            # Browsers receive the initial camera at the end of this update, and move to it.
             self._inbox.put(self._aim_cameras)
         if state.replay is None:
             if not self.editor.placed:
@@ -847,7 +847,7 @@ class Page:
         drawing.base.visible = True
         drawing.place(measured.pose)
         drawing.set_joint_positions(measured.q)
-        # The present, too, is another time than the one that was looked at before.
+        # Returning to the present also changes the displayed time.
         looked_back, self._looked_back = self._looked_back, self._look_back.time_s is not None
         if looked_back or self._looked_back or self._is_due("paths", _PATHS_S):
             self._draw_paths(state, around, measured.time_s)

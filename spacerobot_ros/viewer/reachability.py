@@ -223,7 +223,7 @@ def planned_links(
     try:
         names = planner_config(parameters).goal_links
     except SpaceRobotError:
-        return ()  # The check of any goal reports it.
+        return ()  # The check of each goal reports the error.
     return tuple(name for name in names if name in robot.frames and name != robot.base_link)
 
 
@@ -269,7 +269,7 @@ class GoalChecker:
             return GoalCheck(Verdict.UNCHECKED, "The process that checks goals has terminated.")
         seconds, found = time.monotonic() - self._asked_at, self._progress
         if 0 < self._begun < self._number and seconds > _MAX_CANCELLATION_S:
-            # A solver, or a compiler, of an earlier goal does not look for its cancellation.
+            # A solver or compiler for an earlier goal does not check for cancellation.
             self.close()
             self._require_process()
             self._send_question(self._last)
@@ -297,7 +297,7 @@ class GoalChecker:
             self._connection.send((self._number, question))
 
     def _received_answer(self) -> GoalCheck | None:
-        """Return the answer to the last question, if it is there; note what comes before."""
+        """Return the answer to the last question, if available; record earlier messages."""
         with suppress(OSError, EOFError):  # The process has ended.
             while self._connection.poll():
                 number, answer = self._connection.recv()
@@ -353,10 +353,10 @@ class Planner:
 
 
 def _predicted_end(robot: SpaceRobot, request: PlanRequest, schedule: GaitSchedule) -> Array:
-    """Return the pose (7,) in which the base is to end, after later schedules too.
+    """Return the predicted final base pose (7,), including later schedules.
 
-    Those bring the parts that the method controls to the goal; the position, where it is none of
-    them, follows from the centre of mass, which coasts.
+    Later schedules bring the controlled components to the goal; an uncontrolled position follows
+    from the centre of mass, which coasts.
     """
     position, quaternion = schedule.path.position[-1], schedule.path.quaternion[-1]
     if schedule.partial:
@@ -381,7 +381,7 @@ def _uncontrolled_text(
 ) -> str:
     """Return a sentence on each goal component the method does not control, with its error.
 
-    ``base`` (7,) is the pose in which the base is to end.
+    ``base`` (7,) is the predicted final base pose.
     """
     controls, error = schedule.controls, PoseError.between(base[:3], base[3:], goal)
     missed = missed_parts(goal, error, controls, tolerance)

@@ -179,7 +179,7 @@ def draw_obstacles(
 def _draw_solid(
     scene: viser.SceneApi, path: str, visual: Visual, color: Color | None = None
 ) -> viser.MeshHandle:
-    """Draw a solid in the color of its shape, with shadows; or see-through in another color."""
+    """Draw a solid in the color of its shape, with shadows, or translucent in another color."""
     red, green, blue, alpha = visual.shape.rgba
     own = round(255 * red), round(255 * green), round(255 * blue)
     opacity = (alpha if alpha < 1.0 else None) if color is None else GHOST_OPACITY
@@ -341,7 +341,7 @@ class Surroundings:
             cast_shadow=True,
             position=(float(_SUN[0]), float(_SUN[1]), float(_SUN[2])),
         )
-        # Light that the stars and other bodies would give: parts in shadow stay visible.
+        # Light from the stars and other bodies: parts in shadow stay visible.
         fill = self._scene.add_light_ambient("/skylight", intensity=_SKY_INTENSITY)
         return [stars, sun, light, fill]
 

@@ -183,7 +183,7 @@ def _guarded_websockets(served: str, title: str) -> Iterator[None]:
 
         return serve(*given, process_request=process, **options)
 
-    # Whatever is no GET request, such as HEAD, ends there with a traceback.
+    # Anything but a GET request, such as HEAD, ends there with a traceback.
     log = logging.getLogger("websockets.server")
     log.addFilter(lambda record: record.getMessage() != "opening handshake failed")
     module.serve = guarded_serve  # type: ignore[assignment, misc]

@@ -422,7 +422,7 @@ class ControlLaw(ABC):
         return (kp, kd) if self.gain_units != ACCELERATION_GAINS else self._filled(kp, kd)
 
     def _filled(self, kp: Array, kd: Array) -> tuple[Array, Array]:
-        """Return gains (m,) with those of accelerations instead of zeros."""
+        """Return gains (m,) with zeros replaced by acceleration gains."""
         rate = self._damping_rate
         filled_kp = np.where(kp > 0, kp, _CRITICAL_STIFFNESS * rate**2)
         return filled_kp, np.where(kd > 0, kd, rate)
@@ -486,7 +486,7 @@ class ControlLaw(ABC):
         self.outputs.pack_state(state, self._in["state"])
         self.outputs.pack_reference(reference, self._in["reference"])
         if self.couples:
-            # Errors act on other outputs too, in the place of their integral.
+            # Errors also act on other outputs, via the argument for the integral.
             self._function.evaluate()
             between = zip(self._couplings, (self.error, self.error_rate), strict=True)
             self._in["integral"][:] = self._ki * self._integral + sum(K @ e for K, e in between)
@@ -507,7 +507,7 @@ class ControlLaw(ABC):
         Kp, Kd, mobility = self._acceleration_gains()
         m, h = self.outputs.m, self.control_period
         one, zero = np.eye(m), np.zeros((m, m))
-        # Errors, their rates, and the accelerations by the command before.
+        # Errors, their rates, and the accelerations due to the previous command.
         sampled = np.block([[one, h * one, h**2 / 2 * one], [zero, one, h * one], [-Kp, -Kd, zero]])
         growth, modes = np.linalg.eig(sampled)
         fastest = int(np.abs(growth).argmax())
@@ -524,7 +524,7 @@ class ControlLaw(ABC):
         )
 
     def _acceleration_gains(self) -> tuple[Array, Array, Array]:
-        """Return the accelerations (m, m) of the outputs by error and by error rate, and their
+        """Return the output accelerations (m, m) per error and per error rate, and their
         mobility (m, m), near the last state at rest.
         """
         Kp, Kd = self.gain_matrices
@@ -533,7 +533,7 @@ class ControlLaw(ABC):
         mobility = J[:, :3] @ J[:, :3].T / self.robot.total_mass
         mobility += J[:, 3:] @ np.linalg.solve(H, J[:, 3:].T)
         if self.gain_units != ACCELERATION_GAINS:
-            # Automatic gains are those of accelerations already.
+            # Automatic gains are already acceleration gains.
             given = [self._in[name] > 0 for name in ("kp", "kd")]
             Kp, Kd = (
                 mobility @ np.where(is_given, K, 0.0) + np.where(is_given, 0.0, K)
@@ -563,8 +563,7 @@ class ControlLaw(ABC):
     def largest_error_share(self, bounds: Array) -> float:
         """Return the largest error at the last command as a fraction of the positive bound on that
         error (m,)."""
-        # Of numpy's, as the largest number of Python may hide one that is none: it must not count
-        # as reached.
+        # NumPy's max, as Python's may hide a NaN, which must not count as reached.
         return float(np.abs(self._out["error"] / bounds).max(initial=0.0))
 
     @property
@@ -605,7 +604,7 @@ class ControlLaw(ABC):
         return {**integral, **self.inputs(), **self.robot.mass_arguments}
 
     def _owner(self, method: str) -> int:
-        """Return the place, in the order of resolution, of the class that has a method."""
+        """Return the index, in the method resolution order, of the class that defines a method."""
         classes = type(self).__mro__
         return next(place for place, each in enumerate(classes) if method in vars(each))
 

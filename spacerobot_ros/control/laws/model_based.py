@@ -132,7 +132,7 @@ class ModelBasedLaw(ControlLaw):
     @override
     def actuation(self, reference: Reference) -> Actuation:
         """Return the command; see :meth:`ControlLaw.actuation`."""
-        # Without a joint reference the posture is the present one, and pulls at nothing.
+        # Without a joint reference, the posture is the current one and exerts no pull.
         q = self._in["state"][13 : 13 + self.robot.n]
         self._in["posture"][:] = q if reference.joints is None else reference.joints.q
         self._in["singular_damping"][:] = 0.0
@@ -163,11 +163,11 @@ class ModelBasedLaw(ControlLaw):
         return out["other"] + force @ out["J_actuators"]
 
     def _following(self, joints: JointReference) -> Array:
-        """Return the acceleration (6 + n,) with which joints follow their reference and outputs, as
-        far as the base moves them, theirs, less the damping in the null space.
+        """Return the acceleration (6 + n,) with which joints follow their reference, and outputs,
+        as far as the base moves them, follow theirs, minus the null-space damping.
 
-        Outputs then need forces for the rest of their errors alone: damping leaves forces out that
-        bear the motion along v, too.
+        Outputs then need forces only for their remaining errors: damping also omits forces that
+        support the motion along v.
         """
         out, kd = self._out, self._in["kd"].max()
         damped = self.options.null_space_damping * out["z0dot"]

@@ -50,7 +50,7 @@ from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND, first_time_ns
 
 _WAITING_STATE_CHECK_PERIOD = 0.1  # wall s
-_STATUS_LOG_PERIOD = 5.0  # wall s, of statuses that do not count
+_STATUS_LOG_PERIOD = 5.0  # wall s, for ignored statuses
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
 """Maximum wall time, s, between diagnostics in runs that need not be repeatable."""
@@ -84,7 +84,7 @@ class CommanderNode(FlightNode):
     _decoder: MessageDecoder | None = None
     _goal_actions: GoalActions | None = None
 
-    # -- life ---------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Create an inactive commander and the action servers."""
@@ -205,7 +205,7 @@ class CommanderNode(FlightNode):
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line to the log."""
         logger = self.get_logger()
-        # Each severity has its own call, as rclpy refuses a call site with changing severity.
+        # Each severity has its own call, as rclpy rejects call sites with varying severity.
         match level:
             case "debug":
                 logger.debug(message)
@@ -301,7 +301,7 @@ class CommanderNode(FlightNode):
         return answer
 
     def _subscribe_plant_status(self) -> None:
-        """Subscribe again to plant/status, whose present publishers first send their last
+        """Subscribe again to plant/status, whose current publishers first send their last
         status."""
         if self._statuses is not None:
             self.destroy_subscription(self._statuses)
@@ -316,11 +316,11 @@ class CommanderNode(FlightNode):
         )
 
     def _on_status_publisher(self, matches: Any) -> None:
-        """Doubt what was heard from a publisher of plant/status that has left others behind."""
+        """Doubt earlier statuses if a publisher of plant/status has left while others remain."""
         self._doubted |= matches.total_count > matches.current_count > 0
 
     def _on_plant_status(self, message: DiagnosticStatus) -> None:
-        """React to a status of the plant, unless another node publishes statuses, too."""
+        """React to a status of the plant, unless another node also publishes statuses."""
         if self._has_foreign_statuses():
             self._doubted = True
             self.get_logger().warning(
@@ -340,7 +340,7 @@ class CommanderNode(FlightNode):
         self.commander.receive_plant_status(status, record.name or "plant")
 
     def _has_foreign_statuses(self) -> bool:
-        """Whether more nodes publish plant/status than odom, as every plant publishes both."""
+        """Whether more nodes publish plant/status than odom; every plant publishes both."""
         topics = map(self.resolve_topic_name, ("plant/status", "odom"))
         statuses, odoms = map(self.count_publishers, topics)
         return bool(statuses > odoms > 0)
@@ -349,13 +349,13 @@ class CommanderNode(FlightNode):
         self.commander.receive_odom(first_time_ns(raw), raw)
 
     def _joined(self, raw: bytes) -> bytes | None:
-        """Return joint states of all joints; None: some have not come yet."""
+        """Return joint states of all joints; None: some have not arrived yet."""
         if self._decoder is None:
             return raw
         try:
             whole = self._decoder.joined(raw)
         except CommandError:
-            return raw  # The commander refuses it.
+            return raw  # The commander rejects it.
         if whole is None:
             self.commander.inputs.refusal = self._decoder.incomplete
         return whole
@@ -370,7 +370,7 @@ class CommanderNode(FlightNode):
             self._publish_diagnostics()
 
     def _subscribe_states(self) -> None:
-        """Subscribe to the state; with automatic reliability, notice publishers of another QoS."""
+        """Subscribe to the state; with automatic reliability, detect publishers of another QoS."""
         auto = self.config.state_reliability == "auto" and not self._best_effort
         for kind, topic, callback in (
             (Odometry, "odom", self._on_odom),
@@ -402,7 +402,7 @@ class CommanderNode(FlightNode):
         self._subscribe_states()
 
     def _process_waiting_messages(self) -> None:
-        """Process waiting statuses, and a postponed state once its time is accepted."""
+        """Process waiting statuses, and a deferred state once its time is accepted."""
         assert self._statuses is not None
         commander, handle = self.commander, self._statuses.handle
         # A busy executor may lose a callback.

@@ -253,7 +253,7 @@ class GoalActions:
             )
 
         def on_cancel(handle: ServerGoalHandle) -> CancelResponse:
-            # The state of the goal changes after this callback, before its result may come.
+            # The goal state changes after this callback, before the result may arrive.
             self._run_in_executor(lambda: node.commander.cancel_fly_to(_goal_id(handle)))
             return CancelResponse.ACCEPT
 

@@ -74,7 +74,7 @@ def interface_class(module: str, name: str) -> Any | None:
     try:
         kind = getattr(importlib.import_module(module), name)
         check_for_type_support(kind)
-    except Exception:  # Several kinds tell that it, or its libraries, are not on the paths.
+    except Exception:  # Several exceptions mean that it, or its libraries, are not on the paths.
         return None
     return kind
 
@@ -119,7 +119,7 @@ def goal_of(
     PlanningError
         The frame is unknown, or the message is not a pose; ``what`` names it.
     """
-    from spacerobot_ros.planning import Goal  # A plant takes no goals.
+    from spacerobot_ros.planning import Goal  # A plant does not accept goals.
 
     pose = _pose_of_frame(message.header.frame_id, frame, what, pose_of)
     p, o = message.pose.position, message.pose.orientation
@@ -301,7 +301,7 @@ class KnownFrames:
                     raw, self._kind
                 ).transforms
             except RuntimeError:
-                continue  # The bytes are no TFMessage.
+                continue  # The bytes are not a TFMessage.
             for each in transforms:
                 pose = pose_array(each.transform.translation, each.transform.rotation)
                 if pose is not None:

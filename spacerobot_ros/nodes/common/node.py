@@ -486,7 +486,7 @@ class FlightNode(LifecycleNode):
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Release all resources after a failed transition; the node may be configured again."""
         self._liveness.end()
-        with suppress(Exception):  # A failed transition may have left any entity.
+        with suppress(Exception):  # A failed transition may have left entities behind.
             self.cleanup()
         self._destroy_configured()
         if self._failure and self.fault is not None:
@@ -544,7 +544,7 @@ class FlightNode(LifecycleNode):
         return [*self.timers, *self.subscriptions, *self.services, *self.publishers]
 
     def _destroy_configured(self) -> None:
-        """Destroy the entities of configure; the services of every ROS node stay."""
+        """Destroy the entities created by configure; the services of every ROS node are kept."""
         self._set_parameters_read_only(fixed=False)
         destroy = {
             Timer: self.destroy_timer,

@@ -90,14 +90,14 @@ def free_domain() -> Iterator[int]:
     """
     folder = Path(tempfile.gettempdir()) / f"spacerobot_ros_domains_{os.getuid()}"
     folder.mkdir(exist_ok=True)
-    for _ in range(101):  # Higher domains take ports that Linux hands out to others.
+    for _ in range(101):  # Higher domains use ports that Linux assigns to other programs.
         domain = 1 + next(_turn) % 101
         with (folder / str(domain)).open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 continue
-            # The lock goes with the file that is closed, and with a process that is killed.
+            # The lock is released when the file is closed or the process is killed.
             yield domain
             return
     raise SpaceRobotError("Every ROS domain from 1 to 101 is held by another test.")
@@ -175,7 +175,7 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
         executor.add_node(node)
 
         def request_end() -> None:
-            # The middleware may hang while it is shut down; this says where, and ends the process.
+            # The middleware may hang during shutdown; this reports where, and ends the process.
             faulthandler.dump_traceback_later(_LONGEST_END, exit=True)
             stop.set_result(None)
             node.interrupt()

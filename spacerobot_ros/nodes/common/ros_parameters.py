@@ -132,8 +132,8 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
         value = parameter.default if given is None else parameter.checked(given)
         stored = _ros_parameter(parameter, value)
         if value == ():
-            # By its type, because rclpy cannot tell that of an empty list. One parameter that is
-            # left unset would have get_parameters answer nothing, whatever else it is asked for.
+            # By its type, because rclpy cannot infer the type of an empty list. With one unset
+            # parameter, get_parameters would return nothing, not even the other parameters.
             node.declare_parameter(name, stored.type_, _descriptor(parameter), ignore_override=True)
             Node.set_parameters(node, [stored])
         else:

@@ -121,7 +121,7 @@ class PlantNode(FlightNode):
     def _is_running_or_paused(self) -> bool:
         return self._active in (PlantState.RUNNING, PlantState.PAUSED)
 
-    # -- life ---------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Publish the status of an unconfigured plant, which is inactive."""
@@ -139,14 +139,14 @@ class PlantNode(FlightNode):
             )
         self._period_ns = config.period_ns
         decided = config.decided()
-        # Joints that move, and thrusters, are there for efforts alone.
+        # Moving joints or thrusters already require efforts.
         self._undecided = config.actuation == "auto" and decided.actuation == "velocity"
         self._under_efforts: PlantWithFaults | None = None
         """The effort plant in its initial state, kept as long as it may be needed."""
         if self._undecided:
             under_efforts = config.decided("effort")
             self._under_efforts = build_plant(robot, under_efforts)
-            # Make the equations of its brakes now: between two ticks, the plant would be late.
+            # Create its brake equations now: between two ticks, this would delay the plant.
             CommandValidator(self._under_efforts, under_efforts)
         last = self._last_state(robot)
         self.tick = 0 if last is None else round(last.time_ns / self._period_ns)
@@ -219,13 +219,13 @@ class PlantNode(FlightNode):
         self._injected_seen = plant.injected
 
     def _decide_actuation(self, topic: str, raw: bytes) -> None:
-        """Take the actuation of a command that moves anything for that of the plant."""
+        """Use the actuation of a command that moves anything as the plant's actuation."""
         actuation = "effort"
         if topic == "joint_commands":
             try:
                 actuation = actuation_of(deserialize_message(raw, JointState))
             except RuntimeError:
-                return  # The reader refuses what is no message.
+                return  # The reader rejects what is not a message.
         if not actuation:
             return
         assert self._monitor is not None
@@ -243,7 +243,7 @@ class PlantNode(FlightNode):
             self._count_commanders()
         self._under_efforts = None
         if self._real_time is not None:
-            # Time stands still meanwhile: this command, and the wrench beside it, answer its state.
+            # Time stands still meanwhile: this command, and the wrench with it, answer its state.
             self._real_time.start(self._steady.now().nanoseconds, self.tick)
         self._monitor.observe(self.commands, self.plant, config)
         self.get_logger().info(
@@ -252,12 +252,12 @@ class PlantNode(FlightNode):
         self._publish_changed_status()
 
     def _plant_now(self, robot: SpaceRobot, config: PlantConfig) -> PlantWithFaults:
-        """Return a plant of another actuation in the present state, in which the joints rest."""
+        """Return a plant with another actuation in the current state, with the joints at rest."""
         plant, capturing = self.plant, self.plant.capturing
         prepared = self._under_efforts
         if capturing is None and not np.any(plant.momentum[:6]) and not self.config.resume_bag:
             assert prepared is not None
-            return prepared  # It rests where it began.
+            return prepared  # It is still at its start.
         from spacerobot_ros.bag.salvage import LastState  # Few plants drift before they move.
 
         target = None
@@ -340,7 +340,7 @@ class PlantNode(FlightNode):
         """Bring the joints to rest, because the commanders are also ending."""
         if self._active is not PlantState.RUNNING or self._real_time is None:
             return
-        self._readers, self._undecided = {}, False  # No command counts any more.
+        self._readers, self._undecided = {}, False  # Commands no longer count.
         self.commands.rest()
         self._publish_changed_status()
         end, began = time.monotonic() + _LONGEST_REST, self.tick
@@ -351,7 +351,7 @@ class PlantNode(FlightNode):
         while not at_rest() and time.monotonic() < end and self.is_active:
             executor.spin_once(timeout_sec=0.02)
         if self.tick == began and self.is_active:
-            self._step()  # In slow real time one tick suffices, in which servos stop.
+            self._step()  # In slow real time, one tick suffices, because servos stop in it.
 
     def _stop_timers(self) -> None:
         for timer in self._wall_timers:
@@ -382,7 +382,7 @@ class PlantNode(FlightNode):
         path = self.config.resume_bag
         if not path:
             return None
-        from spacerobot_ros.bag.salvage import last_state  # Few plants begin from a bag.
+        from spacerobot_ros.bag.salvage import last_state  # Few plants start from a bag.
 
         state = last_state(path, self.get_namespace().rstrip("/"))
         if state.joint_names != list(robot.joint_names):
@@ -401,7 +401,7 @@ class PlantNode(FlightNode):
     def _resumed_plant(
         self, robot: SpaceRobot, config: PlantConfig, state: LastState
     ) -> PlantWithFaults:
-        # Servos hold the rates that they are commanded: only motors leave joints moving.
+        # Servos hold their commanded rates; only motors leave joints moving.
         moving = config.actuation == "effort"
         initial = InitialState(
             position=state.position,
@@ -430,7 +430,7 @@ class PlantNode(FlightNode):
         if limited:
             self._report.limited()
         if self._capturing is not None and self._capturing.reports:
-            # Commanders must know of the other robot before they answer a state of it.
+            # Commanders must know about the other robot before they answer its states.
             self._publish_changed_status()
         self.tick += 1
         self._publish()
@@ -516,7 +516,7 @@ class PlantNode(FlightNode):
 
     def _count_commanders(self) -> None:
         for source in self.commands.sources:
-            # Names to count by are not remapped.
+            # Publishers are counted by names that are already remapped.
             source.commanders = self.count_publishers(self.resolve_topic_name(source.topic))
 
     # -- commands -----------------------------------------------------------------------------
@@ -528,7 +528,7 @@ class PlantNode(FlightNode):
             self._decide_actuation(topic, raw)
         reader = self._readers.get(topic)
         if reader is None:
-            return  # Servos take no wrench.
+            return  # Servos do not accept a wrench.
         refusal = reader.offer(self.commands, raw, self.tick * self._period_ns)
         if refusal is not None:
             self._report.refused(reader.source, refusal)
@@ -555,7 +555,7 @@ class PlantNode(FlightNode):
         self._publish_changed_status()
 
     def _on_obstacles(self, message: String) -> None:
-        """Measure distances to the obstacles of a text, and draw them, instead of those so far."""
+        """Use the obstacles in a URDF string for distances and markers from now on."""
         if message.data == self._obstacles:
             return
         try:
@@ -569,10 +569,10 @@ class PlantNode(FlightNode):
         if self._clearance_ticks:
             described = with_world(self.plant.robot.description, world)
             with self.long_work():
-                # The plant in MuJoCo has the obstacles of the beginning alone.
+                # The plant in MuJoCo has only the initial obstacles.
                 self._clearance = ClearancePublisher.of(self, described, self._clearance)
             if self._clearance is None and self._monitor is not None and self._monitor.contacts:
-                # Nothing is left that could touch.
+                # No remaining pair of bodies could touch.
                 self._monitor.contacts = ()
                 self._publish_changed_status()
 
@@ -591,7 +591,7 @@ class PlantNode(FlightNode):
         self.commands.reset(self.time_ns)
         assert self._monitor is not None
         self._monitor.resets += 1
-        # Commanders must know of the reset before they answer a state after it.
+        # Commanders must know about the reset before they answer later states.
         self._publish_changed_status()
         if self._is_running_or_paused:
             self._publish()

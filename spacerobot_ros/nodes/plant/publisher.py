@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from spacerobot_ros.nodes.plant.node import PlantNode
     from spacerobot_ros.simulation.clearance import ClearanceMonitor
 
-_LOG_PERIOD = 5.0  # wall s, of lines of one kind
+_LOG_PERIOD = 5.0  # wall s, between log lines of one kind
 
 _RESTING_SHARE = 0.01
 """Maximum effort of a joint resting on its stop, as a fraction of its effort limit."""
@@ -69,7 +69,7 @@ class PlantReport:
         """Log a rejected command, which its validator has counted."""
         sentence = self._diagnostics.note_refusal(source, refusal)
         if refusal.reason is Reason.STALE and source.stamp_ns == NO_STAMP:
-            # A commander that has just begun answers a state from before it was ready.
+            # A commander that has just started answers a state from before it was ready.
             self._node.get_logger().info(sentence, throttle_duration_sec=_LOG_PERIOD)
         else:
             self._node.get_logger().warning(sentence, throttle_duration_sec=_LOG_PERIOD)

@@ -275,15 +275,15 @@ class Listener:
             self._firing = Firing(tuple(thrusters.name), np.array(thrusters.velocity))
         clearance = self._clearances.take()
         if clearance is not None:
-            with suppress(SpaceRobotError):  # The message is of another package.
+            with suppress(SpaceRobotError):  # The message is from another package.
                 self._clearance = ClearanceStatus.from_values(read_status(clearance).values)
 
     def _take_momenta(self) -> None:
-        """Take the momenta and the expected momenta, if both are of one tick.
+        """Take the momenta and the expected momenta, if both are from the same tick.
 
         They have no stamps. The plant publishes the expected momenta right after the momenta:
-        expected momenta published before them are of an earlier tick, and those published much
-        later than usual are of a later tick.
+        expected momenta published before them are from an earlier tick, and those published
+        much later than usual are from a later tick.
         """
         self._take_expected_momenta()
         momentum = self._momentum.take()
@@ -335,21 +335,21 @@ class Listener:
             try:
                 status = read(dict(message.values), message.message)
             except SpaceRobotError:
-                return  # The status is of another kind of node.
+                return  # The status is from another kind of node.
             status = self._after_refusal(key, status)
             self._statuses[key] = status
             self._reporters[key] = message.name
             self._hidden.pop(message.name, None)
             if isinstance(status, PlannerStatus) and status.state is not PlannerState.REFUSED:
-                with suppress(SpaceRobotError):  # An unreadable goal, of another package.
+                with suppress(SpaceRobotError):  # An unreadable goal, from another package.
                     self._take_planned_goal(status)
             self._on_status(key, message.name)
 
         return take
 
     def _after_refusal(self, key: str, status: Any) -> Any:
-        """Return the status to show: where a goal is refused while another is pursued, that of the
-        pursued one with the reason of the refusal; the pursued goal is shown again, too.
+        """Return the status to show: if a goal is refused while another is pursued, the status of
+        the pursued goal with the reason for the refusal; the pursued goal is also shown again.
         """
         pursued = self._pursued.get(key)
         match status:
@@ -370,20 +370,20 @@ class Listener:
                 self._goals = dict(self._pursued_goals)
                 return replace(pursued, message=f"{pursued.message}{_REFUSED}{status.message}")
             case PlannerStatus(state=PlannerState.PLANNING):
-                pass  # It flies on meanwhile.
+                pass  # Meanwhile, the flight continues.
             case _:
                 self._pursued.pop(key, None)
         return status
 
     def _take_planned_goal(self, status: PlannerStatus) -> None:
-        """Take the goal of a planner in place of the one before, if the status reports one."""
+        """Replace the previous goal with the planner's goal, if the status reports one."""
         links = {
             link: Goal.of_end_effectors([EndEffectorGoal.checked(link, values)])
             for link, values in status.end_effector_goals.items()
         }
         if not links and len(status.goal) != 7:
             return
-        # That of a controller's end-effector stays.
+        # The goal of a controller's end-effector is kept.
         self._goals = {part: g for part, g in self._goals.items() if not g.end_effectors}
         self._goals.pop(BASE_GOAL_KEY, None)
         if len(status.goal) == 7:
@@ -445,7 +445,7 @@ class Listener:
             self._on_goal("base", last)
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
-        with suppress(ValueError):  # The heartbeat is of another package.
+        with suppress(ValueError):  # The heartbeat is from another package.
             pulse = HeartbeatState(message.message)
             self._beats[message.name] = _Heartbeat(time.monotonic(), pulse, message.hardware_id)
             self._hidden = {name: by for name, by in self._hidden.items() if by != message.name}
@@ -471,7 +471,7 @@ class Listener:
             del self._beats[name]
             self._hidden[name] = name
             if is_replay:
-                # The recorded reports are of nodes without heartbeats here.
+                # The recorded reports are from nodes without heartbeats here.
                 recorded = set(self._reporters.values()) - set(self._beats)
                 self._hidden.update(dict.fromkeys(recorded, name))
 

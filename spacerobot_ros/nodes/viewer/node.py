@@ -117,7 +117,7 @@ class ViewerNode(FlightNode):
         self._checker = GoalChecker()
         super().__init__(name, **kwargs)
 
-    # -- life -----------------------------------------------------------------------------------
+    # -- life cycle -----------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Start the page and subscribe."""
@@ -234,7 +234,7 @@ class ViewerNode(FlightNode):
             self._checker.cancel()
         flown = content.flown_check(state) if editor.shows_sent_goal else None
         if flown is not None:
-            # The plan that is flown tells where the robot ends.
+            # The plan being executed determines the robot's final state.
             self._checker.cancel()
             editor.settled_goals(now)
             if editor.check.source is not flown.source:
@@ -319,10 +319,10 @@ class ViewerNode(FlightNode):
                     self._request_parameters(key)
 
     def _on_log(self, message: RosoutLog) -> None:
-        # The topic is the same in all namespaces, and loggers have dots for slashes.
+        # The topic is the same in all namespaces; logger names have dots instead of slashes.
         own = self.get_namespace().strip("/").replace("/", ".")
         if own and not message.name.startswith(f"{own}."):
-            return  # The log line is of another stack.
+            return  # The log line is from another stack.
         if message.level >= _LEAST_SHOWN_LOG_LEVEL and message.name != self.get_logger().name:
             level = 1 if message.level == _LEAST_SHOWN_LOG_LEVEL else 2
             self._note(printable(message.msg), level, printable(message.name))
@@ -437,8 +437,8 @@ class ViewerNode(FlightNode):
                 )
 
     def _count_readers(self, goals: Mapping[Part, Goal]) -> int:
-        """Return how many planners and controllers hear a goal, at most."""
-        # Where this node hears the goal too, one of the readers is its own.
+        """Return the maximum number of planners and controllers that receive a goal."""
+        # If this node also receives the goal, one of the subscriptions is its own.
         return max(
             self._goal_topics[part].get_subscription_count() - (part in _PARTS_WITH_RECEIVED_GOALS)
             for part in goals

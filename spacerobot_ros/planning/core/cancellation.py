@@ -102,7 +102,7 @@ class PlanningJob(Generic[_Plan]):
         """Cancel the job and wait for its thread to end."""
         self.cancel()
         if self._thread.is_alive():
-            # A thread inside CasADi would crash a process that ends.
+            # A thread inside CasADi would crash an exiting process.
             self._thread.join(MAX_THREAD_END_TIME)
 
     def result(self) -> _Plan:

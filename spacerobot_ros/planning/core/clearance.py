@@ -168,7 +168,7 @@ class Clearance:
         return required - _DISTANCE_ERROR
 
     def _require_declared_meshes(self) -> None:
-        """Refuse a robot with a ``<collision>`` whose mesh cannot be read, unless an SRDF disables
+        """Reject a robot with a ``<collision>`` whose mesh cannot be read, unless an SRDF disables
         all pairs of its link. Other meshes that cannot be read are named in the log.
         """
         robot = self._robot
@@ -202,12 +202,12 @@ class Clearance:
     def is_clear(self, shapes: Array, required: Array) -> bool:
         """Whether pairs keep the ``required`` distances (P,), m, in all configurations (N, n).
 
-        Obstacles do not count.
+        Obstacles are ignored.
         """
         return bool(self._keep_distances(shapes, required).all())
 
     def _keep_distances(self, shapes: Array, required: Array | float) -> npt.NDArray[np.bool_]:
-        """Return (N,) whether all pairs keep their distances (P,), m, but for obstacles."""
+        """Return (N,) whether all pairs except obstacles keep their distances (P,), m."""
         geometry = self.geometry
         keep = np.ones(len(shapes), dtype=np.bool_)
         if not len(geometry.pairs):

@@ -98,7 +98,7 @@ def curvatures(robot: SpaceRobot, shapes: Array) -> Array:
     """Return the angular curvature (N, 3, n, n) at shapes (N, n); see `SpaceRobot.curvature`."""
     n = robot.n
     stacked = robot.function("curvature")(shapes.T).full()
-    # Columns run over the first joint fastest, then over the second joint, then over shapes.
+    # The first joint index varies fastest, then the second joint index, then the shape.
     K = stacked.reshape(6, len(shapes), n, n)[3:]
     return np.asarray(K.transpose(1, 0, 3, 2))
 
@@ -192,7 +192,7 @@ def check_sliding_masses(robot: SpaceRobot) -> Controllability:
 def _span_of_brackets(
     robot: SpaceRobot, shapes: Array, among: Sequence[int] | None
 ) -> Controllability:
-    """Return the span of the brackets at the best conditioned one of the shapes (N, n)."""
+    """Return the span of the brackets at the best-conditioned of the shapes (N, n)."""
     joints = list(range(robot.n)) if among is None else list(among)
     name = robot.description.name
     if len(joints) < 2:

@@ -679,7 +679,7 @@ class Tolerance:
             and ("shape" not in controls or error.max_joint_error <= self.shape)
             and (
                 "end_effectors" not in controls
-                # Errors that are not known are not small.
+                # Unknown errors do not count as small.
                 or (
                     bool(error.end_effectors)
                     and all(

@@ -110,7 +110,7 @@ class JointEfforts:
     def _rates(
         self, positions: Array, velocity: Array | float, after: Array | float
     ) -> tuple[Array, Array]:
-        """Return the joint rates and their changes a second (N + 1, n) at the ticks."""
+        """Return the joint rates and their changes per second (N + 1, n) at the ticks."""
         held = held_velocities(positions, self._period, velocity, after)
         return (held[:-1] + held[1:]) / 2, np.diff(held, axis=0) / self._period
 
@@ -129,7 +129,7 @@ class JointEfforts:
 
     @cached_property
     def _drifting_function(self) -> ca.Function:
-        """The efforts by shape, velocities, accelerations, and angular momentum in the base."""
+        """The efforts by shape, rates, accelerations, and angular momentum in base components."""
         n = self._robot.n
         q, qdot, qddot, L_B = (
             ca.SX.sym(name, k) for name, k in zip("qvaL", (n, n, n, 3), strict=True)

@@ -176,7 +176,7 @@ class GaitMethod(ABC):
         try:
             self.setup()
         except PlanningError as refusal:
-            # A planner exists before its first goal, whose request refuses an unsuitable robot.
+            # A planner exists before its first goal, whose request rejects an unsuitable robot.
             self._setup_refusal = refusal
 
     def setup(self) -> None:  # noqa: B027 - methods that delegate have nothing to set up here
@@ -278,8 +278,8 @@ class GaitMethod(ABC):
         quaternion: Array,
         controls: frozenset[Controlled],
     ) -> Notes:
-        """Return notes on the end of a gait: the shape (n,), the pose of the base (3,), (4,) and of
-        links that the goal names, and the errors of the parts that are controlled.
+        """Return notes on the end of a gait: the shape (n,), the poses of the base (3,), (4,) and
+        of links named in the goal, and the errors of the controlled parts.
         """
         left = PoseError.between(position, quaternion, goal, q, self.robot)
         notes: Notes = {"final_shape": q.tolist(), "final_position": position.tolist()}
@@ -326,10 +326,10 @@ class GaitMethod(ABC):
         return np.clip(wanted, robot.lower, robot.upper)
 
     def _clear_goal_shape(self, request: PlanRequest) -> Array | None:
-        """Return the goal shape (n,) as :meth:`goal_shape`, and refuse one in collision."""
+        """Return the goal shape (n,) as :meth:`goal_shape`, and reject one in collision."""
         shape = self.goal_shape(request.goal)
         if shape is not None and self.clearance is not None:
-            # Where the base will be among obstacles depends on the motion.
+            # The base pose among obstacles depends on the motion.
             self.clearance.require_shape(shape, self.clearance.required(request.state.q))
         return shape
 
@@ -363,14 +363,14 @@ class GaitMethod(ABC):
     def _base_poses(
         self, start: RobotState, positions: Array, attitudes: Array | None = None
     ) -> BasePoses | None:
-        """Return the poses of the base at shapes (N + 1, n) at ticks; None without obstacles."""
+        """Return the base poses for shapes (N + 1, n) at ticks; None without obstacles."""
         if not self._has_obstacles:
             return None
         return self._prediction.poses(start, positions, attitudes)
 
     def _require_clear(self, positions: Array, base: BasePoses | None = None) -> None:
-        """Refuse shapes (K, n) on the way, with straight lines in between, where links come too
-        near to each other or, at the poses of the ``base``, to obstacles.
+        """Reject shapes (K, n) on the path, with straight lines in between, at which links come too
+        close to each other or, at the ``base`` poses, to obstacles.
         """
         if clause := self._too_near(positions, base):
             raise PlanningError(f"On the way {clause}.")
@@ -378,7 +378,7 @@ class GaitMethod(ABC):
     def _too_near(
         self, positions: Array, base: BasePoses | None = None, *, at_ticks: bool = True
     ) -> str:
-        """Return the clause that says where links come too near; empty: nowhere."""
+        """Return a clause that states where links come too close; empty: nowhere."""
         if self.clearance is None:
             return ""
         found = self.clearance.approaches(positions, base=base)

@@ -1,6 +1,6 @@
 """Search progress, and announcements of other long-running work.
 
-Those who show progress listen for all searches of the process. So progress passes through methods
+Listeners receive the progress of all searches in the process. So progress passes through methods
 that do not handle it, and out of planning threads.
 """
 
@@ -39,7 +39,7 @@ class SearchProgress:
     best_s
         Duration of the best manoeuvre so far, s; infinite before the first one.
     phase
-        What the search does.
+        Current phase of the search.
     elapsed_s
         Wall time since the search began, s.
     """

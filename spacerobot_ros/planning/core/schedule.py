@@ -185,7 +185,7 @@ def straight_motion(
 
 
 def _leg_duration(robot: SpaceRobot, move: Array, wanted: float) -> float:
-    """Return the duration of a leg, s: infinity if a joint without speed is to move."""
+    """Return the duration of a leg, s: infinity if a joint with zero speed limit must move."""
     active = np.abs(move) > _MIN_JOINT_MOTION
     if not active.any():
         return 0.0

@@ -106,7 +106,7 @@ def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
     if all(map(np.array_equal, _bounds(robot, False), _bounds(robot, True))):
         return (free,)
     limited = _search(robot, link, equations, within_limits=True)
-    # Singular shapes within the limits are some without them, too.
+    # Singular shapes within the limits are also singular without them.
     intervals = np.array([*free.path_dependent, *limited.path_dependent]).reshape(-1, 2)
     joined = _union(intervals, _MAX_CLOSED_GAP * free.distance_range[1])
     return replace(free, path_dependent=tuple(joined)), limited
@@ -124,7 +124,7 @@ def _search(
     if within_limits:
         box = shape_box(robot)
     shapes = np.random.default_rng(_SEED).uniform(*box, (_SAMPLED_SHAPES, robot.n))
-    # Where a distance is extreme, rates of the joints do not change it.
+    # At an extreme distance, joint rates do not change it.
     starts = np.vstack([shapes, extremes])
     curves, count = _Search(equations, lower, upper).intervals(starts)
     ends = [*reach, *np.ravel(curves)]
@@ -133,7 +133,7 @@ def _search(
 
 
 def _bounds(robot: SpaceRobot, within_limits: bool) -> tuple[Array, Array]:
-    """Return bounds (n,), (n,) of the shape; infinite for joints that turn freely."""
+    """Return bounds (n,), (n,) of the shape; infinite for joints that rotate freely."""
     lower, upper = robot.lower.copy(), robot.upper.copy()
     followed = {x.mimic.joint for x in robot.description.moving_joints if x.mimic is not None}
     box = shape_box(robot)
@@ -151,7 +151,7 @@ class _Equations:
 
     ``jacobian`` is ``q -> J*`` (m, n), rows along the directions in which the joints move the link;
     ``function`` is ``(q, u) -> equations (n + 1,), derivatives (n + 1, n + m), distance, its
-    gradient``. ``samples`` (K, n) are shapes all over the shape space, ``rank`` is the largest rank
+    gradient``. ``samples`` (K, n) are shapes across the shape space, ``rank`` is the largest rank
     of J* there.
     """
 
@@ -241,7 +241,7 @@ class _Equations:
 
 
 class _Search:
-    """The search of singular shapes between bounds, many at a time."""
+    """Search for singular shapes within bounds, many at a time."""
 
     def __init__(self, equations: _Equations, lower: Array, upper: Array) -> None:
         m = np.full(equations.dimensions, np.inf)
@@ -321,10 +321,10 @@ class _Search:
 
 
 def _least_solution(A: Array, b: Array, free: Array) -> Array:
-    """Return the least x (K, N) of ``A x = b`` with A (K, M, N), nonzero where ``free`` is one."""
+    """Return the least-norm x (K, N) of ``A x = b``, A (K, M, N), nonzero where ``free`` is one."""
     A = A * free[:, np.newaxis]
     square = A @ A.transpose(0, 2, 1)
-    # A trace of damping: equations may depend on each other where two curves meet.
+    # Slight damping: equations may be dependent where two curves meet.
     square += 1e-12 * np.eye(A.shape[1])
     solution = np.linalg.solve(square, b[:, :, np.newaxis])
     return np.asarray((A.transpose(0, 2, 1) @ solution)[:, :, 0])

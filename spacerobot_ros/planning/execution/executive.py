@@ -353,7 +353,7 @@ class Executive:
         if self.phase is Phase.TELEOPERATING:
             self._teleoperation.keep_base_pose(measured)
         elif self.measuring:
-            # A moving robot has no average: only its last state counts.
+            # States of a moving robot are not averaged: only the last one is used.
             self._average.take(measured, alone=self._tracker.is_active)
 
     def update(self, measured: MeasuredState) -> Setpoint:
@@ -465,7 +465,7 @@ class Executive:
     # -- in motion: EXECUTING and BRAKING -----------------------------------------------------
 
     def _measure_in_motion(self, waiting: IdentifiedGoal, measured: MeasuredState) -> None:
-        """Plan for a new goal from the present state, or brake first if planning takes time."""
+        """Plan for a new goal from the current state, or brake first if planning takes time."""
         take_over, attempts_left = None, self._in_motion_attempts < _MAX_IN_MOTION_ATTEMPTS
         if self.phase is Phase.EXECUTING and attempts_left and self._can_replan():
             after = self.config.takeover_time * 2**self._in_motion_attempts
@@ -530,7 +530,7 @@ class Executive:
         )
 
     def _replan_remaining(self, active: ActiveGoal, state: RobotState) -> None:
-        """Plan the remaining motion again from the present state, at most once a period."""
+        """Replan the remaining motion from the current state, at most once per period."""
         state = self._tracker.path_check.average_pose(state)
         if self._stamp_ns < self._replan_ns or active.schedule.partial:
             return
@@ -550,7 +550,7 @@ class Executive:
         self._request_plan(job, replace(state, q=take_over.shapes[0].copy()), aim)
 
     def _brake_for_replan(self, event: Event) -> None:
-        """Come to rest along the planned path: in the background plans are made from rest."""
+        """Come to rest along the planned path: background plans start from rest."""
         assert self._active_goal is not None
         self._active_goal.next_plan = PlanReason.REPLAN
         self._tracker.brake(self._stamp_ns)
@@ -787,7 +787,7 @@ class Executive:
         self._change_phase(event, self._phase_at_rest())
 
     def _handle_time_jump(self, stamp_ns: int) -> None:
-        """Plan the remaining motion where the schedule does not cover the present time."""
+        """Plan the remaining motion if the schedule does not cover the current time."""
         if self._tracker.covers(stamp_ns):
             return
         if self._active_goal is not None:

@@ -110,7 +110,7 @@ class PathCheck:
         sensitivity: Array | None = None,
         masses: MassEstimate | None = None,
     ) -> None:
-        # No compiler in flight.
+        # Do not compile in flight.
         self._robot = robot.interpreted
         self._path, self._positions = schedule.path, schedule.positions
         self._period, self._deadband = schedule.control_period, config.shape_deadband
@@ -162,7 +162,7 @@ class PathCheck:
         return replace(state, position=position, quaternion=quaternion)
 
     def _joint_lag_deviation(self, state: RobotState) -> Array:
-        """Return the deviation (6,) of the base in W by the lag of the joints."""
+        """Return the base deviation (6,) in W due to the lag of the joints."""
         lag = state.q - self._positions[round(self._path.time[self._next_pose] / self._period)]
         lag[np.abs(lag) <= self._deadband] = 0.0
         displacement_B = -self._robot.connection(state.q) @ lag
@@ -196,7 +196,7 @@ class PathCheck:
         return position, quaternion_multiply(turn, self._path.quaternion[k])
 
     def _deviation_by_masses(self, begin: int, end: int) -> Array:
-        """Return the change of the deviation (6,) between instants by errors of masses."""
+        """Return the change in deviation (6,) between instants due to mass errors."""
         return np.asarray((self._sensitivity[end] - self._sensitivity[begin]) @ self._masses.errors)
 
     def _mean_deviation(self) -> Array:
@@ -229,7 +229,7 @@ class PathCheck:
 
 
 def _aim(end: tuple[Array, Array], error: PoseError, allowed: Tolerance) -> tuple[Array, Array]:
-    """Return the pose to aim at from an end (3,), (4,), as far as its error exceeds the allowed."""
+    """Return an end pose (3,), (4,) shifted by the part of its error beyond the allowed error."""
     position, quaternion = end
     moved = error.position * _excess_share(error.distance, allowed.position)
     turn = error.rotvec * _excess_share(error.angle, allowed.attitude)
@@ -273,9 +273,9 @@ class PathSensitivity:
         return ca.Function("model", [q, p], [ca.vec(-connection[3:, :]), center]), arguments.T
 
     def _derivatives(self, shapes: Array) -> tuple[Array, Array]:
-        """Return derivatives by the parameters, for shapes (M, n), in base components.
+        """Return derivatives with respect to the parameters, for shapes (M, n), in base components.
 
-        They are those of the turn by each joint (M, n, 3, P) and of the centre of mass (M, 3, P).
+        They are those of rotations by each joint (M, n, 3, P) and of the centre of mass (M, 3, P).
         """
         model, arguments = self._model
         variants = arguments.shape[1]
@@ -309,7 +309,7 @@ class PathSensitivity:
         in_base = np.einsum("kjap,kj->kap", by_joint, np.diff(shapes, axis=0))
         steps = (R_WB[:-1] + R_WB[1:]) / 2 @ in_base
         turned = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
-        # The centre of mass C of the system stays where it is: r_WB = r_WC - R_WB r_BC_B.
+        # The system's centre of mass C is at rest: r_WB = r_WC - R_WB r_BC_B.
         r_BC_W = [R @ self._robot.center_of_mass(q) for R, q in zip(R_WB, shapes, strict=True)]
         arms = np.array([hat(each) for each in r_BC_W])
         moved = arms @ turned - R_WB @ _interpolate(instants, called, centers)
@@ -377,7 +377,7 @@ class MassEstimate:
         return self._errors
 
     def _normal_equations(self) -> tuple[Array, Array]:
-        """Return matrix and right side of the estimate, without the part of a constant offset."""
+        """Return the matrix and right-hand side of the estimate, without a constant offset."""
         n = max(self._poses, 1)
         squares = self._squares - self._sum_J.T @ self._sum_J / n
         products = self._products - self._sum_J.T @ self._sum_y / n

@@ -113,7 +113,7 @@ class StateAverage:
         rates = np.mean(self._rates, axis=0)
         if not (np.all(np.isfinite(poses)) and np.all(np.isfinite(np.concatenate([q, rates])))):
             raise PlanningError("The measured state is not finite; see odom and joint_states.")
-        # Attitudes differ by noise, so the mean of small turns from the first attitude is exact
+        # Attitudes differ by noise, so the mean of small rotations from the first attitude is exact
         # enough.
         first = poses[0, 3:]
         quaternion = first
@@ -122,7 +122,7 @@ class StateAverage:
             quaternion = quaternion_multiply(first, quaternion_from_rotvec(turn))
         twist, qdot = rates[:6], rates[6:]
         momenta = self._momenta
-        # Wheels spin on at rest.
+        # Wheels keep spinning at rest.
         at_rest = np.abs(qdot[self._braked]).max(initial=0.0) <= max(_REST_RATE, self._tolerance)
         if at_rest or momenta is None:
             noise = np.abs(np.concatenate([twist, qdot[self._wheels]])).max() <= self._tolerance

@@ -261,7 +261,7 @@ class Phase(Enum):
     MEASURING = "measuring"  # A new goal waits for measured states to plan from; the joints rest.
     PLANNING = "planning"  # The worker computes a plan.
     EXECUTING = "executing"  # A schedule is tracked.
-    REPLANNING = "replanning"  # A schedule is tracked; a plan that takes over is computed.
+    REPLANNING = "replanning"  # A schedule is tracked while a plan that takes over is computed.
     TAKING_OVER = "taking over"  # A schedule is tracked until its successor takes over.
     BRAKING = "braking"  # The joints brake along the planned path.
     EVALUATING = "evaluating"  # A schedule has ended; measured states are compared with the goal.
@@ -276,12 +276,12 @@ class Event(Enum):
     PLAN_REQUESTED = "plan requested"  # A plan from the measured state was requested.
     PLANNED = "planned"
     REFUSED = "refused"  # The method has found no plan.
-    PLAN_LATE = "plan late"  # The tick of a take-over has come, and its plan is not ready.
-    TAKEN_OVER = "taken over"  # The tick has come at which a plan takes over.
+    PLAN_LATE = "plan late"  # The takeover tick has been reached, but the plan is not ready.
+    TAKEN_OVER = "taken over"  # The tick at which a plan takes over has been reached.
     SCHEDULE_ENDED = "schedule ended"
-    AT_REST = "at rest"  # The braking is over.
+    AT_REST = "at rest"  # Braking has ended.
     TRACKING_ERROR = "tracking error"  # The base is off its path; the method plans from rest only.
-    OBSTACLES = "obstacles"  # There are other obstacles, which the plan does not know.
+    OBSTACLES = "obstacles"  # The obstacles have changed since planning.
     JOINTS_STUCK = "joints stuck"
     TIME_JUMPED = "time jumped"  # The schedule does not cover the time of the states.
     REACHED = "reached"
@@ -336,13 +336,13 @@ class PlanReason(Enum):
     """Reason for a plan request; events contain its value under ``reason``."""
 
     NEW_GOAL = "new goal"  # A new goal, from rest.
-    BLEND = "blend"  # A new goal while the joints move: the plan begins with braking.
+    BLEND = "blend"  # A new goal arrived while the joints were moving; the plan begins by braking.
     IN_MOTION = "new goal in motion"  # A new goal; its plan takes over in motion.
     SHRINKING_HORIZON = "shrinking horizon"  # The remaining motion, planned in motion.
     CORRECTION = "correction"  # The schedule has ended, and the goal is not reached.
-    CONTINUATION = "continuation"  # The next piece of a manoeuvre in pieces.
+    CONTINUATION = "continuation"  # The next part of a manoeuvre planned in parts.
     TRACKING_ERROR = "tracking error"  # The base is off its path; the plan begins with braking.
-    REPLAN = "replan"  # The schedule ended by braking, or does not apply any more.
+    REPLAN = "replan"  # The schedule ended by braking, or no longer applies.
     STUCK_JOINTS = "stuck joints"  # Some joints are stuck; the plan uses the other joints.
 
     @property
@@ -459,7 +459,7 @@ def describe_remaining_error(
     hand, hands, several = "", "end_effectors" in controls, len(error.end_effectors) > 1
     if hands and error.end_effectors:
         distance, angle = error.largest_end_effector_distance, error.largest_end_effector_angle
-        # Goals of positions alone leave no angle.
+        # Position-only goals have no angle error.
         turn = f" and {quantity(angle, 'rad')}" if angle > 0 else ""
         hand = f"end-effector{'s at most' if several else ''} {quantity(distance, 'm')}{turn}"
     remaining = f"{body or hand} from the goal"
@@ -488,7 +488,7 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
     Parameters
     ----------
     statuses, end_s
-        As of :func:`time_to_end`.
+        As in :func:`time_to_end`.
 
     Returns
     -------

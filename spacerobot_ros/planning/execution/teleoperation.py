@@ -133,7 +133,7 @@ class _Following:
 
     follower: TwistFollower
     twist: TwistCommand | None
-    """The last one; None: the joints brake."""
+    """The last twist; None: the joints brake."""
     received_ns: int
     """Stamp, in ns, of the state that preceded the twist."""
     reported: str | None = None
@@ -167,7 +167,7 @@ class Teleoperation:
         self._robot, self._config, self._clearance = robot, config, clearance
         self._timeout_ns = config.twist_timeout * SECOND
         self._followers: dict[str, TwistFollower] = {}
-        """By link."""
+        """Followers by link name."""
         self._following: _Following | None = None
         self._refused_ns: int | None = None
         """Stamp, in ns, of the state that preceded the last rejected twist."""
@@ -259,8 +259,8 @@ class Teleoperation:
         return TwistStep(rates, self._news(following, reason or limited, stamp))
 
     def _news(self, following: _Following, reason: str, stamp: int) -> str:
-        """Return the message about a reason that begins, or is over for a while; its numbers
-        change.
+        """Return the message about a reason that is new, or has been over for a while; its numbers
+        may change.
         """
         beginning = reason.split(":")[0].split(" come within ")[0].split(" touch,")[0]
         if reason:
@@ -341,7 +341,7 @@ class TwistFollower:
         Parameters
         ----------
         twist
-            The wanted twist; None: no twist, so the joints come to rest.
+            The desired twist; None: no twist, so the joints come to rest.
         pose
             (7,) of the base: position, m, and quaternion.
         q
@@ -352,7 +352,7 @@ class TwistFollower:
         wanted, reason = np.zeros(len(q)), ""
         if twist is not None:
             wanted, reason = self._wanted(twist, pose, q)
-            # Rates are held for a tick: they are those of its middle.
+            # Rates are held for a tick, so they are computed for its midpoint.
             for _ in range(_MIDPOINT_STEPS):
                 half = self._limited(wanted, q, before) * self._period / 2
                 turn = quaternion_from_rotvec(-self._robot.connection(q + half / 2)[3:] @ half)
@@ -369,7 +369,7 @@ class TwistFollower:
         return rates, reason
 
     def _wanted(self, twist: TwistCommand, pose: Array, q: Array) -> tuple[Array, str]:
-        """Return rates in proportion to those of the twist, and why they are less."""
+        """Return rates proportional to those of the twist, and why they are smaller."""
         limits = self._limits
         R_BE, _ = self._robot.link_pose(self.link, q)
         v, omega = twist.in_base(matrix_from_quaternion(pose[3:]), R_BE)
@@ -417,31 +417,31 @@ class TwistFollower:
         if self._keeps_attitude:
             M = np.vstack([M, self._robot.connection(q)[3:] * self._weights])
             goal = np.concatenate([motion, np.zeros(3)])
-        # An attitude that does not depend on the joints is kept anyway: rows of zeros.
+        # An attitude that does not depend on the joints never changes: its rows are zero.
         scaled = np.linalg.lstsq(M, goal, rcond=1e-9)[0]
         if np.linalg.norm(M @ scaled - goal) > 1e-6 * np.linalg.norm(goal):
             return np.zeros(len(q)), 0.0
         return self._weights * scaled, float(np.linalg.norm(motion) / np.linalg.norm(scaled))
 
     def _rates_that_can_stop(self, room: Array) -> Array:
-        """Return the largest rates (n,) from which joints stop within some room (n,)."""
+        """Return the largest rates (n,) from which joints stop within a distance (n,)."""
         a, h = self._limits.acceleration, self._period
         free = np.maximum(room - a * h**2 / 8, 0.0)
         return np.asarray(a * (np.sqrt(h**2 / 4 + 2 * free / a) - h / 2))
 
     def _limited(self, wanted: Array, q: Array, before: Array) -> Array:
-        """Return rates (n,) on the way to the wanted ones, within acceleration and travel."""
+        """Return rates (n,) towards the desired ones, within acceleration and position limits."""
         limits, most = self._limits, self._limits.acceleration * self._period
         change = wanted - before
         with np.errstate(divide="ignore", invalid="ignore"):
             share = float(np.nanmin(np.append(most / np.abs(change), 1.0)))
-        # All joints change together, so that the direction of the motion stays; but stops count.
+        # All joints change together to keep the direction of motion, except at joint stops.
         rates = before + share * change
         up, down = map(self._rates_that_can_stop, (limits.upper - q, q - limits.lower))
         return np.asarray(np.clip(rates, -down, up))
 
     def _too_near(self, clearance: Clearance, rates: Array, pose: Array, q: Array) -> str:
-        """Return a clause where links come too near until the joints could rest; else nothing."""
+        """Return a clause if links come too close before the joints can stop; else empty."""
         if self._required is None:
             at = BasePoses(pose[np.newaxis, :3], pose[np.newaxis, 3:])
             try:

@@ -96,7 +96,7 @@ class ScheduleFollower:
         self.gain = min(shape_gain, 1.0 / schedule.control_period)
         self._positions = schedule.positions
         # The joints rest after the last tick, and wheels keep their rates. The part of the
-        # feedback known beforehand is added here: qdot = qdot_k + gain (q_k - q), and q alone is
+        # feedback known beforehand is added here: qdot = qdot_k + gain (q_k - q), and only q is
         # measured.
         self._after = np.zeros(len(schedule.joint_names))
         if schedule.end_velocities is not None:
@@ -181,7 +181,7 @@ def _braking_schedule(schedule: GaitSchedule, begins: float, duration: float) ->
     shapes = positions[k] + (ticks - k)[:, np.newaxis] * ahead
     end = schedule.end_velocities
     if end is not None:
-        # From the rate at the beginning to that of the end, steadily.
+        # From the initial to the final rate, linearly.
         first = schedule.velocities[min(k[0], last - 1)]
         t = np.minimum(since, duration)[:, np.newaxis]
         turned = shapes[0] + t * first + t**2 / (2 * duration) * (end - first)
@@ -196,9 +196,9 @@ class TrajectoryTracker:
     Parameters
     ----------
     robot
-        Whose joints are commanded.
+        The robot whose joints are commanded.
     config
-        Of the planner.
+        The planner configuration.
     """
 
     def __init__(self, robot: SpaceRobot, config: PlannerConfig) -> None:
@@ -220,7 +220,7 @@ class TrajectoryTracker:
         self.use_robot(robot)
         band = 2 * config.shape_deadband
         self._stuck_watch = StuckJointWatch(
-            # A controller of the robot's own sees itself that a joint does not follow.
+            # The robot's own controller detects joints that do not follow.
             robot.n,
             0 if self._ends_by_result else config.stuck_ticks,
             config.control_period,
@@ -407,12 +407,12 @@ class StuckJointWatch:
     range. A joint is stuck if it was commanded to move in at least N ticks and the first range is a
     small fraction of the second. So joints that are not commanded to move, slow joints, and noisy
     measurements are not mistaken for stuck joints. If several joints are commanded to move and none
-    does, they are watched for longer, because commands may not arrive for a while.
+    does, they are monitored for longer, because commands may not arrive for a while.
 
     Parameters
     ----------
     joints
-        Their number.
+        Number of joints.
     ticks
         The number N above; 0: joints are never considered stuck.
     control_period
@@ -469,7 +469,7 @@ class StuckJointWatch:
             # Joints do not all jam at once: perhaps commands do not arrive for a while.
             stuck[:] = False
         follows = due & (measured >= _MIN_FOLLOWED_SHARE * commanded)
-        # Joints between both shares are watched for a window twice as long.
+        # Joints between the two fractions are monitored for a window twice as long.
         self._window[due] *= 2
         self._restart_joints(follows | stuck, q)
         return [int(i) for i in np.flatnonzero(stuck)]

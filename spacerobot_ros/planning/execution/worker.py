@@ -125,7 +125,7 @@ class PlanningWorker:
     robot
         The model.
     config
-        Of the planner.
+        The planner configuration.
     method
         Planning method that uses all joints; None: the method named in the configuration.
     long_work
@@ -268,7 +268,7 @@ class PlanningWorker:
             self._job.close()
 
     def approach_ahead(self, schedule: GaitSchedule, begins: float, now: float) -> str:
-        """Return a clause that says at which point the rest of a schedule comes too close to
+        """Return a clause that states where the rest of a schedule comes too close to
         obstacles.
 
         ``begins`` and ``now`` are times, s. Empty if the schedule stays clear, or if there are no
@@ -339,7 +339,7 @@ class PlanningWorker:
         return replace(gait, positions=np.vstack([shapes[:-1], gait.positions]), path=path)
 
     def _predict_motion(self, state: RobotState, shapes: Array) -> tuple[RobotState, Array, Array]:
-        """Return the state after shapes (K + 1, n) at ticks, and the base poses at the ticks."""
+        """Return the state after shapes (K + 1, n), one per tick, and the base pose at each."""
         config = self._config
         # Most manoeuvres have few ticks: compiling the step would take longer.
         robot = self._robot.interpreted

@@ -42,12 +42,12 @@ from spacerobot_ros.planning.methods.nominal_shape import (
 
 _MAX_SHRINKS = 14
 """Number of attempts for a cycle in which links come too close to each other; each attempt uses a
-cycle half as large as the one before.
+cycle half as large as the previous one.
 """
 
 _MAX_CYCLE_TRIALS = 6
 """Number of attempts for a cycle that would not bring the base closer; each attempt uses a cycle
-half as large as the one before."""
+half as large as the previous one."""
 
 _MAX_CYCLE_SHARE = 1.0 - 1e-9
 """Fraction k of the remaining rotation above which one cycle corrects all of it."""
@@ -193,8 +193,8 @@ class AreaLoopGait(GaitMethod):
         chosen: NominalShape,
         cancellation: Cancellation,
     ) -> NominalShape:
-        """Return the nominal shape for a goal: the chosen one if links keep clear on its way and
-        on its first loop, else the one, of others with room, from which the goal takes least time.
+        """Return the nominal shape for a goal: the chosen one if links stay clear on the path to it
+        and on its first loop, else the fastest one for the goal among those with more room.
         """
         if self.clearance is None:
             return chosen
@@ -213,8 +213,8 @@ class AreaLoopGait(GaitMethod):
     def _expected_time(
         self, request: PlanRequest, final: Array | None, chosen: NominalShape
     ) -> tuple[float, bool]:
-        """Return the time of the cycles for a goal round a nominal shape, s, infinite where links
-        come too near, and whether links keep clear without a smaller loop.
+        """Return the duration of the cycles for a goal around a nominal shape, s, infinite if links
+        come too close, and whether links stay clear without a smaller loop.
         """
         nominal, gait, target = self._move_to_nominal(request, final, chosen)
         left = attitude_error(gait.attitudes[-1], target)
@@ -233,8 +233,8 @@ class AreaLoopGait(GaitMethod):
         return self._count_cycles_left(missing, clear, enough) * duration, clear == share
 
     def _initial_loop_areas(self, left: Array, nominal: NominalShape) -> tuple[Array, float]:
-        """Return the areas (3,) for the share k of a turn (3,), rad, and the part of them that
-        loops with edges of at most the longest have.
+        """Return the areas (3,) for the fraction k of a rotation (3,), rad, and the fraction of
+        these areas enclosed by loops with edges of the largest length.
         """
         S = self.options.k * np.linalg.solve(nominal.M, left).astype(float)
         # Edges scale with the square root of areas.
@@ -250,7 +250,7 @@ class AreaLoopGait(GaitMethod):
         flown: int,
     ) -> tuple[_PlannedMotion, Notes, float]:
         """Add one cycle for the turn ``left`` (3,), rad; cycles continue until the attitude is off
-        by ``enough`` (rad), and ``flown`` are done.
+        by ``enough`` (rad), and ``flown`` cycles are complete.
 
         Also returned are the paper's symbols and the expected duration of later cycles, s.
         """
@@ -291,7 +291,7 @@ class AreaLoopGait(GaitMethod):
     def _count_cycles_within_limits(
         self, missing: float, share: float, enough: float, flown: int, too_near: str = ""
     ) -> float:
-        """Return the expected number of cycles for the goal, with those that are ``flown``."""
+        """Return the expected number of cycles for the goal, including those already ``flown``."""
         cycles = flown + self._count_cycles_left(missing, share, enough)
         most = self.options.most_cycles
         if cycles > most:
@@ -305,7 +305,7 @@ class AreaLoopGait(GaitMethod):
     def _shrink_until_clear(
         self, gait: _PlannedMotion, S: Array, share: float, nominal: NominalShape
     ) -> tuple[float, str]:
-        """Return a share of areas ``S`` (3,), up to a given one, on whose loop links keep clear.
+        """Return a fraction of areas ``S`` (3,), up to a given one, on whose loop links stay clear.
 
         The second is the clause on the last loop that was too large; empty where the first one is
         clear. PlanningError if links come too near on small loops, too.
@@ -327,7 +327,7 @@ class AreaLoopGait(GaitMethod):
         return self._too_near(shapes, self._base_poses(gait.start, shapes, attitudes))
 
     def _count_cycles_left(self, missing: float, share: float, enough: float) -> float:
-        """Return the number of cycles left for a missing turn (rad), to first order."""
+        """Return the number of cycles left for a remaining rotation (rad), to first order."""
         unbounded = missing * share
         many = (1.0 / share - 1.0) / self.options.k
         if unbounded <= enough:
@@ -346,7 +346,7 @@ class AreaLoopGait(GaitMethod):
         ends: LegEnds = []
         for loop in path.loops:
             half = np.abs(loop).max(axis=0)
-            # A box that does not fit round the nominal shape is moved into the limits.
+            # A box that does not fit around the nominal shape is moved into the limits.
             centre = np.maximum(np.minimum(nominal.shape[chosen], upper - half), lower + half)
             corners = np.tile(nominal.shape, (len(loop), 1))
             corners[:, chosen] = np.clip(centre + loop, lower, upper)
@@ -359,8 +359,8 @@ class AreaLoopGait(GaitMethod):
     def _move_to_nominal(
         self, request: PlanRequest, final: Array | None, chosen: NominalShape
     ) -> tuple[NominalShape, _PlannedMotion, Array]:
-        """Return the nearest nominal shape, the way to it, and the attitude (4,) to reach there:
-        the straight way from there to the final shape turns the base, too.
+        """Return the nearest nominal shape, the path to it, and the attitude (4,) to reach there:
+        the straight path from there to the final shape rotates the base, too.
         """
         state, edge_time = request.state, self.options.edge_time
         nominal = self._nominal.move_to_nearest_turn(chosen, state.q)
@@ -374,7 +374,7 @@ class AreaLoopGait(GaitMethod):
         shapes = straight_motion(
             self.robot, gait.positions[-1], ends, self.control_period, self.options.longest
         )
-        # A robot at rest has no momentum: its attitudes depend on its shapes alone.
+        # A robot at rest has no momentum: its attitudes depend only on its shapes.
         attitudes = self._prediction.attitudes(shapes, gait.attitudes[-1], np.zeros(3))
         positions = np.vstack([gait.positions, shapes[1:]])
         return _PlannedMotion(gait.start, positions, np.vstack([gait.attitudes, attitudes[1:]]))

@@ -114,7 +114,7 @@ class AutoGait(GaitMethod):
         return _add_notes(results[chosen].schedule, chosen, because, results, refusals)
 
     def _refuse_goal(self, refusals: Mapping[str, SpaceRobotError]) -> PlanningError:
-        """Return the error for a goal that no method plans: the proof of one, or all reasons."""
+        """Return the error for a goal that no method plans: the proof by one, or all reasons."""
         # Refusals of the robot do not depend on the goal.
         of_goal = [refusals[name] for name in refusals if name not in self._unsuitable]
         for refusal in of_goal:
@@ -171,7 +171,7 @@ class AutoGait(GaitMethod):
 @dataclass(frozen=True)
 class _MethodResult:
     """A schedule, the controlled parts of the goal, and whether it is predicted to end on the goal,
-    by itself or with the schedules after it."""
+    by itself or with the subsequent schedules."""
 
     schedule: GaitSchedule
     parts: frozenset[Controlled]

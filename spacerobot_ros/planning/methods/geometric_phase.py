@@ -81,7 +81,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
                 f"Robot '{name}' is not planar in the sense of paper 3: joint '{joint.name}' is "
                 "prismatic, but all joints must rotate about parallel axes."
             )
-        # Turns about parallel axes do not move the axes, so one shape suffices for the test.
+        # Rotations about parallel axes do not tilt the axes, so one shape suffices for the test.
         rotations.append(rotations[body.parent] @ body.origin.R)
         axes.append(rotations[-1] @ joint.axis)
         if np.linalg.norm(np.cross(axes[0], axes[-1])) > _MAX_AXIS_TILT:
@@ -95,7 +95,7 @@ def planar_axis(robot: SpaceRobot) -> Array:
 
 
 def _require_turn_about(robot: SpaceRobot, axis: Array) -> None:
-    """Refuse masses off the plane and products of inertia that tilt the base."""
+    """Reject masses off the plane and products of inertia that tilt the base."""
     # The tilt is a ratio of trigonometric polynomials of the shape: it is zero everywhere or
     # almost nowhere, so a few shapes in general position suffice for the test.
     shapes = np.outer(np.arange(1, _SAMPLED_SHAPE_COUNT + 1), np.sqrt(np.arange(2, robot.n + 2)))

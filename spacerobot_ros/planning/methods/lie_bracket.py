@@ -128,7 +128,7 @@ class LieBracketGait(GaitMethod):
             "c": [2 * float((z_f - state.q)[i]) / t1 for i in self.sliders],
         }
         positions = np.vstack([slide, turn])
-        # In every cycle the base is elsewhere.
+        # The base pose differs in every cycle.
         is_clear = not self._has_obstacles
         return self.schedule_of(goal, positions, path, symbols | notes, is_clear=is_clear)
 
@@ -161,7 +161,7 @@ class LieBracketGait(GaitMethod):
         return z_f
 
     def _keep_strokes(self, P: Array, shift: Array, q: Array, dz: Array, enough: float) -> Array:
-        """Spread a displacement over four or more sliders; name a slider of too short a stroke."""
+        """Spread a displacement over four or more sliders; name one whose stroke is too short."""
         from scipy.optimize import lsq_linear  # scipy is slow to import, and few goals need it.
 
         z0, lower, upper = (x[self.sliders] for x in (q, self.robot.lower, self.robot.upper))
@@ -257,7 +257,7 @@ class LieBracketGait(GaitMethod):
         least: int,
         enough: float,
     ) -> _TurnStep:
-        """Add the first-order error to the wanted turn until it is below ``enough`` (rad)."""
+        """Add the first-order error to the desired rotation until it is below ``enough`` (rad)."""
         omega_d, best = wanted, None
         target = quaternion_from_rotvec(wanted)
         for _ in range(_MAX_REFINEMENTS):
@@ -276,7 +276,7 @@ class LieBracketGait(GaitMethod):
         return best
 
     def _best_triple(self, z_f: Array) -> tuple[tuple[int, int, int], Array]:
-        """Return the three sliders with the best conditioned brackets at zf, and these brackets."""
+        """Return the three sliders with the best-conditioned brackets at zf, and these brackets."""
         triple, M = best_triple(self.robot.curvature(z_f)[3:], self.sliders)
         # M holds the curvature of the pairs 12, 23 and 31; the brackets are its negative.
         brackets = M * np.array([-1.0, -1.0, 1.0])
@@ -292,8 +292,8 @@ class LieBracketGait(GaitMethod):
     def _fit_to_limits(
         self, alpha: Array, triple: tuple[int, int, int], z_f: Array, least: int
     ) -> _TurnStep:
-        """Choose n, from ``least`` up, so that a cycle keeps rates and strokes; more cycles are
-        smaller ones. With ``least`` 0 the first n follows from ``loop_area``.
+        """Choose n, from ``least`` up, so that a cycle stays within rates and strokes; more cycles
+        are smaller. With ``least`` 0, the first n follows from ``loop_area``.
         """
         n = least or max(1, math.ceil(float(np.linalg.norm(alpha)) / self.options.loop_area))
         amplitudes = self._cycle_amplitudes(alpha)
@@ -323,12 +323,12 @@ class LieBracketGait(GaitMethod):
                 if not too_near:
                     return _TurnStep(shapes, n, alpha, amplitudes)
                 excess = _SHRINK_FACTOR
-            # Amplitudes go as 1/sqrt(n).
+            # Amplitudes scale as 1/sqrt(n).
             n = math.ceil(min(n * min(excess, 1e6) ** 2 * 1.001, 1e12)) + 1
 
     def _cycle_amplitudes(self, alpha: Array) -> Array:
         """Return (b11, b12, b21, a22, a31): ``a22 b12 = 2 alpha1/pi``, ``a31 b21 = alpha2/pi``,
-        ``a31 b11 = alpha3/pi``, each product raised by the loss of polygons.
+        ``a31 b11 = alpha3/pi``, each product increased by the loss of polygons.
         """
         p12, p23, p13 = 2 * alpha[0] / np.pi, alpha[1] / np.pi, alpha[2] / np.pi
         a22 = self.options.a22_ratio * math.sqrt(abs(p12))
@@ -363,7 +363,7 @@ class LieBracketGait(GaitMethod):
     def _predict_path(
         self, state: RobotState, slide: Array, attitudes: Array, cycle: Array, n: int
     ) -> BasePath:
-        """Base path: step 2 as it goes, step 3 at the ends of some cycles."""
+        """Base path: step 2 in detail, step 3 at the ends of some cycles."""
         stride = max(1, len(slide) // _PATH_POSES_PER_STEP)
         chosen = np.unique(np.append(np.arange(0, len(slide), stride), len(slide) - 1))
         time, shapes, quaternions = chosen * self.control_period, slide[chosen], attitudes[chosen]

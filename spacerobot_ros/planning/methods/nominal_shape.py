@@ -73,7 +73,7 @@ class NominalShape:
     shape
         (n,), m or rad.
     joints
-        Indices of the three.
+        Indices of the three joints.
     M
         (3, 3) base rotation, rad, in base components, per area of the pairs (1, 2), (2, 3), (3, 1).
     longest
@@ -87,7 +87,7 @@ class NominalShape:
 
     @property
     def singular_values(self) -> Array:
-        """(3,) of M, descending."""
+        """(3,) singular values of M, descending."""
         return np.asarray(np.linalg.svd(self.M, compute_uv=False))
 
     @property
@@ -312,7 +312,7 @@ def _grid(lower: Array, upper: Array, points: int) -> Array:
 
 
 def _worst_axis_turn(M: Array, longest: Array) -> Array:
-    """Return the turn (...) of the base about the worst axis by the largest loops, rad."""
+    """Return the base rotation (...) about the worst axis by the largest loops, rad."""
     areas = np.stack([longest[..., i] * longest[..., j] for i, j in JOINT_PLANES], axis=-1)
     return np.asarray(np.linalg.svd(M * areas[..., np.newaxis, :], compute_uv=False)[..., 2])
 

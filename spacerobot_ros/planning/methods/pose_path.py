@@ -136,7 +136,7 @@ class PosePath:
         return PosePath(self.positions[order], self.quaternions[order])
 
     def _distances_from_line(self, first: int, last: int) -> Array:
-        """Return how far the poses between two of them are off the line of these, m or rad."""
+        """Return the deviations of the poses between two poses from their line, m or rad."""
         inner = slice(first + 1, last)
         shares = (self.lengths_at_poses[inner] - self.lengths_at_poses[first]) / (
             self.lengths_at_poses[last] - self.lengths_at_poses[first]
@@ -185,7 +185,7 @@ class RoundedPath:
     is_straight
         Whether the path is one straight line.
     curvature_breaks
-        Fractions of the way at which the curvature changes.
+        Fractions of the path at which the curvature changes.
     """
 
     def __init__(
@@ -225,14 +225,14 @@ class RoundedPath:
         return np.asarray(b_rate * chords[after] - a_rate * chords[before]), np.asarray(turn)
 
     def travelled_length(self, share: float) -> float:
-        """Return the length along the whole path, m, after a fraction of the way."""
+        """Return the length along the whole path, m, after a fraction of this motion."""
         return self._length_before + float(
             np.interp(share * self._total, self._path.lengths_at_poses, self._metres_at_poses)
         )
 
     def _blend_at(self, share: float) -> tuple[int, int, int, float, float, float, float]:
-        """Return a pose, the lines to and from it, the shares ``a`` of the first that are left and
-        ``b`` of the second that are done, and the derivatives of both by the share of the way.
+        """Return a pose, the lines to and from it, the fractions ``a`` of the first remaining and
+        ``b`` of the second completed, and the derivatives of both by the fraction of the path.
         """
         along, lengths, total = self._path.lengths_at_poses, self._path.lengths, self._total
         s = share * total

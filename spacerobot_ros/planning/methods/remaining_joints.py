@@ -194,8 +194,8 @@ class RemainingJointsGait(GaitMethod):
 
 
 def _options_of_remaining(options: Any, stuck: npt.NDArray[np.bool_], names: Sequence[str]) -> Any:
-    """Return options for the joints that are not stuck: lists with a number a joint lose those of
-    the stuck ones, and names of joints are left to the method if one of them is stuck.
+    """Return options for the joints that are not stuck: lists with one number per joint lose those
+    of the stuck ones, and joint names are left to the method if one of them is stuck.
     """
     gone = {name for name, is_stuck in zip(names, stuck, strict=True) if is_stuck}
     kept: dict[str, Any] = {}

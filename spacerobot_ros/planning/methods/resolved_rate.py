@@ -71,7 +71,7 @@ _ZERO_PROGRESS_RATE = 1e-8
 _SINGULARITY_STEP_SHARE = 0.25
 
 _KNOT_TOLERANCE = 1e-6
-"""Fraction of the way within which a curvature jump counts as passed."""
+"""Fraction of the path within which a curvature jump counts as passed."""
 
 _ZERO_DISTANCE = 1e-10  # m or rad
 
@@ -126,8 +126,8 @@ class ResolvedRateOptions(MotionOptions):
 
 
 class _SmoothPath:
-    """A smooth way through points (K, 3), m, from the origin: a natural cubic spline by the lengths
-    of its chords, which through two points is the straight line.
+    """A smooth path through points (K, 3), m, from the origin: a natural cubic spline over chord
+    length, which is a straight line for two points.
 
     ``turn`` (3,) is the rotation vector from the start to the end, in step with the way, rad;
     ``total_length`` is that of the chords together, m. There are no ``curvature_breaks``, shares of
@@ -139,7 +139,7 @@ class _SmoothPath:
     def __init__(self, points: Array, turn: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
         from scipy.interpolate import CubicSpline
 
-        # A point that comes twice is no way.
+        # A repeated point adds no length.
         chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
         kept = np.flatnonzero(np.append(np.inf, chords) > _ZERO_DISTANCE)
         along = np.append(0.0, np.cumsum(chords))[kept]
@@ -162,16 +162,16 @@ class _SmoothPath:
         return np.asarray(self._rate(share)), self._turn
 
     def travelled_length(self, share: float) -> float:
-        """Return the length, m, of a fraction of the way."""
+        """Return the length, m, of a fraction of the path."""
         return share * self.total_length
 
 
 @dataclass(frozen=True)
 class _LinkPath:
-    """The line of a link E, in the base B_0 at the start, seen from the centre of mass.
+    """The line of a link E in the initial base frame B_0, relative to the centre of mass.
 
     ``displacements`` (k, 3) and ``rotations`` (l, 3) are the directions in which the joints move
-    and turn it, and in which it follows; ``start_position`` (3,) and ``start_attitude`` (4,) its
+    and rotate it, and in which it follows; ``start_position`` (3,) and ``start_attitude`` (4,) its
     pose at the start.
     """
 
@@ -188,8 +188,8 @@ class _LinkPaths:
 
     Rows are scaled by the reach of the links, joints by their velocity limits: all are radians of
     the fastest joint. ``joint_scales`` (n,) is the motion of each joint while the fastest one moves
-    by a radian, m or rad; ``length`` is that of the lines together, scaled; ``curvature_breaks``
-    are the shares of the lines at which their curvature jumps.
+    by a radian, m or rad; ``length`` is the scaled length of all lines; ``curvature_breaks`` are
+    the fractions of the lines at which their curvature jumps.
     """
 
     def __init__(self, robot: SpaceRobot, lines: Sequence[_LinkPath], limits: MotionLimits) -> None:
@@ -214,7 +214,7 @@ class _LinkPaths:
         )
 
     def _scaled_derivative(self, share: float) -> Array:
-        """Return the scaled derivative (m,) of the rows by the share of the lines."""
+        """Return the scaled derivative (m,) of the rows by the fraction of the lines."""
         rates: list[Array] = []
         for line in self._lines:
             velocity, omega = line.path_from_start.derivative(share)
@@ -252,11 +252,11 @@ class _LinkPaths:
         return self.joint_scales * least, float(np.linalg.norm(miss))
 
     def tangent(self, q: Array, X: Array, share: float) -> tuple[Array, Array, float]:
-        """Return the path's tangent: Shape (n,), rotation (4,), and progress."""
+        """Return the path's tangent: shape (n,), rotation (4,), and progress."""
         M = np.column_stack(
             [self.scaled_jacobian(q, X), -self._scaled_derivative(share) / self.length]
         )
-        # Of the null space, the unit vector of most progress: the projection of the last axis.
+        # The unit vector of most progress in the null space: the projection of the last axis.
         basis = np.linalg.qr(M.T, mode="complete")[0][:, len(M) :]
         progress = float(np.linalg.norm(basis[-1]))
         if progress < _ZERO_PROGRESS_RATE / 100:  # The joints cannot move without leaving the line.
@@ -338,7 +338,7 @@ def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) ->
         cancellation.raise_if_requested()
         left = total - y[-1]
         ahead = breaks[breaks > y[-1] + _KNOT_TOLERANCE * total] - y[-1]
-        # Steps end where the curvature of the way jumps.
+        # Steps end where the curvature of the path jumps.
         step = min(longest, left / progress[-1], *ahead[:1] / progress[-1])
         if len(progress) > 1 and (falls := progress[-2] - progress[-1]) > 0:
             slope = falls / (lengths[-1] - lengths[-2])
@@ -349,8 +349,8 @@ def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) ->
         there = y + step / 6 * (k + 2 * k2 + 2 * k3 + k4)
         there[n : n + 4] /= np.linalg.norm(there[n : n + 4])
         at_end = rate(there)
-        # A singularity is a turning point of the path, which no step may go beyond: there the
-        # tangent is the other way round, as progress is never negative.
+        # A singularity is a turning point of the path, which no step may go beyond: there, the
+        # tangent is reversed, as progress is never negative.
         if min(float(x[:n] @ (k[:n] / lines.joint_scales**2)) for x in (k2, k3, k4, at_end)) < 0:
             longest = step / 4
             if longest < _ZERO_PROGRESS_RATE**2:
@@ -372,7 +372,7 @@ def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) ->
 def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval: float) -> Array:
     """Return the squares (K + 1,) of the fastest speed on a path, from rest to rest.
 
-    At K + 1 places that are ``interval`` apart, with the derivatives (K + 1, n) of the shape by the
+    At K + 1 points ``interval`` apart, with the derivatives (K + 1, n) of the shape by the path
     length. With ``x`` the square of the speed, ``x' / 2`` is the acceleration along the path, and
     ``q'' x + q' x' / 2`` that of the joints: limits are linear in ``x`` (Verscheure et al.), and
     the largest sum is the largest speed everywhere.
@@ -383,7 +383,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
     K, n = len(slopes) - 1, slopes.shape[1]
     with np.errstate(divide="ignore"):
         fastest = (limits.velocity / np.abs(slopes)).min(axis=1) ** 2
-        # The unit of the squares: the linear program has numbers near one.
+        # Unit of the squares, so that the linear program has numbers near one.
         by_acceleration = (limits.acceleration / (np.abs(slopes) / interval + np.abs(bends))).min()
     unit = float(by_acceleration) * K
     fastest = np.minimum(fastest / unit, 1e6)
@@ -391,7 +391,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
     rows, columns, values = [], [], []
     bound = np.tile(_USED_ACCELERATION_SHARE * limits.acceleration / unit, 2 * K)
     intervals, joints = np.arange(K)[:, np.newaxis], np.arange(n)
-    for end in (0, 1):  # Both ends of each interval, in which x' is constant.
+    for end in (0, 1):  # At both ends of each interval, in which x' is constant.
         at = slopes[end : K + end] / (2 * interval), bends[end : K + end]
         row = (end * K + intervals) * n + joints
         before, after = -at[0] + (1 - end) * at[1], at[0] + end * at[1]
@@ -540,7 +540,7 @@ class ResolvedRateGait(GaitMethod):
         return self._schedule(request.state, goal, np.vstack(positions), notes, progress)
 
     def _route(self, request: PlanRequest, tolerance: float) -> PosePath:
-        """Return the path of a request in W, from where the end-effector is."""
+        """Return the path of a request in W, from the current end-effector pose."""
         state, goal = request.state, request.goal
         if len(goal.end_effectors) > 1:
             raise PlanningError(
@@ -558,7 +558,7 @@ class ResolvedRateGait(GaitMethod):
             rest = progress.route.remaining_after(float(done[np.argmin(off)]))
         else:
             points = aim.path_values[-1:] if request.correction else aim.path_values
-            # Without an attitude any will do: it does not turn.
+            # Without an attitude, any will do: it does not rotate.
             any_ = np.tile([0.0, 0.0, 0.0, 1.0], (len(points), 1))
             rest = PosePath(points[:, :3], any_ if aim.quaternion is None else points[:, 3:])
         if aim.quaternion is None:
@@ -571,7 +571,7 @@ class ResolvedRateGait(GaitMethod):
     def _trace_without_contact(
         self, lines: _LinkPaths, state: RobotState, cancellation: Cancellation
     ) -> tuple[Array, Array, Notes]:
-        """Return shapes (N + 1, n) and shares of the lines (N + 1,) at ticks, with notes."""
+        """Return shapes (N + 1, n) and fractions of the lines (N + 1,) at ticks, with notes."""
         path = trace_joint_path(lines, state.q, cancellation)
         notes: Notes = {}
         obstacle = self._find_obstacle(lines, path)
@@ -598,7 +598,7 @@ class ResolvedRateGait(GaitMethod):
     def _find_contact(
         self, state: RobotState, path: JointPath, obstacle: tuple[int, str] | None
     ) -> tuple[int, str] | None:
-        """Return the last place of a path before links come too near, with the reason; else an
+        """Return the last point of a path before links come too close, with the reason; else an
         ``obstacle`` that has been found.
         """
         last = len(path.shapes) - 1 if obstacle is None else obstacle[0]
@@ -639,7 +639,7 @@ class ResolvedRateGait(GaitMethod):
         return trace_joint_path(lines, request.state.q, cancellation)
 
     def _waypoints(self, request: PlanRequest, goal: Goal) -> Array:
-        """Return the waypoints (K, 3) of a request, in the world: none of a correction."""
+        """Return the waypoints (K, 3) of a request, in the world: none for a correction."""
         if request.correction or not self.options.waypoints:
             return np.zeros((0, 3))
         if len(goal.end_effectors) > 1:
@@ -673,8 +673,8 @@ class ResolvedRateGait(GaitMethod):
     ) -> _LinkPaths:
         """Return the lines of a goal, along directions in which the joints move the links.
 
-        ``piece`` is a part of a given path that the first link follows, the metres before it and
-        those of the whole path; None: it goes through the waypoints to the goal. PlanningError if
+        ``piece`` is a part of a given path that the first link follows, the metres before it and in
+        the whole path; None: it goes through the waypoints to the goal. PlanningError if
         the goal lies off these directions, or has more of them than the joints can follow.
         """
         robot = self.robot
@@ -711,7 +711,7 @@ class ResolvedRateGait(GaitMethod):
             else:
                 points = np.vstack([np.zeros(3), (points - state.position) @ R_BW.T - r_BE])
                 way = _SmoothPath(points) if is_base else _SmoothPath(points, turn)
-            # Of the base its attitude alone is kept.
+            # Only the attitude of the base is kept.
             moved = np.zeros((0, 3)) if is_base else directions.displacements
             lines.append(
                 _LinkPath(each.link, moved, directions.rotations, r_BE - r_BC, quaternion, way)
@@ -736,8 +736,8 @@ class ResolvedRateGait(GaitMethod):
             )
 
     def _find_obstacle(self, lines: _LinkPaths, path: JointPath) -> tuple[int, str] | None:
-        """Return the last place of a path before the limits of the joints are left, or before a
-        singularity is near, with the reason; None if the way is free.
+        """Return the last point of a path before joint limits are exceeded, or before a singularity
+        is near, with the reason; None if the path is free.
         """
         robot = self.robot
         beyond = np.maximum(robot.lower - path.shapes, path.shapes - robot.upper)

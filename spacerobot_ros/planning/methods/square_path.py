@@ -169,7 +169,7 @@ class SquarePathGait(GaitMethod):
         if psi_e is None:
             psi_e = np.clip(state.q, self.robot.lower, self.robot.upper)
         step_1 = float(self._phase.turns_by_legs(state.q[np.newaxis], psi_e[np.newaxis])[0])
-        # Full turns do not change the attitude, so the shorter way round is taken.
+        # Full revolutions do not change the attitude, so the shorter rotation is chosen.
         wanted = math.remainder(turn - step_1, 2 * math.pi)
         duration_1, duration_2, duration_3, duration_4 = self._durations
         legs = [(psi_e, duration_1)]
@@ -214,9 +214,9 @@ class SquarePathGait(GaitMethod):
     def _find_loop(self, psi_e: Array, wanted: float) -> _SquareLoop:
         """Return the loop for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,).
 
-        Of all pairs of joints it is the one that takes the fewest loops, and of those the one
-        with the smallest square; if links come too near on all of these, it takes more loops around
-        smaller squares. PlanningError if no square within the joint limits does.
+        Among all joint pairs, the one with the fewest loops is chosen, and among those the one with
+        the smallest square; if links come too close on all of these, more loops around smaller
+        squares are used. PlanningError if no square within the joint limits does.
         """
         pairs = itertools.combinations(self._movable, 2)
         found = [
@@ -253,7 +253,7 @@ class SquarePathGait(GaitMethod):
         )
 
     def _describe_refusal(self, wanted: float, largest: _SquareFamily | None) -> str:
-        """Return the message for a turn without a loop; ``largest`` turns the base farthest."""
+        """Return the message for a rotation without a loop; ``largest`` rotates it farthest."""
         if len(self._movable) < 2:
             return (
                 f"Fewer than two joints of robot '{self.robot.description.name}' have a velocity "
@@ -298,7 +298,7 @@ class SquarePathGait(GaitMethod):
         return _SquareFamily(pair, plane, centres, sides, plane.turns_by_squares(centres, sides))
 
     def _solve_for_side(self, candidates: _SquareFamily, wanted: float) -> tuple[int, float]:
-        """Return the row of the smallest square that turns the base far enough, and its ``z*``."""
+        """Return the row of the smallest square that rotates the base enough, and its ``z*``."""
         from scipy.optimize import brentq
 
         # The slack keeps rounding from excluding the largest square.

@@ -117,16 +117,16 @@ class EndEffectorRows:
     robot
         The model.
     links
-        Links, each with a flag that says whether the link attitude is part of the goal.
+        Links, each with a flag for whether the link attitude is part of the goal.
     axes
-        (m, 3) directions in the base about which joint loops rotate it.
+        (m, 3) directions in base components about which joint loops rotate it.
     """
 
     def __init__(self, robot: SpaceRobot, links: Sequence[tuple[str, bool]], axes: Array) -> None:
         self.robot, self.links, self.axes = robot, tuple(links), axes
         self.parameters = _PARAMETERS_PER_LINK * len(self.links)
         self.directions = tuple(self._directions(link, attitude) for link, attitude in links)
-        """Those of each link."""
+        """Directions of each link."""
 
     @cached_property
     def turn(self) -> ca.Function:
@@ -169,7 +169,7 @@ class EndEffectorRows:
 
     @cached_property
     def _with_derivatives(self) -> ca.Function:
-        """Rows, and their derivatives by a rotation of the base (in its components) and by q."""
+        """Rows, and their derivatives by a base rotation (in base components) and by q."""
         X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
         p = ca.SX.sym("p", self.parameters)
         rows = self.function(X, q, p)
@@ -202,7 +202,7 @@ class EndEffectorRows:
         return attitudes_along(self.turn, shapes, steps, steps)[:, -1]
 
     def rank(self, fixed_attitude: bool) -> tuple[int, int]:
-        """Return how many of the rows the joints can move independently, and the number of rows.
+        """Return the number of rows that the joints can move independently, and of all rows.
 
         Rows are counted at shapes in general position, with the base attitude given or free.
         """
@@ -256,16 +256,16 @@ class EndEffectorRows:
                 )
 
     def _samples(self) -> tuple[Array, Array]:
-        """Return shapes (K, n) in general position, and turns of the base (K, 4) that go with."""
+        """Return shapes (K, n) in general position, and a base rotation (K, 4) for each."""
         shapes = sample_shapes(self.robot, _SAMPLED_SHAPES)
         vectors = np.random.default_rng(0).normal(size=(len(shapes), len(self.axes))) @ self.axes
         return shapes, quaternions_from_rotvecs(vectors)
 
     def _rates(self, link: str, q: Array, X: Array) -> tuple[Array, Array]:
-        """Return how a link moves in B_0, seen from the centre of mass: displacement over rotation.
+        """Return link Jacobians in B_0, relative to the centre of mass: displacement over rotation.
 
-        (6, n) by the joints at zero momentum, as the generalised Jacobian has it, and (6, m) by
-        turns of the base about the axes.
+        (6, n) is due to the joints at zero momentum, the generalised Jacobian, and (6, m) to base
+        rotations about the axes.
         """
         R_X = matrix_from_quaternion(X)
         # [v_cm; omega; qdot] -> [v_E; omega_E]
@@ -304,8 +304,8 @@ class EndEffectorSpecification:
     attitude, position, shape
         Whether base attitude, base position and joint positions are part of the goal.
     overdetermined
-        Whether the goal has more coordinates than the joints can move independently. Hardly any
-        such goal can be reached, and only in isolated shapes, which inverse kinematics finds before
+        Whether the goal has more coordinates than the joints can move independently. Few such goals
+        can be reached, and only in isolated shapes, which inverse kinematics finds before
         the motion is planned.
     """
 
@@ -343,7 +343,7 @@ class EndEffectorSpecification:
 
     @property
     def controls(self) -> frozenset[Controlled]:
-        """The parts by name."""
+        """The controlled components by name."""
         parts: set[Controlled] = {"shape", "end_effectors"}
         if self.attitude:
             parts.add("attitude")
@@ -358,7 +358,7 @@ class EndEffectorSpecification:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3) in the base along which the base attitude must be reached."""
+        """Directions (m, 3), base components, along which the base attitude must be reached."""
         if self.ends_in_one_shape:
             return self.rows.axes
         return self.base.base_rotations.axes if self.attitude else np.zeros((0, 3))
@@ -433,7 +433,7 @@ class EndEffectorSpecification:
         limits: MotionLimits,
         parameters: Array,
     ) -> Array:
-        """Return the turn (4,) of the base that puts the end-effectors to their goals in a shape.
+        """Return the base rotation (4,) that puts the end-effectors at their goals in a shape.
 
         UnreachableError if there is none.
         """
@@ -443,7 +443,7 @@ class EndEffectorSpecification:
             X = self.rows.turns_along_direct_path(request.state.q, shape[np.newaxis])[0]
         most = max(tolerance.position, _GIVEN_SHAPE_ERROR)
         if not self.attitude and len(self.rows.axes):
-            # Loops of the joints turn the base about the axes; in the given shape alone.
+            # Joint loops rotate the base about the axes; the shape is given.
             candidates = quaternions_from_rotvecs(
                 np.vstack([np.zeros((1, 3)), *(np.pi * k / 2 * self.rows.axes for k in (1, 2, 3))])
             )
@@ -472,12 +472,12 @@ class EndEffectorSpecification:
     def _find_possible_ends(
         self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
     ) -> list[PossibleEnd]:
-        """Return ends of guesses, those that the joints reach soonest first, or NotFoundError."""
+        """Return ends for guesses, fastest to reach first, or raise NotFoundError."""
         rng = np.random.default_rng(0)
         middle, half = limits.joint_ranges(start)
         nearest = np.inf
         for count, follows in ((_STARTS, True), (_STARTS, False), (_ADDITIONAL_STARTS, False)):
-            # From here, from nearby, and from anywhere.
+            # From the start, from nearby, and from anywhere.
             anywhere = middle + half * rng.uniform(-1, 1, (count, len(start)))
             share = np.linspace(0.0, 1.0, count)[:, np.newaxis]
             shapes = np.clip(start + share * (anywhere - start), limits.lower, limits.upper)
@@ -508,7 +508,7 @@ class EndEffectorSpecification:
         ends: Sequence[PossibleEnd],
         tolerance: Tolerance,
     ) -> PossibleEnd:
-        """Return the first end that meets an overdetermined goal within its tolerance, or
+        """Return the first end that meets an overdetermined goal within its tolerance, or raise
         NotFoundError."""
         turns = np.array([each.base_rotation for each in ends])
         shapes, X, miss = self._inverse_kinematics(
@@ -558,10 +558,10 @@ class EndEffectorSpecification:
         damping: float = _DAMPING,
         error: float = _END_ERROR / 10,
     ) -> tuple[Array, Array, Array]:
-        """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from first shapes (K, n).
+        """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from initial shapes (K, n).
 
-        The ``turns`` (K, 4) of the base are ``fixed``, or first ones that are free along the axes;
-        None: they follow from the direct way.
+        The ``turns`` (K, 4) of the base are ``fixed``, or initial values that are free along the
+        axes; None: they follow from the direct path.
         """
         rows, n, count = self.rows, len(start), len(shapes)
         connection = rows.robot.function("connection", compile=False)
@@ -577,7 +577,7 @@ class EndEffectorSpecification:
                 J = by_shape - by_rotation @ A
             if np.abs(values).max() <= error:
                 break
-            # Joints at a limit that the step would take beyond it are left out of it.
+            # Joints at a limit that the step would exceed are excluded from the step.
             for _ in range(2):
                 normal = J.transpose(0, 2, 1) @ J
                 largest = np.maximum(np.abs(normal).max(axis=(1, 2)), 1e-12)

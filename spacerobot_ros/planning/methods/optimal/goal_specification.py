@@ -97,7 +97,7 @@ class GoalSpecification:
 
     @property
     def controls(self) -> frozenset[Controlled]:
-        """The parts by name."""
+        """The controlled components by name."""
         parts: set[Controlled] = {"shape"}
         if self.position:
             parts.add("position")
@@ -107,7 +107,7 @@ class GoalSpecification:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3) in the base along which the attitude must be reached."""
+        """Directions (m, 3), base components, along which the attitude must be reached."""
         return self.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     def require_suitable(self, robot: SpaceRobot) -> None:
@@ -249,9 +249,9 @@ class GoalSpecification:
     def _turn_on_way_to_shape(
         self, robot: SpaceRobot, turn: Array, start: Array, shape: Array, tolerance: float
     ) -> Array:
-        """Return the turn (4,) on any path to a shape (n,), for robots whose loops turn nothing.
+        """Return the turn (4,) on any path to a shape (n,), for robots whose loops rotate nothing.
 
-        UnreachableError if it is not the turn of the goal.
+        UnreachableError if it is not the goal rotation.
         """
         axis, way = self.base_rotations.axes[0], shape - start
         nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
@@ -314,9 +314,9 @@ class BaseRotations:
 def _require_within_one_joint(
     robot: SpaceRobot, limits: MotionLimits, q: Array, axis: Array, turn: Array, tolerance: float
 ) -> None:
-    """Refuse a turn that the only joint, at ``q`` (1,), cannot cause within its limits.
+    """Reject a rotation that the only joint, at ``q`` (1,), cannot cause within its limits.
 
-    The base turns about ``axis`` (3,), to and fro with the joint; the angle is an integral.
+    The base rotates about ``axis`` (3,), back and forth with the joint; the angle is an integral.
     """
     ends = np.array([limits.lower[0], limits.upper[0]])
     if not np.all(np.isfinite(ends)):
@@ -331,7 +331,7 @@ def _require_within_one_joint(
     least, most = min(angles), max(angles)
     wanted = 2 * np.arctan2(axis @ turn[:3], turn[3])
     whole = 2 * np.pi
-    # The same attitude may also be reached the other way round.
+    # The same attitude may also be reached by rotating the other way.
     turns = np.arange(np.floor(least / whole) - 1, np.ceil(most / whole) + 2)
     nearest = wanted + whole * turns
     beyond = np.maximum(least - nearest, nearest - most)
@@ -425,7 +425,7 @@ def _distance_to_center(robot: SpaceRobot, q: Array, wanted: Array) -> float:
 def _unreachable_center_error(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> UnreachableError | NotFoundError:
-    """Return the reason why no shape puts the base at ``wanted``; ``near`` (n,) came nearest."""
+    """Return the reason why no shape puts the base at ``wanted``; ``near`` (n,) came closest."""
     name, distance = robot.description.name, _distance_to_center(robot, near, wanted)
     gap = CenterReach.of(robot, limits.lower, limits.upper).distance_outside(wanted)
     if gap <= _POSITION_TOLERANCE:

@@ -104,7 +104,7 @@ class ManoeuvreModel:
     robot, prediction, control_period
         The model, the base motion prediction, and the command duration, s.
     axes
-        (m, 3) directions in the base along which the attitude is reached.
+        (m, 3) directions in base components along which the attitude is reached.
     constraints, efforts, distances
         Path constraints; efforts and distances are unlimited if None.
     end_effectors
@@ -180,15 +180,15 @@ class ManoeuvreModel:
         return None
 
     def slowed(self, guess: Trajectory, boundary: BoundaryConditions) -> Trajectory:
-        """Return a trajectory, slowed until it keeps the efforts and the rate of the base."""
+        """Return a trajectory, slowed until it satisfies the effort and base rate limits."""
         guess = self.constraints.slowed(guess)
         return guess if self.efforts is None else self.efforts.slowed(guess, boundary)
 
     def _slowing_factor(
         self, held: HeldCommands, boundary: BoundaryConditions, before: Array | float
     ) -> float:
-        """Return the factor by which commands must be slower to keep the joints' efforts and the
-        rate of the base.
+        """Return the factor by which commands must be slowed down to satisfy the limits on joint
+        efforts and base rate.
         """
         rate = self.constraints.excess_rate(held.quaternions, self.control_period)
         if self.efforts is None:
@@ -207,8 +207,8 @@ class ManoeuvreModel:
         *,
         moves_end: bool,
     ) -> HeldCommands | None:
-        """Return commands near to shapes (N + 1, n) that end in the goal attitude and keep all
-        limits, where there are some: every shape may change.
+        """Return commands close to shapes (N + 1, n) that end at the goal attitude and satisfy all
+        limits, if there are any; every shape may change.
         """
         positions = self._move_to_final(positions, boundary, final, limits)
         for _ in range(_MAX_PROGRAMS_IN_TURN):
@@ -241,7 +241,7 @@ class ManoeuvreModel:
         return held if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
 
     def _attitudes(self, positions: Array, boundary: BoundaryConditions) -> Array:
-        """Return the attitudes (N + 1, 4) at the ticks, from the starting one."""
+        """Return the attitudes (N + 1, 4) at the ticks, from the initial one."""
         start = np.array([0.0, 0.0, 0.0, 1.0])
         return self.prediction.attitudes(positions, start, boundary.angular_momentum)
 
@@ -250,7 +250,7 @@ class ManoeuvreModel:
     ) -> Array:
         """Return shapes (N + 1, n) that end in the shape ``final`` exactly."""
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
-        # The solver's last shape is the wanted one to its own precision.
+        # The solver reaches the final shape only to its own precision.
         positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
         positions = np.clip(positions, limits.lower, limits.upper)
         positions[0], positions[-1] = boundary.start, final
@@ -278,7 +278,7 @@ class ManoeuvreModel:
         *,
         moves_end: bool,
     ) -> HeldCommands | None:
-        """Add waves to shapes (N + 1, n) so that they end in the goal attitude; None on failure.
+        """Add waves to shapes (N + 1, n) so that they end at the goal attitude; None on failure.
 
         ``moves_end``: the last shape is changed, too.
         """
@@ -286,7 +286,7 @@ class ManoeuvreModel:
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:
-            # The others make up for joints at the end of their range.
+            # The others compensate for joints at the end of their range.
             speed = limits.speeds(positions[0]) * self._fading(positions[-1:], limits)[0]
             ramps = (s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self.robot.n) * speed
             waves = np.hstack([waves, ramps])
@@ -330,9 +330,9 @@ class ManoeuvreModel:
     def _end_error(
         self, positions: Array, quaternions: Array, boundary: BoundaryConditions
     ) -> tuple[Array, Array | None, Array | None]:
-        """Return the error (m,) that is left at the end, along the axes and of end-effectors.
+        """Return the remaining error (m,) at the end, along the axes and of end-effectors.
 
-        With it, derivatives of the rows of end-effectors by turn (m', 3) and last shape (m', n).
+        Also return derivatives of end-effector rows by rotation (m', 3) and last shape (m', n).
         """
         error = self.axes @ attitude_error(quaternions[-1], boundary.goal_rotation)
         if self.end_effectors is None:
@@ -350,7 +350,7 @@ class ManoeuvreModel:
         by_turn: Array | None,
         by_shape: Array | None,
     ) -> Array:
-        """Return derivatives (m, N + 1, n) of the numbers at the end by the shapes."""
+        """Return derivatives (m, N + 1, n) of the end values with respect to the shapes."""
         turns = self._turns_by_shapes(positions, quaternions, boundary)
         rows = np.tensordot(self.axes, turns, axes=1)
         if by_turn is None or by_shape is None:
@@ -362,7 +362,7 @@ class ManoeuvreModel:
     def _turns_by_shapes(
         self, positions: Array, quaternions: Array, boundary: BoundaryConditions
     ) -> Array:
-        """Return the turns (3, N + 1, n) of the final attitude by all shapes, base components."""
+        """Return derivatives (3, N + 1, n) of the final attitude by all shapes, base components."""
         moved = np.gradient(positions, axis=0)
         curvature = self.robot.function("curvature", compile=False)
         K = curvature(positions.T).full().reshape(6, len(positions), self.robot.n, -1)[3:]
@@ -373,7 +373,7 @@ class ManoeuvreModel:
         if L_B is not None:
             turned = self._drift.carried(positions, L_B, R, turned, self.control_period)
         by_shapes = R[-1].T @ turned
-        # The last step of a change that does not vanish at the end turns the base directly.
+        # The last step of a change that does not vanish at the end rotates the base directly.
         by_shapes[-1] -= self.robot.connection(positions[-1])[3:]
         return np.asarray(by_shapes.transpose(1, 0, 2))
 
@@ -414,8 +414,8 @@ class DriftVariation:
         G, M = (each.reshape(len(shapes), -1, 3).transpose(0, 2, 1) for each in columns)
         added = turned + duration * (R @ G)
         half = duration / 2 * (R @ M @ R.transpose(0, 2, 1))
-        # The implicit midpoint rule of xi' = M xi + b, from the end: what follows a step acts on
-        # all that was added until then.
+        # The implicit midpoint rule of xi' = M xi + b, from the end: the steps after one act on
+        # everything added before.
         after, xi = np.eye(3), np.empty_like(added)
         for k in reversed(range(len(added))):
             after = after @ np.linalg.inv(np.eye(3) - half[k])
@@ -424,7 +424,7 @@ class DriftVariation:
         return xi
 
 
-# -- the least change of commands -----------------------------------------------------------------
+# -- the least change in commands -----------------------------------------------------------------
 
 _LIMIT_RESERVE = 1e-4
 """Fraction of the velocity and acceleration limits reserved for the last, small correction."""
@@ -465,7 +465,7 @@ def _least_change(
     count = N - 1 + moves_end
     if count < 1:
         return None
-    # Unknowns are shares of a tick at full speed.
+    # Unknowns are fractions of a tick at full speed.
     scale = limits.speeds(positions[0]) * period
     scaled = (rows[:, moving] * scale).reshape(len(rows), -1)
     weight = 1.0 / np.maximum(np.linalg.norm(scaled, axis=1), 1e-12)

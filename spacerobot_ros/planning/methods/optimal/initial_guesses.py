@@ -34,8 +34,8 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 
 _CANDIDATES_PER_GUESS, _CANDIDATES_PER_CLEAR_GUESS = 24, 240
-"""Number of random loops, of which the one closest to the goal becomes the guess; for clear ones,
-of which there are one in ten for two arms, more."""
+"""Number of random loops, of which the one closest to the goal becomes the guess; more for clear
+guesses, which are one in ten for two arms."""
 
 _MIN_LOOP_SIZE = 0.1
 """Smallest loop size on the path to a possible end shape, in half ranges of the joints, for all
@@ -85,8 +85,7 @@ class InitialGuesses:
     ) -> Iterator[Trajectory]:
         """Yield guesses that end in the likely shape, or in each possible end shape in turn.
 
-        ``is_clear``: whether a guess keeps clear; then all do, unless none of their candidates
-        does.
+        ``is_clear``: whether a guess stays clear; if given, all do, unless no candidate does.
         """
         rng = np.random.default_rng(1)
         half = limits.joint_ranges(boundary.start)[1]
@@ -102,7 +101,7 @@ class InitialGuesses:
         for number in itertools.count():
             around, place = divmod(number, len(ends))
             final, turn = ends[place].shape, ends[place].base_rotation
-            # The direct way to an end may be all that it takes, and is no guess twice.
+            # The direct path to an end may suffice; it is used as a guess only once.
             size = max(sizes[place], _MIN_LOOP_SIZE if boundary.possible_ends and around else 0.0)
             rounds = [
                 size * rng.uniform(0.3, 1.5) * _loop(rng, self._instants, len(half))
@@ -127,7 +126,7 @@ class InitialGuesses:
 
         The base rotates about a fixed axis, in either direction, and slows down from its current
         rate to rest. The other joints move to their final shape; in later guesses, with loops on
-        the way. The wheel rates follow from the momentum.
+        the path. The wheel rates follow from the momentum.
         """
         direct = self._direct_path(boundary.start, boundary.likely_final_shape)
         loops = self.generate(boundary, limits)
@@ -144,13 +143,13 @@ class InitialGuesses:
         robot: SpaceRobot,
         shapes: Array,
     ) -> list[tuple[float, Trajectory]]:
-        """Return guesses along shapes (N + 1, n) in which wheels turn the base, with their largest
-        shares of limits, at least one: the least share, then the shortest first.
+        """Return guesses along shapes (N + 1, n) in which wheels rotate the base, with their
+        largest fraction of a limit, at least one: smallest fraction, then shortest first.
 
-        Were the wheels to change their rates steadily, the base would be stopped, but at another
-        attitude. So it turns from where that leads forwards to where it leads backwards from the
-        goal, one way or the other, and wheels have the rates that this asks for. Durations are
-        tried one after the other: in a longer one, a base that turns only turns farther.
+        If wheel rates changed linearly, the base would stop, but at another attitude. So attitudes
+        are blended from that motion forwards from the start to that motion backwards from the goal,
+        in either direction, and the wheel rates follow. Durations are tried one after the other: in
+        a longer one, a rotating base only rotates farther.
         """
         s = self._instants[:, np.newaxis]
         index, other = wheels.index, wheels.other
@@ -193,8 +192,8 @@ class InitialGuesses:
         step: float,
         turns: int,
     ) -> Array:
-        """Return attitudes (N + 1, 4) between those to which a motion leads forwards from the
-        start, and backwards from the goal.
+        """Return attitudes (N + 1, 4) blended between those of a motion integrated forwards from
+        the start, and backwards from the goal.
         """
         forwards = np.tile([0.0, 0.0, 0.0, 1.0], (len(shapes), 1))
         backwards = forwards.copy()
@@ -209,7 +208,7 @@ class InitialGuesses:
         between = rotvecs_from_quaternions(
             quaternion_multiply(quaternion_inverse(forwards), backwards)
         )
-        # Without jumps by a whole turn.
+        # Without jumps by a full revolution.
         for k in range(1, len(between)):
             angle = float(np.linalg.norm(between[k]))
             if angle > 0:
@@ -237,7 +236,7 @@ class InitialGuesses:
         return np.clip(shapes, limits.lower, limits.upper)
 
     def _loop_size(self, q: Array, half: Array, angle: float) -> float:
-        """Return the size, in half ranges, of a loop that turns the base by ``angle``."""
+        """Return the size, in half ranges, of a loop that rotates the base by ``angle``."""
         n = len(q)
         K = np.abs(self._curvature(q).full()[3:]).sum(axis=0).reshape(n, n)
         largest = float((K * np.outer(half, half)).max())
@@ -270,7 +269,7 @@ class InitialGuesses:
     def _integrate_drift(
         self, q: Array, u: Array, u_next: Array, durations: Array, L_0: Array
     ) -> Array:
-        """Return the attitudes (..., N + 1, 4), each from the one before, at an angular momentum.
+        """Return the attitudes (..., N + 1, 4), each from the previous one, at an angular momentum.
 
         ``q``, ``u`` and ``u_next`` (..., N, n) are those of the steps.
         """
@@ -280,7 +279,7 @@ class InitialGuesses:
         X = np.tile([0.0, 0.0, 0.0, 1.0], (len(h), N + 1, 1))
         Omega = np.zeros((len(h), 3))
         for k in range(N):
-            # Half-way, about: where the turn before leads in half a step.
+            # Approximate midpoint: half of the previous rotation ahead.
             ahead = quaternion_multiply(X[:, k], quaternions_from_rotvecs(Omega / 2))
             impulse = h * (L_0 @ matrices_from_quaternions(ahead))
             arguments = (*(each[:, k] for each in parts), impulse)
@@ -327,8 +326,8 @@ class InitialGuesses:
 
 
 def attitudes_along(turn: ca.Function, q: Array, u: Array, u_next: Array) -> Array:
-    """Return the attitudes (..., N + 1, 4) along N steps (..., N, n) from rest, each from the one
-    before; ``turn`` is the function that computes one step (:func:`.turn_function`).
+    """Return the attitudes (..., N + 1, 4) along N steps (..., N, n) from rest, each from the
+    previous one; ``turn`` is the function that computes one step (:func:`.turn_function`).
     """
     Omega = turn(*(x.reshape(-1, x.shape[-1]).T for x in (q, u, u_next))).full().T
     rotations = quaternions_from_rotvecs(Omega).reshape(*q.shape[:-1], 4)
@@ -353,7 +352,7 @@ def rates_between(quaternions: Array, step: float) -> Array:
 
 
 def _interpolate(instants: Array, known: Array, values: Array) -> Array:
-    """Return values (N, n) at the instants (N,), linear between those (M, n) at ``known`` (M,)."""
+    """Return values (N, n) at the instants (N,), interpolated from (M, n) at ``known`` (M,)."""
     return np.column_stack([np.interp(instants, known, column) for column in values.T])
 
 

@@ -40,7 +40,7 @@ _MIN_INSTANTS = 80
 grid, a solver step took twice as long, and paths were no sooner clear in between."""
 
 _SHARE_OF_ENDS = 0.1
-"""Fraction of a path, at an end with a given shape, where pairs need not have room."""
+"""Fraction of a path, at an end with a given shape, where pairs need no room."""
 
 
 def instants_of(intervals: int) -> int:
@@ -111,7 +111,7 @@ class DistanceLibrary:
         geometry = self.clearance.geometry
         distances, planes = geometry.planes(pair, poses)
         if geometry.with_obstacles[pair]:
-            # From W to the centre of mass with the attitude of the base at the start.
+            # From W to the centre-of-mass frame with the initial base attitude.
             state = boundary.state
             assert state is not None
             R_W0 = matrix_from_quaternion(state.quaternion)
@@ -142,7 +142,7 @@ class KeptDistances:
 
     @property
     def pairs(self) -> tuple[int, ...]:
-        """Their numbers."""
+        """Pair numbers."""
         return tuple(sorted(self._room))
 
     def approaches(self, positions: Array, turns: Array, margin: float = 0.0) -> list[Approach]:
@@ -194,7 +194,7 @@ class KeptDistances:
 
     def is_clear(self, path: Trajectory) -> bool:
         """Whether no pair comes too close along a path."""
-        # Most paths that are not clear are not at their knots, which costs a fiftieth to find.
+        # Most paths in collision are so at their knots, which costs a fiftieth to check.
         clearance = self._library.clearance
         return clearance.is_clear(path.shapes, self._required) and not self.approaches_of(path)
 

@@ -120,7 +120,7 @@ _LIMIT_ROUNDING = 1e-8
 class _GoalKind:
     """Goals with the same parts: these parts, and the searches for their manoeuvres.
 
-    Most manoeuvres of most robots keep the limits of efforts without a search ``within_efforts``.
+    Most manoeuvres of most robots satisfy the effort limits without ``within_efforts``.
     """
 
     specification: GoalSpecification | EndEffectorSpecification
@@ -136,7 +136,7 @@ class _GoalKind:
 
 
 class _Plan(NamedTuple):
-    """Shapes (N + 1, n) at the ticks, notes on the search, and the velocities (n,) kept after."""
+    """Shapes (N + 1, n) at the ticks, notes on the search, and the final velocities (n,)."""
 
     positions: Array
     notes: Notes
@@ -192,8 +192,7 @@ class OptimalGait(GaitMethod):
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
-        """Return the kind of a goal, made when it is needed; GoalError if the robot has no such
-        link."""
+        """Return the kind of a goal, created on demand; GoalError if the robot has no such link."""
         if not goal.end_effectors:
             return self._base_goals
         key = EndEffectorSpecification.key(goal)
@@ -223,7 +222,7 @@ class OptimalGait(GaitMethod):
         q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
         goal = request.goal.for_robot(self.robot.description)
         if goal.joint_positions is not None and len(goal.joint_positions) == self.robot.n:
-            # The angle of a wheel is no part of the shape.
+            # The angle of a wheel is not part of the shape.
             shape = goal.joint_positions.copy()
             shape[self._wheels.index] = q[self._wheels.index]
             goal = replace(goal, joint_positions=shape)
@@ -237,7 +236,7 @@ class OptimalGait(GaitMethod):
         )
         turns_on = len(self._wheels) > 0 and bool(state.angular_momentum.any())
         if turns_on and goal.end_effectors and "attitude" not in goal.base:
-            # The rates of the wheels at the end depend on the attitude: a free one is the present.
+            # The final wheel rates depend on the attitude: if it is free, the current one is kept.
             base: frozenset[Controlled] = goal.base | {"attitude"}
             goal = replace(goal, quaternion=state.quaternion, base=base)
         request = replace(request, state=state, goal=goal)
@@ -247,7 +246,7 @@ class OptimalGait(GaitMethod):
         return self._build_schedule(request, of(request, cancellation, clock))
 
     def _wheel_rates(self, qdot: Array | None) -> Array:
-        """Return velocities (n,) of the joints with those of wheels alone; none where they rest."""
+        """Return joint velocities (n,) that are zero except for spinning wheels."""
         rates, index = np.zeros(self.robot.n), self._wheels.index
         if qdot is not None and not np.all(np.isfinite(qdot[index])):
             raise PlanningError("The wheel velocities at the start are not finite.")
@@ -266,9 +265,9 @@ class OptimalGait(GaitMethod):
     ) -> BoundaryConditions:
         """Return boundary conditions with the rates of reaction wheels at both ends.
 
-        The angle of a wheel is free at the end; its rate there is such that the wheels hold all of
-        the momentum, and the base rests. UnreachableError if they cannot hold it; PlanningError if
-        the goal leaves the attitude open, on which the rates depend, or wheels are too fast.
+        The angle of a wheel is free at the end; its rate there is such that the wheels hold all
+        momentum, and the base is at rest. UnreachableError if they cannot hold it; PlanningError if
+        the goal does not fix the attitude, on which the rates depend, or wheels are too fast.
         """
         wheels, n, state = self._wheels, self.robot.n, request.state
         if not len(wheels):
@@ -310,9 +309,9 @@ class OptimalGait(GaitMethod):
     def _plan_while_coasting(
         self, request: PlanRequest, cancellation: Cancellation, clock: SearchClock
     ) -> _Plan:
-        """Plan for a robot whose centre of mass coasts, in the frame of that.
+        """Plan for a robot whose centre of mass coasts, in a frame that moves with it.
 
-        PlanningError if there are obstacles, or no manoeuvre ends when the goal is where it leads.
+        PlanningError if there are obstacles, or no manoeuvre ends where the goal is at that time.
         """
         state, goal = request.state, request.goal
         velocity = state.linear_momentum / self.robot.total_mass
@@ -370,13 +369,13 @@ class OptimalGait(GaitMethod):
         clock: SearchClock,
         duration: float | None = None,
     ) -> _Plan:
-        """Plan where the centre of mass rests; in a ``duration``, s, or that of the options."""
+        """Plan with the centre of mass at rest, in ``duration``, s, or that of the options."""
         state, goal, correction = request.state, request.goal, request.correction
         q, motion, shape = state.q, request.motion, self.goal_shape(goal)
         margin = np.zeros(self.robot.n) if correction else self._margin
         same_shape = self._specification.same_shape and not goal.end_effectors
         if motion is not None and shape is None and same_shape:
-            # The present shape is a shape on the path.
+            # The current shape is on the path.
             shape = motion.remaining[-1]
         boundary = self._with_wheels(self._boundary(request, shape), request)
         # A manoeuvre ends within the margin if its goal does.
@@ -472,7 +471,7 @@ class OptimalGait(GaitMethod):
             raise NotFoundError(f"{refusal} It is proved that {bound}.") from None
 
     def _boundary(self, request: PlanRequest, shape: Array | None) -> BoundaryConditions:
-        """Return the ends of a request whose goal shape (n,) is another one; None: any."""
+        """Return the boundary conditions of a request with this goal shape (n,); None: any."""
         specification, state = self._kind_of(request.goal).specification, request.state
         ends = specification.boundary_conditions(self.robot, request, shape, self._limits)
         R_BW, direction_W = (
@@ -502,10 +501,10 @@ class OptimalGait(GaitMethod):
         return ConnectionBounds.of(self.robot, self._specification.base_rotations.axes)
 
     def _require_enough_time(self, task: SearchProblem, *, final_is_given: bool) -> DurationBound:
-        """Return a bound of the duration of all manoeuvres from rest to the goal.
+        """Return a bound on the duration of all manoeuvres from rest to the goal.
 
         ``final_is_given``: the goal has the last shape of the boundary conditions. PlanningError if
-        the bound is longer than the time that the options give.
+        the bound is longer than the options allow.
         """
         robot, boundary, bounds = self.robot, task.boundary, self._connection_bounds
         # The slots of three sliders determine the shape.
@@ -530,7 +529,7 @@ class OptimalGait(GaitMethod):
         return bound
 
     def _begin_in_asked_time(self, task: SearchProblem) -> Manoeuvre:
-        """Return a manoeuvre from rest that takes no longer than the options ask for.
+        """Return a manoeuvre from rest that takes no longer than the options allow.
 
         NotFoundError if none was found; if a longer one was, the message has its duration.
         """
@@ -555,10 +554,10 @@ class OptimalGait(GaitMethod):
         )
 
     def _begin_now(self, task: SearchProblem) -> Manoeuvre:
-        """Return a manoeuvre that begins at once.
+        """Return a manoeuvre that begins immediately.
 
-        Without effort limits if that keeps them, and otherwise with them. Limits that are the
-        robot's own, and that no manoeuvre is found to keep, are not kept.
+        Effort limits are imposed only if they would be violated otherwise. If no manoeuvre within
+        them is found, they are ignored, unless the options require them.
         """
         kind = self._kind_of(task.request.goal)
         found = kind.search.search(task)
@@ -573,9 +572,9 @@ class OptimalGait(GaitMethod):
     def _begin_now_or_coast(self, task: SearchProblem) -> Manoeuvre:
         """Return a manoeuvre of a robot that drifts: joints may rest until the goal is in reach.
 
-        The drift may lead away from the goal faster than the joints turn the base back; later, it
-        leads past it. At first a manoeuvre is looked for that ends before the base has turned far,
-        then such a one that ends when the base passes the goal, and at last any.
+        The base may drift away from the goal faster than the joints rotate it back; later, it
+        passes the goal. The search is first for a manoeuvre that ends before the base has rotated
+        far, then for one that ends when the base passes the goal, and finally for any.
         """
         state, longest = task.request.state, task.options.longest
         momenta, rest = (state.linear_momentum, state.angular_momentum), np.zeros(self.robot.n)
@@ -607,7 +606,7 @@ class OptimalGait(GaitMethod):
         """Return the ticks at which the coasting base passes the goal, the closest pass first."""
         grid = np.arange(0, len(coast.position), step)
         turns = np.array([self._later(task, coast, int(k)).boundary.goal_rotation for k in grid])
-        # The cosine of half the angle that is left.
+        # The cosine of half the remaining angle.
         near = np.abs(turns[:, 3])
         passes = 1 + np.flatnonzero((near[1:-1] > near[:-2]) & (near[1:-1] >= near[2:]))
         closest = passes[np.argsort(-near[passes], kind="stable")]
@@ -617,7 +616,7 @@ class OptimalGait(GaitMethod):
         """Return a manoeuvre that ends about when the coasting base passes the goal, at tick
         ``end``.
 
-        It begins as long before as a manoeuvre at zero momentum takes from there.
+        It begins earlier by the duration of a manoeuvre from there at zero momentum.
         PlanningError if none was found, UnusableCandidateError if coasting violates a path
         constraint.
         """
@@ -646,8 +645,8 @@ class OptimalGait(GaitMethod):
         try:
             found = self._begin_now(replace(task, options=budget))
         except NotFoundError as refusal:
-            # The present manoeuvre goes on where the same goal is planned for again; a base that
-            # drifts would have to pass its goal later.
+            # The current manoeuvre continues if its goal is only replanned; a drifting base would
+            # have to pass its goal later.
             rests = not (task.boundary.drifts or len(self._wheels))
             if again or chosen.duration > 0 or not rests or not motion.velocity.any():
                 raise
@@ -657,16 +656,16 @@ class OptimalGait(GaitMethod):
     def _plan_with_braking(
         self, task: SearchProblem, motion: InitialMotion, refusal: NotFoundError
     ) -> _Plan:
-        """Plan from the shape in which joints that brake as fast as they may come to rest.
+        """Plan from the shape in which joints come to rest after braking as fast as allowed.
 
         Raises
         ------
         NotFoundError
-            None was found; the ``refusal`` where the braking itself is not possible.
+            None was found; the ``refusal`` if braking itself is impossible.
         """
         state, limits, period = task.request.state, task.limits, self.control_period
         ticks = math.ceil(float((np.abs(motion.velocity) / limits.acceleration).max()) / period)
-        # The last tick is one of rest, from which the next command keeps its limits.
+        # The joints rest in the last tick, so that the next command is within its limits.
         shares = 1 - np.arange(1, ticks + 1) / ticks
         travel = np.append(0.0, period * np.cumsum(shares))
         braking = state.q + travel[:, np.newaxis] * motion.velocity
@@ -689,7 +688,7 @@ class OptimalGait(GaitMethod):
 
     @property
     def _efforts_are_strict(self) -> bool:
-        """Whether limits of efforts are asked for: others are kept where a manoeuvre is found."""
+        """Whether effort limits are strict; otherwise, they are kept if a manoeuvre allows it."""
         return self.options.effort_limits != 0 or bool(self.options.max_effort)
 
     def _is_within_efforts(self, task: SearchProblem, found: Manoeuvre) -> bool:
@@ -722,7 +721,7 @@ class OptimalGait(GaitMethod):
         L_B: Array | None = None
         if state.angular_momentum.any():
             L_B = np.asarray(state.angular_momentum @ matrices_from_quaternions(attitudes))
-        # Held commands end on the goal by the plant's integration; where it is off, so are they.
+        # Held commands end at the goal in the plant's integration, and share its error.
         true_end = self._prediction.true_end(positions, attitudes, state.angular_momentum)
         (true_position,) = self._prediction.positions(
             state, path.time[-1:], positions[-1:], true_end[np.newaxis]

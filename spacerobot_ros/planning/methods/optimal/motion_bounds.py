@@ -1,8 +1,8 @@
 """Bounds on base positions and on manoeuvre durations, proved before a search.
 
-:class:`CenterReach` bounds the centre of mass in the base, which proves that goals beyond the bound
+:class:`CenterReach` bounds the centre of mass relative to the base, proving that goals beyond it
 are out of reach. Without thrust, the centre of mass is at rest in the world, so a base pose
-determines its position in the base. Sliders with directions fixed in the base move the centre of
+determines its base-frame position. Sliders with directions fixed in the base move the centre of
 mass exactly along straight slots. Everything that rotates stays within a ball around the first
 joint that rotates it (triangle inequality over the links beyond that joint). The sum of the slots
 and the balls is a convex set that contains the centre of mass for all shapes; for robots with only
@@ -65,7 +65,7 @@ class CenterReach:
     lower, upper
         (s,) ends of the slider ranges, m.
     radius
-        Of the ball, m.
+        Radius of the ball, m.
     """
 
     origin: Array
@@ -131,7 +131,7 @@ class _FrameBounds:
     """Bounds on the frame of a body for all shapes.
 
     It is within ``radius`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
-    direction (3,). ``R`` (3, 3) is its attitude in the base, None if that depends on the shape.
+    direction (3,). ``R`` (3, 3) is its attitude in B, None if that depends on the shape.
     """
 
     r: Array
@@ -163,7 +163,7 @@ class ConnectionBounds:
     turn
         (n,) largest base rotation caused by each joint, rad per rad or m; infinite: unknown.
     center
-        (n,) largest centre-of-mass displacement in the base, m per rad or m.
+        (n,) largest centre-of-mass displacement relative to the base, m per rad or m.
     inertia
         Smallest moment of inertia of the robot with its joints locked, kg m^2; for planar robots,
         about their axis.
@@ -226,16 +226,16 @@ class LinkBounds:
 
 
 def _coupled(robot: SpaceRobot, values: Array) -> Array:
-    """Return bounds (n,) by the joints of those by all moving joints (m,)."""
+    """Return bounds (n,) per coordinate from bounds (m,) per moving joint."""
     G = np.abs(robot.description.coupling[0])
     with np.errstate(invalid="ignore"):
-        # A bound that is not known is no part of joints that do not move the body.
+        # An unknown bound does not affect joints that do not move the body.
         return np.asarray(np.where(G > 0, G * values[:, np.newaxis], 0.0).sum(axis=0))
 
 
 @dataclass(frozen=True)
 class _Tree:
-    """The bodies of a robot, with bounds of the distances between them.
+    """The bodies of a robot, with bounds on the distances between them.
 
     ``hinges`` (b, 3) are the origins of bodies in their parents at the middle of the joint's range,
     m; ``travels`` half of the range of the slider that carries each body, m (0: none does);
@@ -300,7 +300,7 @@ class _Tree:
             moment = float(np.linalg.eigvalsh(inertia)[-1])
             largest += moment + m[k] * reach[k] ** 2
             energy += (axis @ inertia @ axis if k == joint else moment) + m[k] * lever**2
-        # |X a| <= sqrt(|X| a . X a) for the inertia X of all that is behind the joint.
+        # |X a| <= sqrt(|X| a . X a) for the inertia X of everything outboard of the joint.
         momentum = energy if planar else math.sqrt(largest * energy)
         if len(levers) == 1:
             d, rest = body.inertia.com, 1 - behind / total
@@ -357,7 +357,7 @@ class _Tree:
 
 
 def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: str) -> float:
-    """Return an upper bound, m, of the distance of a link's origin from the centre of mass, with
+    """Return an upper bound, m, on the distance of a link's origin from the centre of mass, with
     the joints within ``lower`` and ``upper`` (n,).
     """
     body, pose = robot.description.frames[link]
@@ -451,7 +451,7 @@ class DurationBound:
             moves = f"the centre of mass moves by {way:.4g} m in the base"
             demands.append(Demand(connection.center, way, f"{moves} {_WITHIN} of the joints"))
         ends = np.maximum(np.abs(boundary.velocity), np.abs(boundary.final_velocity))
-        # As many held velocities make no more way than a motion of one period more.
+        # Held velocities cover no more distance than a motion that is one period longer.
         times = _shortest_times(demands, limits, ends) - period
         bounds = list(zip(times.tolist(), (each.reason for each in demands), strict=True))
         if base_rate_limit > 0:
@@ -468,7 +468,7 @@ class DurationBound:
 
 
 def _least_turn(rotation: Array, axes: Array) -> float:
-    """Return the least angle, rad, by which a base turns to ``rotation`` (4,) along ``axes``."""
+    """Return the least angle, rad, by which a base rotates to ``rotation`` (4,) along ``axes``."""
     if not len(axes):
         return 0.0
     along = float(axes[0] @ rotation[:3]) if len(axes) == 1 else np.linalg.norm(rotation[:3])

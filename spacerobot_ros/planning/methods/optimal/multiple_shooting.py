@@ -36,7 +36,7 @@ TOLERANCE = 1e-5
 
 _IPOPT_OPTIONS = {
     "print_time": False,
-    # All derivatives are given: the solver is not to derive more.
+    # All derivatives are given: the solver must not derive more.
     "no_nlp_grad": True,
     "calc_lam_p": False,
     "ipopt.print_level": 0,
@@ -45,7 +45,7 @@ _IPOPT_OPTIONS = {
     # Approximate minimum degree: the matrices are banded, and the choice of MUMPS fills them in.
     "ipopt.mumps_pivot_order": 0,
     # A matching of large entries to the diagonal first undoes that order: legged robots took up to
-    # thirty times as long a step.
+    # thirty times as long per step.
     "ipopt.mumps_permuting_scaling": 0,
     "ipopt.mu_strategy": "monotone",
     "ipopt.constr_viol_tol": 1e-6,
@@ -72,7 +72,7 @@ _LARGEST_REACH, _LARGEST_REACH_SHARE = 0.3, 0.15
 """Largest reach of a neighbourhood, rad or m, and as a fraction of a joint's range."""
 
 _COST_OF_LACK = 300.0
-"""Cost per metre of missing distance, in durations or efforts of the guess."""
+"""Cost per metre of missing clearance, in durations or efforts of the guess."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class DurationBounds:
 
     @property
     def fixed(self) -> bool:
-        """Whether it is given."""
+        """Whether the duration is given."""
         return self.shortest == self.longest
 
 
@@ -246,7 +246,7 @@ class MultipleShooting:
         self.converged = bool(stats["success"])
         x = result["x"].full().ravel()
         if not self.converged:
-            # Where the goal drifts away, no time makes up for what each interval violates.
+            # If the goal drifts away, no duration compensates for the violations in each interval.
             infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
             if self._monitor.best is None or infeasible:
                 return None

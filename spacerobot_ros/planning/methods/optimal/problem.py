@@ -206,7 +206,7 @@ class BoundaryConditions:
     final
         (n,) last shape; None: any. NaN for reaction wheels: any position.
     center
-        (3,) system's centre of mass in the base at the end, m; None: anywhere.
+        (3,) system's centre of mass in base components at the end, m; None: anywhere.
     direction
         (3,) ``keep_direction`` of the path constraints, in the initial base frame.
     velocity
@@ -248,12 +248,12 @@ class BoundaryConditions:
         return self.drifts or bool(np.any(self.velocity) or np.any(self.final_velocity))
 
     def momenta_in_base(self, quaternions: Array) -> Array | None:
-        """Return the angular momentum (..., 3) in the base at rotations (..., 4) since the start;
-        None: it is zero.
+        """Return the angular momentum (..., 3), base components, at rotations (..., 4) since the
+        start; None: it is zero.
         """
         if not self.drifts:
             return None
-        # With R_0B' on the left.
+        # R_0B' multiplied from the left.
         return np.asarray(self.angular_momentum @ matrices_from_quaternions(quaternions))
 
 
@@ -318,7 +318,7 @@ class MotionLimits:
 
         The given shapes (n,) are always admitted.
         """
-        # Where two margins overlap the joint keeps to the middle of its range.
+        # Where two margins overlap, the joint stays in the middle of its range.
         with np.errstate(invalid="ignore"):
             room = np.where(
                 np.isfinite(self.upper - self.lower), (self.upper - self.lower) / 2, np.inf
@@ -339,8 +339,8 @@ class MotionLimits:
         return middle, np.minimum((upper - lower) / 2, _UNLIMITED_HALF_RANGE)
 
     def speeds(self, q: Array) -> Array:
-        """Return a finite speed (n,) of every joint: half of its range round ``q`` (n,) in a
-        second if its velocity is not limited."""
+        """Return a finite speed (n,) of every joint: half of its range around ``q`` (n,) per second
+        if its velocity is unlimited."""
         return np.where(np.isfinite(self.velocity), self.velocity, self.joint_ranges(q)[1])
 
     def excess(
@@ -419,9 +419,9 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class _SmoothBody:
-    """A smooth body of shapes round a box, through its corners.
+    """A smooth body of shapes around a box, through its corners.
 
-    ``box_center`` and ``box_half_sizes`` are the box's, of the ``joints`` that it bounds.
+    ``box_center`` and ``box_half_sizes`` are those of the box, for the ``joints`` that it bounds.
     """
 
     joints: list[int]
@@ -438,7 +438,7 @@ class _SmoothBody:
         ]
         if not bounded:
             raise ParameterError("A box in optimal.keep_out contains all shapes of the robot.")
-        # No joint gets beyond its limits, so a distant side may move to a finite distance.
+        # No joint exceeds its limits, so a distant side may move to a finite distance.
         width = robot.upper - robot.lower
         lower = np.maximum(lower, robot.lower - width)[bounded]
         upper = np.minimum(upper, robot.upper + width)[bounded]
@@ -577,7 +577,7 @@ def _unit_direction(name: str, values: Sequence[float]) -> Array | None:
 
 
 def _largest_base_rate(quaternions: Array, period: float) -> float:
-    """Return the largest mean rate (rad/s) between attitudes (N + 1, 4) that are so far apart."""
+    """Return the largest mean rate (rad/s) between attitudes (N + 1, 4) a ``period`` apart."""
     # |a - b| is twice the sine of a quarter of the angle.
     apart = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
     angles = 4 * np.arcsin(np.minimum(apart / 2, 1.0))

@@ -79,8 +79,8 @@ _GENTLE_TICKS, _GENTLE_TIME = 20, 1.0
 faster one would leave a larger error."""
 
 _GENTLE_DURATION_FACTOR = 4.0
-"""A gentle manoeuvre is the path of least effort in this multiple of the duration of its guess,
-then made as fast as the limits allow."""
+"""A gentle manoeuvre is the path of least effort in this multiple of its guess's duration, then
+made as fast as the limits allow."""
 
 _BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
 """As ``optimal.time_budget`` is documented."""
@@ -97,7 +97,7 @@ _SAME_COST_TOLERANCE, _AGREEING_COST_TOLERANCE = 1e-3, 3e-3
 agree: the coarse grid and the solver's tolerance cause such differences."""
 
 _MAX_FULL_GRID_STARTS = 3
-"""Number of other paths that are made clear only on the full grid, which costs the most."""
+"""Number of other paths that are made clear only on the full grid, which is the most expensive."""
 
 _MAX_ITERATIONS_OF_STOPS = 120
 """Solver steps from a guess in which wheels stop the base: most take twenty. With 300, one of nine
@@ -138,19 +138,19 @@ quadruped's plan took 1.75 instead of 1.00 s."""
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
 ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
-12 and 36 s of an idle core (0.5 us a nonzero). With 1.25e5, two arms took 40 s for the same
+12 and 36 s of an idle core (0.5 us per nonzero). With 1.25e5, two arms took 40 s for the same
 plan."""
 
 _MAX_STALLED_ROUNDS, _STALLED_SHARE = 3, 0.9
-"""Number of paths in succession, on the way to a clear path, that still lack more than this share
-of the smallest lack before them: a path for two arms lacked 55 mm in twelve rounds."""
+"""Number of successive paths, on the way to a clear path, that still lack more than this
+fraction of the smallest previous lack: a path for two arms lacked 55 mm in twelve rounds."""
 
 _MIN_SHORTENING_ROUNDS = 6
 """Number of paths that are always tried on the way to a fast path: with 3, a plan for two arms took
 10 instead of 8 s after a long search for its clear path."""
 
 _NO_LACK = 1e-3
-"""Missing distance below which all planes are kept, m."""
+"""Missing clearance below which all planes are kept, m."""
 
 _MIN_GAIN = 0.01
 """Relative time gain below which a clear path is no longer made faster, at the full reach."""
@@ -236,7 +236,7 @@ class SearchClock:
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """What is searched for.
+    """Problem of a search.
 
     Attributes
     ----------
@@ -277,10 +277,10 @@ class SearchProblem:
 
     @property
     def gentle(self) -> bool:
-        """Whether the manoeuvre takes the path of least effort, whose base rotation is least
+        """Whether the manoeuvre follows the path of least effort, whose base rotation is least
         sensitive to mass errors.
         """
-        # While a gentle manoeuvre takes its time, the base of a robot that drifts turns on.
+        # During a gentle manoeuvre, the base of a drifting robot keeps rotating.
         return self.request.correction and not self.is_timed
 
     @property
@@ -397,7 +397,7 @@ class ManoeuvreSearch:
 
 
 def _initial_velocity(motion: InitialMotion, limits: MotionLimits, period: float) -> Array:
-    """Return the velocities (n,) at the start: between those that are held before and after."""
+    """Return the initial velocities (n,): the mean of those held before and after."""
     between = motion.velocity
     if len(motion.remaining) > 1:
         after = (motion.remaining[1] - motion.remaining[0]) / period
@@ -413,7 +413,7 @@ class _Search:
     starts
         Number of guesses that were tried.
     rejection
-        Reason against the last candidate.
+        Reason why the last candidate was rejected.
     """
 
     def __init__(
@@ -428,22 +428,22 @@ class _Search:
             len(self._wheels) > 0 and problem.boundary.is_timed and problem.motion is None
         )
         if self._wheels_stop_base:
-            # Guesses with wheels are near to solutions.
+            # Guesses with wheels are close to solutions.
             iterations = min(problem.options.iterations, _MAX_ITERATIONS_OF_STOPS)
             options = replace(problem.options, answers=1, iterations=iterations)
             problem = replace(problem, options=options)
         self._problem = problem
         self._full = self._coarse = _Grid(problem.options.intervals)
         coarse = _Grid(problem.options.intervals // _COARSE_GRID_RATIO, _COARSE_TOLERANCE)
-        # On a coarse grid the attitude of a base that wheels stop is too far off.
+        # On a coarse grid, the attitude of a base stopped by wheels is too inaccurate.
         if coarse.intervals >= _MIN_COARSE_INTERVALS and not self._wheels_stop_base:
             self._coarse = coarse
-            # A single answer in motion is for the rest of a manoeuvre, which is short.
+            # In motion, a single answer is requested for the rest of a manoeuvre, which is short.
             if problem.motion is not None and problem.options.answers == 1:
                 self._full = coarse
         self.starts, self.rejection = 0, ""
         self._phase, self._reported = SearchPhase.SEARCHING, 0.0
-        # Of the clear paths once there are some in collision.
+        # Of the clear paths, once paths in collision have been found.
         self._best, self._is_clearing = math.inf, False
         self._work = 0.0
         self._coarse_solutions: list[Trajectory | None] = []
@@ -453,7 +453,7 @@ class _Search:
     def _guesses(
         self, grid: _Grid, is_clear: Callable[[Trajectory], bool] | None = None
     ) -> Iterator[Trajectory]:
-        """Yield guesses on a grid without end, in the same order for equal problems; those that
+        """Yield guesses on a grid endlessly, in the same order for equal problems; those that
         are clear, if ``is_clear`` is given."""
         problem, source = self._problem, self._source(grid)
         boundary, limits, motion = problem.boundary, problem.limits, problem.motion
@@ -502,7 +502,7 @@ class _Search:
                 found = self._refine_best(solutions, grid)
                 if found is not None or cut_short:
                     return found
-                # These are none; the next ones count one by one.
+                # These solutions failed; the next ones are tried one by one.
                 solutions, enough = [], 1
         return self._refine_best(solutions, grid)
 
@@ -557,7 +557,7 @@ class _Search:
     def _make_held_commands(
         self, trajectory: Trajectory, kept: KeptDistances | None = None
     ) -> Manoeuvre:
-        """Return a solution as held commands, near to it if pairs are kept apart;
+        """Return a solution as held commands, close to it if pairs are kept apart;
         UnusableCandidateError if none reach the goal within the constraints.
         """
         problem, model = self._problem, self._model
@@ -578,11 +578,11 @@ class _Search:
     def _hold_in_whole_ticks(
         self, trajectory: Trajectory, kept: KeptDistances | None
     ) -> HeldCommands | None:
-        """Return a solution whose duration matters as held commands; None where that fails.
+        """Return a solution whose duration matters as held commands; None if that fails.
 
-        Were it stretched to whole control periods, the base would turn on meanwhile, or the joints
-        begin at other rates. So the trajectory of least effort in as many control periods, or a few
-        more, is solved for.
+        If it were stretched to whole control periods, the base would rotate farther, or the joints
+        would start at other rates. So a least-effort trajectory is computed for this number of
+        periods, or a few more.
         """
         problem, limits, near = self._problem, self._problem.limits, None
         if self._wheels_stop_base:
@@ -594,7 +594,7 @@ class _Search:
         grid = _Grid(len(trajectory.shapes) - 1)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
         guess, aim = trajectory, problem.boundary
-        # In a given time there is no other than the first.
+        # If the duration is given, only the first one is possible.
         longer = [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES]
         for more in [*_ADDITIONAL_TICKS, *longer][: 2 if problem.options.duration > 0 else None]:
             T = (ticks + more) * self._period
@@ -613,8 +613,8 @@ class _Search:
     # -- 5. clear ---------------------------------------------------------------------------------
 
     def keep_clear(self, kept: KeptDistances, found: Manoeuvre) -> Manoeuvre | None:
-        """Return a manoeuvre that keeps clear: the one that was found, if it does; else one near to
-        it, or near to other paths; None: none is found.
+        """Return a manoeuvre that keeps clear: the one that was found, if it does; else one close
+        to it, or close to other paths; None: none is found.
         """
         if not kept.approaches(found.held.positions, found.held.quaternions):
             return found
@@ -630,13 +630,13 @@ class _Search:
     def _other_paths(
         self, kept: KeptDistances, known: Trajectory
     ) -> Iterator[tuple[Trajectory, float]]:
-        """Yield other paths with the share of the largest reach in which clear ones are looked for,
-        by turns: solutions that need not keep clear, from guesses on a coarse grid, and guesses
+        """Yield other paths, with the fraction of the largest reach to search for clear paths,
+        alternately: solutions that need not keep clear, from guesses on a coarse grid, and guesses
         that keep clear, but do not end at the goal.
         """
         problem = self._problem
         if problem.boundary.drifts and problem.motion is None:
-            # A robot that drifts finds others sooner after it has coasted.
+            # A drifting robot finds others sooner after coasting.
             return
         brakes = problem.motion is not None and not problem.boundary.drifts
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
@@ -665,12 +665,12 @@ class _Search:
 
     @property
     def _clears_coarsely(self) -> bool:
-        # A motion that is timed is too far off on a coarse grid: joints run on in long intervals.
+        # A timed motion is too inaccurate on a coarse grid: joints overrun in long intervals.
         problem = self._problem
         return problem.hastens and self._coarse != self._full and not problem.is_timed
 
     def _clear_near(self, kept: KeptDistances, path: Trajectory, reach: float) -> Manoeuvre:
-        """Return a clear manoeuvre near to a path; UnusableCandidateError if none was found."""
+        """Return a clear manoeuvre close to a path; UnusableCandidateError if none was found."""
         options, grid, made = self._problem.options, self._full, None
         duration = _CLEARING_TIME_FACTOR * path.duration
         if options.duration > 0:
@@ -679,7 +679,7 @@ class _Search:
         if self._clears_coarsely:
             path, _ = self._clear(kept, self._coarse, path, duration, reach)
             path, _ = self._shorten(kept.beside(path, _NEAR), self._coarse, path, None)
-            # A path that is clear on the coarse grid mostly is on the full one, as fast.
+            # A path that is clear on the coarse grid is mostly clear on the full one, and as fast.
             kept, path = kept.beside(path, _NEAR), path.stretched(_RESAMPLED_TIME_FACTOR)
             path, made = self._shorten(kept, grid, path, None, 1 / _REACH_DIVISOR)
             duration, reach = _RECLEARED_TIME_FACTOR * path.duration, 1.0
@@ -701,8 +701,8 @@ class _Search:
         duration: float,
         reach: float,
     ) -> tuple[Trajectory, Manoeuvre | None]:
-        """Return a clear path near to one, in a given duration (s), and its held commands; by
-        steps of a share of the largest reach. UnusableCandidateError if none was found.
+        """Return a clear path close to another, in a given duration (s), and its held commands, in
+        steps of a fraction of the largest reach. UnusableCandidateError if none was found.
         """
         self._begin(SearchPhase.CLEARING)
         around = Neighbourhood.within(self._problem.limits, reach, _LARGEST_LACK)
@@ -732,7 +732,7 @@ class _Search:
         made: Manoeuvre | None,
         reach: float = 1.0,
     ) -> tuple[Trajectory, Manoeuvre | None]:
-        """Return a faster path near to a clear one, and its held commands; else that one itself.
+        """Return a faster path close to a clear one, and its held commands; else the clear one.
 
         The first step is a share, ``reach``, of the largest reach. On the full grid, a path without
         held commands may be replaced by a faster one that is not clear.
@@ -770,8 +770,8 @@ class _Search:
     def _approaches(
         self, kept: KeptDistances, grid: _Grid, path: Trajectory
     ) -> tuple[list[Approach], Manoeuvre | None]:
-        """Return the pairs that come too near along a path, or else, on the full grid, along its
-        held commands, and those.
+        """Return the pairs that come too close along a path, or else, on the full grid, along its
+        held commands, and these commands.
         """
         near = kept.approaches_of(path)
         if near or grid != self._full:
@@ -787,7 +787,7 @@ class _Search:
         duration: float | None,
         near: Neighbourhood,
     ) -> Trajectory:
-        """Return a solution near to a guess that keeps pairs of links apart, in a duration, s
+        """Return a solution close to a guess that keeps pairs of links apart, in a duration, s
         (None: the fastest one); UnusableCandidateError if none was found.
         """
         problem, boundary = self._problem, self._problem.boundary
@@ -796,14 +796,14 @@ class _Search:
         if len(guess.shapes) != grid.intervals + 1:
             guess = self._source(grid).resample(guess)
         if problem.motion is not None and duration is not None:
-            # A path that takes longer begins as fast all the same.
+            # A longer path begins at the same velocities.
             lacking = boundary.velocity - guess.velocities[0]
             guess = self._source(grid).with_initial_velocity(guess, lacking, problem.limits)
         longest = problem.options.longest if duration is None else None
         shortest = duration or self._shortest_duration
         return self._solve(grid, guess, shortest, longest, kept=kept, near=near, found=True)
 
-    # -- what the steps share ---------------------------------------------------------------------
+    # -- shared by the steps ----------------------------------------------------------------------
 
     def _solve(
         self,
@@ -822,7 +822,7 @@ class _Search:
         """Return the fastest solution near a guess, at most ``longest``, s; None: that of least
         effort in the ``shortest`` time.
 
-        ``aim`` and ``limits`` are others than the problem's, ``kept`` pairs are apart, ``found``:
+        ``aim`` and ``limits`` replace those of the problem, ``kept`` pairs stay apart, ``found``:
         whether there is a manoeuvre. UnusableCandidateError if none was found.
         """
         problem, pairs = self._problem, () if kept is None else kept.pairs
@@ -848,13 +848,13 @@ class _Search:
 
     @property
     def _shortest_duration(self) -> float:
-        """Duration that a manoeuvre has at least, s."""
+        """Shortest duration of a manoeuvre, s."""
         gentle = min(_GENTLE_TICKS * self._period, _GENTLE_TIME) if self._problem.gentle else 0.0
         return max(_MIN_TICKS * self._period, gentle)
 
     @property
     def _given_duration(self) -> float:
-        """The duration that is asked for in whole ticks, s."""
+        """The requested duration in whole ticks, s."""
         return max(round(self._problem.options.duration / self._period), 1) * self._period
 
     def _is_over(self, *, found: bool) -> bool:
@@ -873,7 +873,7 @@ class _Search:
             iterations = min(iterations, _MAX_CLEARING_ITERATIONS)
 
         def is_over(feasible: bool) -> bool:
-            # A path on the way to a clear one is no manoeuvre.
+            # An intermediate path to a clear one is not a manoeuvre.
             is_manoeuvre = self._phase is not SearchPhase.CLEARING and (found or feasible)
             return problem.clock.is_over(found=is_manoeuvre)
 

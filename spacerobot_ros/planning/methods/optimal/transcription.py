@@ -187,9 +187,9 @@ class Stages:
         robot
             The model.
         axes
-            (m, 3) directions in the base along which the attitude must be reached.
+            (m, 3) directions in base components along which the attitude must be reached.
         position
-            Whether the centre of mass must end at ``center`` in the base.
+            Whether the centre of mass must end at ``center``, base components.
         constraints
             Constraints of the path.
         inequality
@@ -381,10 +381,10 @@ class AttitudeRows:
 def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> ConstraintBlock:
     """Return the distances at equally spaced instants of an interval, by the chain rule.
 
-    The last instant is the end of the interval. The turn of the base there is about the weighted
-    mean of those at the knots; rows take it at any norm. Each instant has planes of its own.
+    The last instant is the end of the interval. The base rotation there is approximately the
+    weighted mean of those at the knots; rows accept any norm. Each instant has its own planes.
     """
-    # In MX, whose functions call those of the pairs: made anew for every choice of pairs.
+    # In MX, which calls the functions of the pairs: built anew for every choice of pairs.
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
     X, X_next, lack = ca.MX.sym("X", 4), ca.MX.sym("X+", 4), ca.MX.sym("lack")
     z = ca.vertcat(h, X, s, v, X_next, v_next, lack)
@@ -408,7 +408,7 @@ def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> Co
             curvature += H
         J, slope = ca.vertcat(*slopes), slope[:, :n]
         bend = ca.horzcat(ca.MX(1, 5 + n), b * slope, ca.MX(1, 4), c * slope)
-        # How [point; turn] moves with z: by a column, and by multiples of units.
+        # The derivatives of [point; turn] by z: a column, and multiples of unit matrices.
         weights = (b * h, c * h)
         by_lack = ca.MX.ones(len(pairs), 1)
         jacobian.append(ca.horzcat(_point_derivative_columns(J, along, weights, tau, n), by_lack))
@@ -425,8 +425,8 @@ def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> Co
 
 
 def _curved_where_it_counts(rows: PlaneDistance) -> ca.Function:
-    """Return ``(y, plane, lambda) -> lambda J, H``: of multipliers next to nothing, zeros without
-    an evaluation. They are those of most rows, and Hessians took half of the time of clear paths.
+    """Return ``(y, plane, lambda) -> lambda J, H``: for negligible multipliers, zeros without
+    evaluation. Most rows have such multipliers, and Hessians took half of the time for clear paths.
     """
     arguments = [ca.MX.sym(f"a{i}", rows.hessian.size1_in(i)) for i in range(3)]
     y, plane, multiplier = arguments
@@ -441,7 +441,7 @@ def _curved_where_it_counts(rows: PlaneDistance) -> ca.Function:
 def _point_derivative_columns(
     A: ca.MX, along: ca.MX, weights: tuple[ca.MX, ca.MX], tau: float, n: int
 ) -> ca.MX:
-    """Return ``A P``, where P is the derivative of a point of an interval and of the turn there
+    """Return ``A P``, where P is the derivative of a point of an interval and of the rotation there
     with respect to ``[h; X; s; v; X+; v+]``.
     """
     q, X, by_step = A[:, :n], A[:, n:], A[:, :n] @ along
@@ -463,7 +463,7 @@ def _path_constraint_rows(
     )
     rows = [ca.SX(0, 1), constraints.symbolic(s - h * v / 2, X, direction)]
     if constraints.base_rate_limit > 0:
-        # Rates change steadily within an interval and are largest at its ends.
+        # Rates change linearly within an interval and are largest at its ends.
         fastest = h * constraints.imposed_base_rate
         first, second = rates
         for end in (0.0, 1.0):
@@ -484,7 +484,7 @@ def state_within_interval(tau: float, s: ca.SX, u: ca.SX, u_next: ca.SX) -> ca.S
 
 
 def momentum_in_base(tau: float, X: ca.SX, X_next: ca.SX, L_0: ca.SX) -> ca.SX:
-    """Return the angular momentum (3,) in the base at the fraction tau between two attitudes."""
+    """Return the angular momentum (3,), base components, at fraction tau between two attitudes."""
     mean = (1 - tau) * X + tau * X_next
     v, w = mean[:3], mean[3]
     # R(mean)' L_0 for a quaternion of any norm.
@@ -541,7 +541,7 @@ def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
     """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, in base components.
 
     If the robot drifts, the fourth argument is the angular impulse (3,) of the step: the angular
-    momentum in the base at about half of the step, times the step duration.
+    momentum in base components at about half of the step, times the step duration.
     """
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
     impulse = ca.SX.sym("impulse", 3 if drifting else 0)

@@ -70,7 +70,7 @@ class _Surroundings:
     def __init__(self, clearance: Clearance, target: TorqueFreeMotion | None = None) -> None:
         self.clearance, self.target, self.geometry = clearance, target, clearance.geometry
         self.of_hand = np.zeros(len(self.geometry.pairs), dtype=bool)
-        """Whether each pair (P,) is the body that grasps and the target."""
+        """Whether each pair (P,) consists of the grasping body and the target."""
         self.required = np.zeros(0)
         """Distances (P,), m."""
 
@@ -126,7 +126,7 @@ class _Corridor:
     distance of it; its axis is the direction of the standoff.
 
     It is one pair, whose distance is that of the end-effector origin from the surface of the cone
-    or, if that is more, from the sphere in which the cone counts; negative: it is beside the cone.
+    or, if that is more, from the sphere in which the cone counts; negative: it is outside the cone.
     """
 
     def __init__(self, robot: SpaceRobot, link: str, grapple: Grapple, start: Samples) -> None:
@@ -178,7 +178,7 @@ class _Corridor:
         the sphere, planes that touch the sphere."""
         p, apex, axis, inside, outside = self._places(path)
         within = inside >= outside
-        # From the instant before: between the two, the edge of the sphere is crossed in the cone.
+        # Also at the instant before: between the two, the sphere is entered within the cone.
         within |= np.append(within[1:], True)
         normal = p / np.maximum(np.linalg.norm(p, axis=1, keepdims=True), 1e-9)
         chosen = within[:, np.newaxis]
@@ -263,7 +263,7 @@ class Bodies:
         for each in self._solid:
             each.required = each.clearance.required(start.q, each.base(begin))
             if each.target is not None:
-                # The body that grasps comes as near as the grasp has it.
+                # The grasping body comes as close as the grasp requires.
                 hand, solids = robot.description.frames[link][0], each.geometry.solids
                 each.of_hand[:] = [solids[i].body == hand for i, _ in each.geometry.pairs]
                 at = base_for_hand(robot, link, start.q, each.target.grapple_in_target)

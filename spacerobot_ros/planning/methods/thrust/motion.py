@@ -140,9 +140,9 @@ class ThrustMotion:
     Parameters
     ----------
     functions
-        Those of its robot.
+        Functions of its robot.
     propulsion
-        What pushes its base.
+        Propulsion of its base.
     knots
         A solution, whose first knot is the start.
     """
@@ -174,10 +174,10 @@ class ThrustMotion:
         return np.asarray(self._functions.interval(begin, controls, t).full().T)
 
     def defects(self) -> Array:
-        """Return the defects (N, 12) with which the knots would be exact states of a flight."""
+        """Return the defects (N, 12) with which the knots would be exact flight states."""
         states = self._knots.states
         ends = np.array([self._through(k, x)[-1] for k, x in enumerate(states[:-1])])
-        # Knots obey the program with their own defects: what they miss is the rest.
+        # Knots satisfy the program with their own defects: this is the remaining difference.
         turn = quaternion_multiply(quaternion_inverse(states[1:, :4]), ends[:, :4])
         rest = np.hstack([rotvecs_from_quaternions(turn), ends[:, 4:13] - states[1:, 4:13]])
         return rest if self._knots.defects is None else self._knots.defects + rest

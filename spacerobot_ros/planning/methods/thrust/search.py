@@ -93,8 +93,8 @@ the joints from their initial shape on the way to a grasp, m or rad: the base mo
 stays clear of it."""
 
 _LARGEST_LACK, _SHALLOW = 1e-4, 0.1
-"""Missing distance between pairs up to which a solution counts as clear before the exact check, and
-contact depth on a path to a target up to which planes along this path are tried first, m."""
+"""Missing clearance between pairs up to which a solution counts as clear before the exact check,
+and contact depth on a path to a target up to which planes along this path are tried first, m."""
 
 _MAX_ROUNDS, _LARGEST_STRETCH = 6, 4.0
 """Number of times that new planes are computed to clear a path or that a motion with excessive
@@ -286,7 +286,7 @@ class ThrustPlanner:
         force = self.propulsion.largest_force()
         reach = reach_of_end_effector(robot, options.lower, options.upper, self.link)
         near = max(distance - reach - target.arm_length, 0.0)
-        # From rest to the velocity of a body that is that near.
+        # From rest to the velocity of a body at this distance.
         a = force / robot.total_mass
         least = max(leaving + 2 * math.sqrt(leaving**2 / 2 + a * near), abs(leaving)) / a
         if least > grapple.horizon:
@@ -305,7 +305,7 @@ class ThrustPlanner:
         q, reach = np.where(given, shape, start.q), np.where(given, 0.0, np.inf)
         if hand is not None:
             q = np.where(given, q, self._shape_at(goal.base, hand, q))
-            # Near to this family of shapes: others may lie beyond a contact of the arm.
+            # Close to this family of shapes: others may lie beyond a contact of the arm.
             reach[~given & ~self._wheels] = _END_REACH
         for i in np.flatnonzero((q < limits.lower) | (q > limits.upper))[:1]:
             raise UnreachableError(
@@ -324,7 +324,7 @@ class ThrustPlanner:
         return boundary, q
 
     def _shape_at(self, base: Array, hand: Array, q: Array) -> Array:
-        """Return the shape (n,) near to one in which the end-effector is at a pose."""
+        """Return the shape (n,) close to another in which the end-effector is at a pose."""
         poses = [Pose(matrix_from_quaternion(each[3:]), each[:3]) for each in (base, hand)]
         arm = FixedBaseArm(self.robot, self.link, poses[0])
         found, distance = arm.nearest_shape(q, poses[1])
@@ -353,7 +353,7 @@ class ThrustPlanner:
         R = matrices_from_quaternions(X)
         c = robot.function("center_of_mass")(q.T).full().T
         r = r_WB + np.einsum("kij,kj->ki", R, c)
-        # In one second; the time follows.
+        # For a duration of one second; the actual duration follows.
         h = 1.0 / N
         V, v = np.gradient(r, h, axis=0), np.gradient(q, h, axis=0)
         omega = rates_between(X, h)
@@ -434,7 +434,7 @@ class _Search:
 
     def first_meeting(self) -> ThrustKnots:
         """Return the guess that meets a target at the earliest time possible for the robot."""
-        # There is one: distances grow with time, and what full thrust covers with its square.
+        # One exists: target distances grow with time, the distance at full thrust with its square.
         for time in itertools.count(_MEETING_PERIOD, _MEETING_PERIOD):
             base, shape, _ = self._meeting(time)
             guess = self.planner.guess(self.boundary, base, shape, np.zeros(3))
@@ -478,7 +478,7 @@ class _Search:
             share = motion.effort_share(self.planner.effort_limit)
             if share <= 1.0:
                 return motion
-            # Efforts of a motion at rest are about as the square of its speed.
+            # Efforts of a motion from rest scale approximately with its squared speed.
             self.earliest = motion.duration * min(1.01 * math.sqrt(share), _LARGEST_STRETCH)
             time = self.earliest if self.grapple is None else max(self.earliest, time)
             self.is_timed = True
@@ -495,7 +495,7 @@ class _Search:
         return motion
 
     def _motion(self, fastest: ThrustKnots, time: float) -> ThrustMotion:
-        """Return the exact and clear motion near the fastest one, in a time if that is given; to a
+        """Return the exact and clear motion near the fastest one, in a time if one is given; for a
         target, by that time.
         """
         bodies, failure, self.latest = self.bodies, None, time
@@ -504,7 +504,7 @@ class _Search:
         first = time if self.grapple is None else self.earliest
         path = fastest.stretched(first / fastest.duration)
         if self.is_timed:
-            # Roughly, for a look at what is in the way.
+            # A rough solution, to find obstacles in the way.
             path = self._solve(path, self._weights(path, _ROUNDINGS[0]), begins="rough") or path
         near = bodies.approaches(self.planner.motion(path))
         guesses = self._bows(path) if self.grapple is None else self._meetings(path.duration)
@@ -569,7 +569,7 @@ class _Search:
         return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, _REGULARISATION, rounding)
 
     def _exact(self, guess: ThrustKnots) -> ThrustMotion:
-        """Return the motion of least propellant, or of least time, near a path, as it flies."""
+        """Return the exactly integrated motion of least propellant or time near a path."""
         planner, knots, planes = self.planner, guess, self.bodies.planes(guess)
         is_rounded = planner.propulsion.norms and self.is_timed and not len(planes)
         roundings = _ROUNDINGS[1:] if is_rounded else _ROUNDINGS[1:2]
@@ -590,7 +590,7 @@ class _Search:
                 break
             knots = replace(solved, defects=motion.defects())
             if self.is_timed and found < _NEAR_END:
-                # The nearest controls that fly exactly: solutions of least propellant are flat.
+                # The nearest controls with an exact flight: least-propellant optima are flat.
                 weights, center = _NEAREST, knots
         if best is None:
             raise self._failure("no motion to the goal was found")
@@ -602,21 +602,21 @@ class _Search:
         return best
 
     def _goals(self, duration: float) -> Array:
-        """Return the parameters of the end, for a target of a motion that takes about so long."""
+        """Return the end parameters; for a target, those of a motion of about this duration."""
         if self.grapple is None:
             return self.boundary.goals
         numbers = self.grapple.motion.numbers(duration)
         return np.concatenate([[self.planner.options.intervals], numbers, self.left])
 
     def _end_error(self, motion: ThrustMotion) -> float:
-        """Return the largest error at the end, m, rad, m/s: but for that of angular momenta."""
+        """Return the largest error at the end, m, rad, m/s, except that of angular momenta."""
         last = np.append(motion.step, with_joints_moved(motion.final_state, motion.step / 2))
         rows = self._solver.end.values(last, self._goals(motion.duration))
         of_poses = 9 if self.kind.target else rows.numel()
         return float(np.abs(rows.full()[:of_poses]).max(initial=0.0))
 
     def _cleared(self, at: ThrustKnots) -> ThrustKnots | None:
-        """Return a path near one that keeps pairs apart, and all others that come too near."""
+        """Return a path near one that keeps pairs apart, and all others that come too close."""
         bodies, lack = self.bodies, math.inf
         self._begin(SearchPhase.CLEARING)
         for _ in range(_MAX_ROUNDS):
@@ -636,7 +636,7 @@ class _Search:
             fell_in = [e.pair for e in near if e.distance < 0 and e.pair not in known]
             bodies.keep(near, solved)
             if not fell_in or min(bodies.distances(pair, at).min() for pair in fell_in) <= 0:
-                # Else planes of these pairs are made along the path before, which is clear of them.
+                # Else their planes are computed along the previous path, which is clear of them.
                 at = solved
         return None
 

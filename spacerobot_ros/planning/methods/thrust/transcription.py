@@ -4,8 +4,8 @@ A knot is ``x = [X; L; r; V; s; v]``: the attitude X, the vertices s and the vel
 joints' parabolas (:mod:`spacerobot_ros.planning.methods.optimal.transcription`), and the angular
 momentum L about the centre of mass, its position r and its velocity V, in W. The controls of an
 interval are the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W
-u`` is constant in the base. With ``R_i``, ``c_i`` the attitude and the centre of mass in the base
-at the Gauss points tau_i of an interval,
+u`` is constant in base components. With ``R_i``, ``c_i`` the attitude and the centre of mass in
+base components at the Gauss points tau_i of an interval,
 
 ``V+ = V + h/m sum R_i f / 2``, ``r+ = r + h V + h^2/m sum (1 - tau_i) R_i f / 2``,
 ``L+ = L + h sum R_i (n - c_i x f) / 2``, ``X+ = X exp(Omega)``,
@@ -77,7 +77,7 @@ K - 1.
 
 
 _COST_OF_LACK = 1e3
-"""Weight of missing distance between pairs, per metre."""
+"""Weight of missing clearance between pairs, per metre."""
 
 _PUSHES = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
 _CONTINUED = {
@@ -91,9 +91,9 @@ _NEAR_BOUNDS = {"ipopt.mu_init": 1e-2, "ipopt.bound_push": 1e-3, "ipopt.bound_fr
 
 _OPTIONS: Mapping[str, Mapping[str, object]] = {
     "": {"ipopt.tol": 1e-6},
-    # A shortest time that another time follows from, or a look at what is in the way.
+    # A shortest time that determines another time, or a search for obstacles in the way.
     "rough": {"ipopt.tol": 1e-4, "ipopt.constr_viol_tol": 1e-5},
-    # The guess is clear of its planes, or nearly so; planes made anew follow its solution.
+    # The guess is clear of its planes, or nearly so; new planes follow its solution.
     "clear": {**_NEAR_BOUNDS, "ipopt.tol": 1e-3, "ipopt.dual_inf_tol": 1e-1},
     # The guess is a solution with other weights, planes or pairs; then one with other defects.
     "continued": _CONTINUED,
@@ -452,7 +452,7 @@ class ThrustSolver:
         if guess.multipliers is not None:
             begins = begins if begins == "corrected" else "continued"
             of_variables, of_rows = guess.multipliers
-            # Of all rows, if they are the same ones, else of those without pairs.
+            # Multipliers of all rows if they are the same, else of those without pairs.
             same = rows if len(of_rows) == rows else rows - len(planes)
             begin["lam_x0"] = np.zeros(layout.size)
             begin["lam_x0"][: len(of_variables)] = of_variables[: layout.size]
