@@ -51,7 +51,7 @@ def warn_once(message: str) -> None:
 
 
 def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
-    """Replace a file completely or not at all.
+    """Replace a file atomically.
 
     Parameters
     ----------

@@ -334,7 +334,7 @@ class Flights:
     @property
     def command_size(self) -> int:
         """Size of a command: n joint velocities, or n efforts and a wrench (6) on the base: force
-        (N), then torque (N m), in base components."""
+        (N), then torque (N m), in the base frame."""
         return self.robot.n + (6 if PLANTS[self.actuation].wrench else 0)
 
     @property

@@ -222,7 +222,7 @@ class SteppedFlights:
         ----------
         commands
             (N, command_size) joint velocities, or efforts and a base wrench: force (N), then torque
-            (N m) at the base link origin, in base components. Commands are clipped to the limits.
+            (N m) at the base link origin, in the base frame. Commands are clipped to the limits.
         ticks
             Number of ticks.
 

@@ -55,6 +55,6 @@ class GoalFollower:
 
 
 def decision_event(status: Status) -> Event:
-    """Return the event for a status that decides a goal."""
+    """Return the event for the final status of a goal."""
     kind = EventKind(f"goal_{status.state.value}")
     return Event(kind, status.message, status.state.level, goal_id=status.goal_id)

@@ -87,7 +87,7 @@ def _grasp_wrench(robot: SpaceRobot, payload: Payload) -> ca.Function:
     """Return ``(q, z, zdot) -> wrench`` of a grasp on its body, by Newton and Euler.
 
     The wrench is force over torque (6,) at the end-effector, ``z`` are the velocities
-    ``[v_cm; omega; qdot]`` (6 + n,), all in base components. The robot's model includes the body.
+    ``[v_cm; omega; qdot]`` (6 + n,), all in the base frame. The robot's model includes the body.
     """
     N = 6 + robot.n
     q, z, zdot = ca.SX.sym("q", robot.n), ca.SX.sym("z", N), ca.SX.sym("zdot", N)
@@ -147,12 +147,12 @@ class Detumbling:
         """Largest grasp torque due to a command, N m."""
 
     def angular_momentum(self, state: ControlState) -> Array:
-        """Return the angular momentum (3,) about the centre of mass, N m s, in base components."""
+        """Return the angular momentum (3,) about the centre of mass, N m s, in the base frame."""
         H = self._robot.inertia_matrix(state.q)
         return np.asarray(H[3:6, 3:6] @ state.omega_WB_B + H[3:6, 6:] @ state.qdot)
 
     def velocity(self, state: ControlState) -> Array:
-        """Return the centre-of-mass velocity (3,), m/s, in base components."""
+        """Return the centre-of-mass velocity (3,), m/s, in the base frame."""
         J = self._robot.jacobian(self._robot.base_link, state.q)
         return np.asarray(state.v_WB_B - J[:3, 3:6] @ state.omega_WB_B - J[:3, 6:] @ state.qdot)
 

@@ -1,7 +1,7 @@
 """Outputs z1 of a law: selection and symbolic expressions (paper 4, eqs 22, 23, 26).
 
 The independent velocities are the paper's ``z0dot = [v_cm; omega; qdot]`` (eq. 8), the first two
-in base components. The outputs are pose components in W, and joint positions. The Jacobian here is
+in the base frame. The outputs are pose components in W, and joint positions. The Jacobian here is
 eq. (23) without its Euler-rate matrices: attitude is a quaternion, its error a rotation vector, and
 the velocity of an attitude output is a component of the angular velocity. So the representation has
 no singularity, and ``J_z`` loses rank only if the manipulator is singular.
@@ -198,7 +198,7 @@ class OutputVector:
     ``model``
         Calls robot model functions by name.
     ``q``, ``omega``, ``v_cm``, ``qdot``
-        The state, with velocities z0dot in base components.
+        The state, with velocities z0dot in the base frame.
     ``J_z``
         (m, N) ``z1dot = J_z z0dot``, eq. (23).
     ``bias``
@@ -333,7 +333,7 @@ class OutputVector:
     def _pose_group(
         self, J_B: ca.SX, position: ca.SX, quaternion: ca.SX, target: ca.SX
     ) -> _OutputGroup:
-        """Build the six outputs of a frame from its Jacobian in base components."""
+        """Build the six outputs of a frame from its Jacobian in the base frame."""
         R = self._R_WB
         p_des, quaternion_des, v_des, omega_des, a_des, alpha_des = ca.vertsplit(
             target, [0, 3, 7, 10, 13, 16, 19]

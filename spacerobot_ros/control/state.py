@@ -40,7 +40,7 @@ class ControlState:
 
     ``r_WB`` (3,) base link position in W, m; ``quaternion_WB`` (4,) base attitude
     (x, y, z, w), a unit quaternion; ``v_WB_B`` (3,) in m/s and ``omega_WB_B`` (3,) in rad/s, base
-    twist in base components; ``q``, ``qdot`` (n,) joint positions and velocities (m or rad, /s).
+    twist in the base frame; ``q``, ``qdot`` (n,) joint positions and velocities (m or rad, /s).
     """
 
     r_WB: Array
@@ -83,7 +83,7 @@ class ControlState:
 @dataclass(frozen=True)
 class PoseReference:
     """Desired pose of a frame in W: position (m), attitude (unit quaternion x, y, z, w), and their
-    velocities and accelerations (m, rad, s), all in world components; zero unless given.
+    velocities and accelerations (m, rad, s), all in the world frame; zero unless given.
     """
 
     position: Array

@@ -428,7 +428,7 @@ def momentum_budget(
     rates: Array,
 ) -> dict[str, Array]:
     """Return the contributions (3,) to the angular momentum about the centre of mass by name, N m
-    s, in base components.
+    s, in the base frame.
 
     ``base`` is due to the rotation of the gyrostat with the base while its joints are at rest;
     ``arm`` is due to the gyrostat's joints (q, qdot: (n - k,)) with the base at rest; ``wheels`` is

@@ -3,7 +3,7 @@
 Computes ``z0ddot`` of paper 4, eq. (19), with 44 to 84 % of the operations that barycentric vectors
 require, depending on the robot. Spatial vectors follow Featherstone, Rigid Body Dynamics Algorithms
 (2008), with the angular part first: motions ``[omega; v]`` and forces ``[n; f]``. All these vectors
-are in base components at one common point, the system's centre of mass, so that no body needs a
+are in the base frame at one common point, the system's centre of mass, so that no body needs a
 transform and the inertia of the whole system is ``diag(D, M 1)``.
 
 Because that inertia is block-diagonal, the base can be eliminated joint by joint. A unit rate of
@@ -31,7 +31,7 @@ the momenta are therefore constant to the last bit, for any step size:
 * ``K qddot = Q`` with the ``omega_WB_B`` that follows from the momenta.
 
 The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (N) and torque (N m)
-at the base link origin, in base components. The attitude is integrated in R^4 and normalised
+at the base link origin, in the base frame. The attitude is integrated in R^4 and normalised
 after each Runge-Kutta step.
 
 Under external loads (:mod:`spacerobot_ros.model.external_loads`), the state ends with the time (s),
@@ -108,7 +108,7 @@ class SymmetricFactor:
 
 @dataclass(frozen=True)
 class Composites:
-    """Composite rigid bodies outboard of each joint, in base components; see the module docstring
+    """Composite rigid bodies outboard of each joint, in the base frame; see the module docstring
     for the symbols.
 
     ``J[k]`` (3, 3) is the second moment of mass of body k about its own centre. ``S[j]`` (6,) is
@@ -274,7 +274,7 @@ def shape_forces(
 ) -> tuple[ca.SX, ca.SX]:
     """Return ``Q`` (n,) of ``K qddot = Q`` and the remaining moment (3,) on the base.
 
-    ``external`` (6,) is the external moment (N m) and force (N) on the base, in base components,
+    ``external`` (6,) is the external moment (N m) and force (N) on the base, in the base frame,
     about the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
     """
     f = motion_forces(system.parts, omega, qdot)

@@ -414,7 +414,7 @@ def weld_links(
 
 
 def plane_normal(description: RobotDescription) -> Array | None:
-    """Return the unit normal (3,) of a planar robot's plane of motion, in base components; None:
+    """Return the unit normal (3,) of a planar robot's plane of motion, in the base frame; None:
     spatial.
 
     A robot is planar if it has a revolute joint, the axes of all such joints are parallel, and the

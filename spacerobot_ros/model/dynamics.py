@@ -1,7 +1,7 @@
 """The papers' equations in closed form: dynamics (paper 4), connection (papers 1 and 2).
 
 Equations of motion ``H+ zddot + C+ = Q`` (paper 4, eqs 8-10 and 18-21). The independent velocities
-are ``z0dot = [v_cm; omega; qdot]``, of which the first two are in base components (eq. 8), so that
+are ``z0dot = [v_cm; omega; qdot]``, of which the first two are in the base frame (eq. 8), so that
 the equations do not depend on the robot pose. Inertias are composite-rigid-body inertias
 (:mod:`.composite_rigid_body`).
 
@@ -19,7 +19,7 @@ from spacerobot_ros.model.kinematics import TreeKinematics
 
 
 def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
-    """Return ``0J+`` (6, 6 + n) for the origin of a link frame, eq. (10), in base components.
+    """Return ``0J+`` (6, 6 + n) for the origin of a link frame, eq. (10), in the base frame.
 
     The matrix maps ``[v_cm; omega; qdot]`` to the linear velocity of the point and the angular
     velocity of its body. ``J_12`` is the shape derivative of ``rho = sum_i v_ik,m``, which for
@@ -106,7 +106,7 @@ def momentum_of_bodies(
     kin: TreeKinematics, v_WB_B: ca.SX, omega_WB_B: ca.SX, qdot: ca.SX
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Return the linear momentum (3,), the angular momentum about the system's centre of mass (3,)
-    and the kinetic energy, in base components, summed body by body.
+    and the kinetic energy, in the base frame, summed body by body.
 
     ``H+`` is not used: the result is an independent check of the motion.
     """
@@ -140,7 +140,7 @@ def base_twist(
     L_B: ca.SX,
 ) -> tuple[ca.SX, ca.SX]:
     """Return ``(v_WB_B, omega_WB_B)`` for linear momentum ``p_B`` (kg m/s) and angular
-    momentum ``L_B`` about the system's centre of mass (kg m^2/s), both in base components.
+    momentum ``L_B`` about the system's centre of mass (kg m^2/s), both in the base frame.
 
     If both are zero, the result is ``-A(q) qdot``.
     """

@@ -63,7 +63,7 @@ class LoadLayout:
 
 @dataclass(frozen=True)
 class ExternalLoads:
-    """Loads in a state, as expressions in base components.
+    """Loads in a state, as expressions in the base frame.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ def external_loads(
     kin
         The kinematics.
     second_moments
-        (3, 3) second moment of mass of every body about its own centre, in base components.
+        (3, 3) second moment of mass of every body about its own centre, in the base frame.
     quaternion
         (4,) of ``R_WB``.
     r_WC_W

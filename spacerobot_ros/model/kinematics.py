@@ -1,4 +1,4 @@
-"""Forward kinematics of the link tree in base components, symbolic and numeric (paper 4, section
+"""Forward kinematics of the link tree in the base frame, symbolic and numeric (paper 4, section
 II).
 
 The base frame B is the root link frame. All vectors here are expressed in B, so every
@@ -39,7 +39,7 @@ from spacerobot_ros.model.symbolic_rotations import quaternion_from_matrix as sy
 class TreeKinematics:
     """Body poses, centres of mass and inertias as functions of the shape q.
 
-    For body k, in base components: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
+    For body k, in the base frame: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
     origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
     unit axis of the joint that carries it (None for the base). ``theta`` (m,) are the positions
     of the joints that carry ``bodies[1:]``: equal to q unless there are mimic joints.

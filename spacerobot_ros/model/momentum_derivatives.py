@@ -50,7 +50,7 @@ def momentum_derivatives(
     parts
         The composites at the configuration.
     omega, qdot
-        Angular velocity (3,) of the base, in base components, and joint rates (n,).
+        Angular velocity (3,) of the base, in the base frame, and joint rates (n,).
     eta
         (3,) weights of the momentum components.
     """

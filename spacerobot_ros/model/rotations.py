@@ -159,7 +159,7 @@ def rotvecs_from_quaternions(quaternions: Array) -> Array:
 
 
 def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
-    """Return the rotation vector (3,), rad, in body components, from one attitude to another."""
+    """Return the rotation vector (3,) from one attitude to another, in the body frame, rad."""
     return rotvec_from_quaternion(quaternion_multiply(quaternion_inverse(quaternion), target))
 
 

@@ -1,6 +1,6 @@
 """Model of one robot: its compiled equations as methods.
 
-Frames: world W, base link B. Vectors with the suffix ``_B`` are in base components. The shape ``q``
+Frames: world W, base link B. Vectors with the suffix ``_B`` are in the base frame. The shape ``q``
 (n,) is in the order of ``joint_names``. The methods return new arrays; code that runs every control
 period uses a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
 """
@@ -134,7 +134,7 @@ class SpaceRobot:
         return R[:, 3 * index : 3 * index + 3], r.reshape((3, -1), order="F")[:, index]
 
     def inertia_matrix(self, q: npt.ArrayLike) -> Array:
-        """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, in base components (eq. 15)."""
+        """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, in the base frame (eq. 15)."""
         return self._call_function("inertia_matrix", q)[0]
 
     def bias(
@@ -156,7 +156,7 @@ class SpaceRobot:
         wrench_B: npt.ArrayLike,
         tau: npt.ArrayLike,
     ) -> Array:
-        """Return ``z0ddot`` (6 + n,): derivatives of ``[v_cm; omega; qdot]``, in base components
+        """Return ``z0ddot`` (6 + n,): derivatives of ``[v_cm; omega; qdot]``, in the base frame
         (eq. 19).
 
         ``wrench_B`` (6,) is force (N) and torque (N m) at the base origin, ``tau`` (n,) efforts.
@@ -180,7 +180,7 @@ class SpaceRobot:
         ``d/dt dx = A dx + B du`` to first order, with ``dx = [dr; dtheta; dq; dv; domega; dqdot]``:
         position (m) and rotation vector (rad) of the base relative to its motion in that state,
         joint positions, base twist, and joint velocities. ``du = [f; n; tau]`` is the change in
-        force, torque and efforts. All vectors are in base components.
+        force, torque and efforts. All vectors are in the base frame.
         """
         n = self.n
         given = zip((3, 3, n, 6, n), (v_WB_B, omega_WB_B, qdot, wrench_B, tau), strict=True)
@@ -223,7 +223,7 @@ class SpaceRobot:
         return self._call_function("joint_efforts", q, qdot, qddot)[0]
 
     def jacobian(self, link: str, q: npt.ArrayLike) -> Array:
-        """Return ``0J+`` (6, 6 + n) for a link frame origin (paper 4, eq. 10), in base components.
+        """Return ``0J+`` (6, 6 + n) for a link frame origin (paper 4, eq. 10), in the base frame.
 
         The matrix maps ``[v_cm; omega; qdot]`` to linear and angular velocity.
 
@@ -236,7 +236,7 @@ class SpaceRobot:
         return self._call_function(f"jacobian:{link}", q)[0]
 
     def generalised_jacobian(self, link: str, q: npt.ArrayLike) -> Array:
-        """Return ``J*`` (6, n) for a link frame origin at zero momentum, in base components.
+        """Return ``J*`` (6, n) for a link frame origin at zero momentum, in the base frame.
 
         The matrix maps ``qdot`` to linear and angular velocity in the world, while the base moves
         according to the momenta (Umetani and Yoshida's generalised Jacobian).

@@ -94,7 +94,7 @@ def quaternion_from_small_rotvec(rotvec: ca.SX) -> ca.SX:
 
 
 def rotation_error(quaternion: ca.SX, target: ca.SX) -> ca.SX:
-    """Return the rotation vector (3,), rad, in world components, from one attitude to another.
+    """Return the rotation vector (3,) from one attitude to another, in the world frame, rad.
 
     The result is the shortest such rotation vector: its length is at most pi for either sign of the
     quaternions. For a rotation by pi, either of the two shortest vectors is returned.

@@ -196,7 +196,7 @@ def _surface_of_revolution(radii: list[float], heights: Array) -> TriangleMesh:
 
 
 def sharp_edges(mesh: TriangleMesh) -> Edges:
-    """Return the edges of a mesh where its surface bends by more than 30 degrees or ends."""
+    """Return the edges of a mesh at its boundary, or whose faces meet at more than 30 degrees."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)

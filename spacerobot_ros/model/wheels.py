@@ -2,7 +2,7 @@
 
 A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>``
 specifies the largest rate and torque. Since a wheel is a body of revolution, its angle has no
-effect; only its spin matters. Let ``A`` (3, k) be the wheel axes in base components, ``J`` (k,) the
+effect; only its spin matters. Let ``A`` (3, k) be the wheel axes in the base frame, ``J`` (k,) the
 moments of inertia about them, and ``h = J (A' omega + qdot_w)`` (k,) the spins: the wheel momenta
 about their axes in inertial space. Then the base and the arm obey the equations of a robot without
 wheels (a gyrostat)
@@ -53,7 +53,7 @@ class ReactionWheels:
     other
         (n - k,) coordinates of the other joints in q.
     axes_B
-        (3, k) unit vectors of the wheel axes, in base components.
+        (3, k) unit vectors of the wheel axes, in the base frame.
     inertia
         (k,) moments of inertia about the axes, kg m^2.
     rate, torque
@@ -108,7 +108,7 @@ class ReactionWheels:
         Parameters
         ----------
         L_B
-            (3,) in base components, kg m^2/s.
+            (3,) in the base frame, kg m^2/s.
         near
             (k,) preferred rates of redundant wheels, rad/s; by default zero.
         largest

@@ -165,7 +165,7 @@ def first_shape(robot: SpaceRobot) -> Array:
 def first_problem(
     name: str, robot: SpaceRobot, file: Path, *, clear: bool = True
 ) -> PlanningProblem:
-    """Return the problem of a small base rotation about an axis that is accessible to the joints.
+    """Return the problem of a small base rotation about an axis that joint motion can produce.
 
     If ``clear`` is true, the plan avoids contacts between links, which requires the link meshes.
 

@@ -54,7 +54,7 @@ class ThrusterPlant(WrappedPlant):
 
     ``wrench``
         (6,) mean force (N) and torque (N m) of the thrusters in the last tick, at the base link
-        origin, in base components.
+        origin, in the base frame.
     ``on_time``, ``duty``, ``thrust``
         (m,) total on-time of each thruster (s), and its duty cycle (0 to 1) and mean force (N) in
         the last tick.

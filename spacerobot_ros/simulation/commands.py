@@ -103,7 +103,7 @@ class CommandSource:
         because stopping the wheels would rotate the base.
     command
         (size,) active command: for the joints (m/s, rad/s, N or N m), or force (N) and torque (N
-        m) at the base link origin, in base components.
+        m) at the base link origin, in the base frame.
     stamp_ns
         Stamp of the active command; :data:`NO_STAMP` if there is none.
     arrived

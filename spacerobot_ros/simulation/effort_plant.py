@@ -344,7 +344,7 @@ class EffortPlant:
         """Advance one tick under joint efforts (n,), clipped to their limits, and under a base
         wrench.
 
-        ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, in base components;
+        ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, in the base frame;
         it rotates with the base during the tick. A joint that reaches its limit stops there without
         rebound and is held while something pushes it outwards. Returns whether any joint was
         limited; ``effort_limited`` and ``stroke_limited`` count these ticks for each joint.

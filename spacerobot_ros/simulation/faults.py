@@ -23,7 +23,7 @@ _MAX_FAULT_VALUE = 1e6
 """Largest fault value, in its unit: the squares of much larger values would overflow."""
 
 WRENCH_AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
-"""Axes of the base wrench, in base components."""
+"""Axes of the base wrench, in the base frame."""
 
 POSE_AXES = tuple(f"{part}_{axis}" for part in ("position", "attitude") for axis in "xyz")
 """Axes of the measured pose: position in W, rotation vector in B."""
@@ -196,7 +196,7 @@ class Disturbance:
     """One disturbance, active from ``start`` s until just before ``end`` s of simulated time.
 
     ``force`` (3,), N, and ``torque`` (3,), N m, act at the frame origin of ``link``, in link
-    components if ``in_link``, otherwise in world components.
+    components if ``in_link``, otherwise in the world frame.
     """
 
     link: str

@@ -56,7 +56,7 @@ class JointEfforts:
 
         ``positions`` (N + 1, n) are the shapes at the ticks; the velocities ``velocity`` and
         ``after`` (n,) are held before and after the motion. ``L_B`` (N + 1, 3) is the angular
-        momentum about the centre of mass in base components, kg m^2/s; None: zero.
+        momentum about the centre of mass in the base frame, kg m^2/s; None: zero.
         """
         return self._effort_shares(positions, *self._rates(positions, velocity, after), L_B)
 
@@ -129,7 +129,7 @@ class JointEfforts:
 
     @cached_property
     def _drifting_function(self) -> ca.Function:
-        """The efforts by shape, rates, accelerations, and angular momentum in base components."""
+        """The efforts by shape, rates, accelerations, and angular momentum in the base frame."""
         n = self._robot.n
         q, qdot, qddot, L_B = (
             ca.SX.sym(name, k) for name, k in zip("qvaL", (n, n, n, 3), strict=True)

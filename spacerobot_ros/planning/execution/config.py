@@ -64,7 +64,7 @@ class PlannerConfig(CommanderConfig):
     )
     twist_timeout: float = parameter(
         0.5,
-        "simulated time without a twist on NAME/twist after which the joints brake",
+        "timeout, in simulated time, of twists on NAME/twist, after which the joints brake",
         "s",
         minimum=0.001,
         maximum=1000.0,

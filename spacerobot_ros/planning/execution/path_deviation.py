@@ -260,7 +260,7 @@ class PathSensitivity:
         """A function of shape and inertial parameters, and the parameters (k, 1 + P) of variants.
 
         The function returns the angular velocity of the base per joint rate (3 n,) and the centre
-        of mass (3,), both in base components. The variants are the model itself, then the model
+        of mass (3,), both in the base frame. The variants are the model itself, then the model
         with each parameter changed by a small step.
         """
         robot, bodies = self._robot, self.count // 2
@@ -273,7 +273,7 @@ class PathSensitivity:
         return ca.Function("model", [q, p], [ca.vec(-connection[3:, :]), center]), arguments.T
 
     def _derivatives(self, shapes: Array) -> tuple[Array, Array]:
-        """Return derivatives with respect to the parameters, for shapes (M, n), in base components.
+        """Return derivatives with respect to the parameters, for shapes (M, n), in the base frame.
 
         They are those of rotations by each joint (M, n, 3, P) and of the centre of mass (M, 3, P).
         """

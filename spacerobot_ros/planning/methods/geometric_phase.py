@@ -58,7 +58,7 @@ _NEIGHBOUR_OFFSETS = np.array([[x, y] for x in (0.0, -1.0, 1.0) for y in (0.0, -
 
 
 def planar_axis(robot: SpaceRobot) -> Array:
-    """Return the axis (3,) of a planar robot with three links, a unit vector in base components.
+    """Return the axis (3,) of a planar robot with three links, a unit vector in the base frame.
 
     Its largest component is positive, regardless of joint orientation.
 
@@ -155,7 +155,7 @@ class PlanarPhase:
 
     def __init__(self, robot: SpaceRobot) -> None:
         self.axis = planar_axis(robot)
-        """Axis (3,) of positive rotations, a unit vector in base components."""
+        """Axis (3,) of positive rotations, a unit vector in the base frame."""
         self.robot = robot.interpreted
         """The model, not compiled: that would take longer than planning."""
 

@@ -75,7 +75,7 @@ class NominalShape:
     joints
         Indices of the three joints.
     M
-        (3, 3) base rotation, rad, in base components, per area of the pairs (1, 2), (2, 3), (3, 1).
+        (3, 3) base rotation, rad, in the base frame, per area of the pairs (1, 2), (2, 3), (3, 1).
     longest
         (3,) longest edges that fit within the joint limits, m or rad.
     """

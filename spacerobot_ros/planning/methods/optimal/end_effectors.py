@@ -119,7 +119,7 @@ class EndEffectorRows:
     links
         Links, each with a flag for whether the link attitude is part of the goal.
     axes
-        (m, 3) directions in base components about which joint loops rotate it.
+        (m, 3) directions in the base frame about which joint loops rotate it.
     """
 
     def __init__(self, robot: SpaceRobot, links: Sequence[tuple[str, bool]], axes: Array) -> None:
@@ -169,7 +169,7 @@ class EndEffectorRows:
 
     @cached_property
     def _with_derivatives(self) -> ca.Function:
-        """Rows, and their derivatives by a base rotation (in base components) and by q."""
+        """Rows, and their derivatives by a base rotation (in the base frame) and by q."""
         X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
         p = ca.SX.sym("p", self.parameters)
         rows = self.function(X, q, p)
@@ -181,7 +181,7 @@ class EndEffectorRows:
     def evaluate(self, X: Array, q: Array, parameters: Array) -> tuple[Array, Array, Array]:
         """Return rows (K, m) and their derivatives (K, m, 3) and (K, m, n) at K motion ends.
 
-        The derivatives are with respect to a base rotation, in base components, and to the shape;
+        The derivatives are with respect to a base rotation, in the base frame, and to the shape;
         ``X`` (K, 4) and ``q`` (K, n).
         """
         K = len(q)

@@ -275,7 +275,7 @@ class BaseRotations:
     Attributes
     ----------
     axes
-        (m, 3) in base components: one unit vector for a planar robot, the unit matrix if all
+        (m, 3) in the base frame: one unit vector for a planar robot, the unit matrix if all
         attitudes can be reached, none if the joints do not rotate the base, or rotate it only back
         and forth along one attitude curve.
     turns_base
@@ -358,7 +358,7 @@ def _slides_anywhere(robot: SpaceRobot) -> bool:
 
 
 def _center_rate(robot: SpaceRobot, q: Array) -> Array:
-    """Return ``dc/dq`` (3, n) of the centre of mass in base components: ``-A_v + c x A_omega``."""
+    """Return ``dc/dq`` (3, n) of the centre of mass in the base frame: ``-A_v + c x A_omega``."""
     A = robot.connection(q)
     return np.asarray(A[:3] - np.cross(robot.center_of_mass(q), A[3:], axisb=0, axisc=0))
 

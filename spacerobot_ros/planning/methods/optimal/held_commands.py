@@ -104,7 +104,7 @@ class ManoeuvreModel:
     robot, prediction, control_period
         The model, the base motion prediction, and the command duration, s.
     axes
-        (m, 3) directions in base components along which the attitude is reached.
+        (m, 3) directions in the base frame along which the attitude is reached.
     constraints, efforts, distances
         Path constraints; efforts and distances are unlimited if None.
     end_effectors

@@ -146,8 +146,8 @@ class KeptDistances:
         return tuple(sorted(self._room))
 
     def approaches(self, positions: Array, turns: Array, margin: float = 0.0) -> list[Approach]:
-        """Return the pairs that come closer along held commands (N + 1, n) than required plus a
-        margin, m, nearest first.
+        """Return the pairs whose distance during held commands (N + 1, n) falls below the required
+        one plus a margin, m, nearest first.
 
         ``turns`` (N + 1, 4) are the base rotations since the start.
         """

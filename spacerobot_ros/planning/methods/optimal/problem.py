@@ -206,7 +206,7 @@ class BoundaryConditions:
     final
         (n,) last shape; None: any. NaN for reaction wheels: any position.
     center
-        (3,) system's centre of mass in base components at the end, m; None: anywhere.
+        (3,) system's centre of mass in the base frame at the end, m; None: anywhere.
     direction
         (3,) ``keep_direction`` of the path constraints, in the initial base frame.
     velocity

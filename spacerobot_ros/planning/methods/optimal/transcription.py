@@ -187,7 +187,7 @@ class Stages:
         robot
             The model.
         axes
-            (m, 3) directions in base components along which the attitude must be reached.
+            (m, 3) directions in the base frame along which the attitude must be reached.
         position
             Whether the centre of mass must end at ``center``, base components.
         constraints
@@ -538,10 +538,10 @@ def magnus(first: ca.SX, second: ca.SX) -> ca.SX:
 
 
 def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
-    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, in base components.
+    """Return ``(q, u, u+) -> Omega`` (3,): the rotation vector of a step, in the base frame.
 
     If the robot drifts, the fourth argument is the angular impulse (3,) of the step: the angular
-    momentum in base components at about half of the step, times the step duration.
+    momentum in the base frame at about half of the step, times the step duration.
     """
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
     impulse = ca.SX.sym("impulse", 3 if drifting else 0)

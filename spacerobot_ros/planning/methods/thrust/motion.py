@@ -38,7 +38,7 @@ EXACT_STEPS = 8
 
 class FrameSample(NamedTuple):
     """Motion of a frame in W: position (3,), m, quaternion (4,), and their velocities and
-    accelerations (3,), in world components.
+    accelerations (3,), in the world frame.
     """
 
     position: Array

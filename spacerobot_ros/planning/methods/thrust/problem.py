@@ -24,7 +24,7 @@ class Propulsion:
     Attributes
     ----------
     wrenches
-        (6, m) force (N), then torque (N m) at the base link origin, in base components, at level
+        (6, m) force (N), then torque (N m) at the base link origin, in the base frame, at level
         one.
     cost
         (m,) cost per second at level one: kg of propellant if there is a table, else N s of

@@ -4,7 +4,7 @@ A knot is ``x = [X; L; r; V; s; v]``: the attitude X, the vertices s and the vel
 joints' parabolas (:mod:`spacerobot_ros.planning.methods.optimal.transcription`), and the angular
 momentum L about the centre of mass, its position r and its velocity V, in W. The controls of an
 interval are the joint accelerations a and the levels u of the propulsion, whose wrench ``(f, n) = W
-u`` is constant in base components. With ``R_i``, ``c_i`` the attitude and the centre of mass in
+u`` is constant in the base frame. With ``R_i``, ``c_i`` the attitude and the centre of mass in
 base components at the Gauss points tau_i of an interval,
 
 ``V+ = V + h/m sum R_i f / 2``, ``r+ = r + h V + h^2/m sum (1 - tau_i) R_i f / 2``,
