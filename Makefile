@@ -145,9 +145,11 @@ bags: $(STAMP)/demo ## fly the reference bags in bags/ again, where a changed be
 	$(FLY) servicer_thrusters $(NEAR) $(STRAIGHT) --set coordinated_control.position_tolerance=0.006 \
 	    --set coordinated_control.transposed_jacobian.joint_damping=0
 	$(FLY) free_flyer --goal 0.8 0.2 0.05 --goal-rotvec 0 0 1 --set plant.tick_rate=10 \
-	    --set coordinated_control.tick_rate=10 --set coordinated_control.settle_time=0.5 $(STRAIGHT)
+	    --set coordinated_control.tick_rate=10 --set coordinated_control.settle_time=0.5 $(STRAIGHT) \
+	    --set plant.world=config/worlds/panel.urdf --set coordinated_control.world=config/worlds/panel.urdf
 	$(FLY) inspection --set plant.tick_rate=5 --set coordinated_control.tick_rate=5 \
-	    --set coordinated_control.settle_time=0.5
+	    --set coordinated_control.settle_time=0.5 --set plant.world=config/worlds/satellite.urdf \
+	    --set coordinated_control.world=config/worlds/satellite.urdf
 	$(FLY) wheels --set plant.tick_rate=10 --set coordinated_control.tick_rate=10 \
 	    --set coordinated_control.settle_time=1
 	$(FLY) gravity_gradient --set plant.tick_rate=12.5 --set coordinated_control.tick_rate=12.5 \

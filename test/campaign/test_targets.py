@@ -304,7 +304,7 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
         ("initial.joints.slider_9", "has no joint 'slider_9'; it has slider_1, slider_2, slider_3"),
         ("end_effector_goal.position.x", "has no goal for the end-effector"),
         ("faults[3].at", "plant.faults has 3 faults; the first is faults[0]."),
-        ("faults[0].value", "a fault of kind joint_stuck has no value"),
+        ("faults[0].value", "a fault of kind joint_stuck does not take a value"),
     ],
 )
 def test_names_that_are_none_are_refused(name: str, words: str, scenario: Scenario) -> None:

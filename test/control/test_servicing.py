@@ -300,7 +300,7 @@ def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
     # The robot of the test stays where it is.
     any_error = {"error_margin.position": 0.0, "error_margin.attitude": 0.0}
     planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
-    loop = Meeting(**planned, **any_error, **{"target.detumble": "none"})
+    loop = Meeting(**planned, **any_error, **{"target.detumble": "none", "target.horizon": 9.0})
     loop.executive.plan_at_once()
     loop.aim(base=goal_at(AIM, "5"))
     loop.answer(3)

@@ -81,6 +81,8 @@ def test_reference_bags_are_flown_again_without_ros(bag: Path) -> None:
     flight, recorded = fly_scenario(recorded_scenario(read_bag(bag))), read_run(bag)
     assert len(recorded.time) > 25
     assert_same(flight, recorded, 1e-9)
+    worlds = (str(each.get("world")) for each in read_bag(bag).metadata.values())
+    assert not any(world.startswith('"/') for world in worlds), "a path of one machine"
 
 
 BROKEN = ["plant.tick_rate=50", "coordinated_control.tick_rate=50"]

@@ -203,6 +203,7 @@ def test_programs_run_once_their_module_is_whole() -> None:
 # -- values ------------------------------------------------------------------------------------
 
 MUTABLE = {
+    "spacerobot_ros.planning.methods.thrust.search._Search",
     "spacerobot_ros.commanding.controller._ReferenceWait",
     "spacerobot_ros.commanding.fly_to._ActionGoal",
     "spacerobot_ros.control.goal_monitor.GoalMonitor",
