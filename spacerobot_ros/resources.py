@@ -17,7 +17,7 @@ _ROBOT_SUFFIXES = (".urdf", ".xacro", ".xml", ".sdf", ".world", ".mjcf")
 
 
 def installed_share_directory(package: str) -> Path | None:
-    """Return the folder ``share/PACKAGE`` of a package in the ROS environment; None: not found."""
+    """Return the folder ``share/PACKAGE`` of a package in the ROS environment, or None."""
     try:
         from ament_index_python.packages import get_package_share_directory
 

@@ -311,7 +311,7 @@ class JointReader:
     def joined(self, raw: bytes) -> bytes | None:
         """Return a measured state of all joints: this message, or one merged from several messages.
 
-        Returns None if joints are still missing since the last complete state.
+        Returns None until every joint has arrived since the last complete state.
 
         Raises
         ------
