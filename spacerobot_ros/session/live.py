@@ -73,8 +73,8 @@ def fly_by_nodes(
         stack = MultiProcessStack(scenario, bag)
         try:
             with graceful_shutdown() as stopped:
+                stack.start(scenario.goal, stopped)
                 began = time.perf_counter()
-                stack.start(scenario.goal)
 
                 def look() -> bool:
                     progress(stack.time_ns / SECOND, stack.client.ends_at)

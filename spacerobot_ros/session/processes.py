@@ -245,15 +245,19 @@ class MultiProcessStack:
     def _read_log(self, name: str) -> str:
         return self._log_file_of(name).read_text("utf-8", errors="replace")
 
-    def start(self, goal: Goal | None) -> None:
-        """Activate all nodes and send the goal, if any; the plant starts last."""
+    def start(self, goal: Goal | None, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Activate all nodes and send the goal, if any; the plant starts last. This ends early if
+        ``stopped`` returns true."""
         self.client.node.destroy_subscription(self._heartbeats)
         for name in reversed(self.names[1:]):
+            if stopped():
+                return
             self._change_states(Transition.TRANSITION_ACTIVATE, [name])
-        if goal is not None:
+        if goal is not None and not stopped():
             self.client.send(goal, self.scenario.end_effector_goal)
             self.client.await_delivery()
-        self._change_states(Transition.TRANSITION_ACTIVATE, ["plant"])
+        if not stopped():
+            self._change_states(Transition.TRANSITION_ACTIVATE, ["plant"])
 
     def spin(self, look: Callable[[], bool]) -> None:
         """Run until the goal has ended, or until ``look``, called five times per second, returns
