@@ -431,6 +431,8 @@ def goal_command(
 
     outcome = send_goal(goal, say, namespace=namespace, timeout=timeout)
     exit_if_terminated()
+    if outcome is Outcome.INTERRUPTED:
+        fail(f"The goal has no result after {timeout:g} s; the stack still pursues it.")
     if outcome is not Outcome.REACHED:
         fail()
 
