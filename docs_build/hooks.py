@@ -10,7 +10,7 @@ from typing import Any
 
 from mkdocs.exceptions import PluginError
 
-from docs_build import diagrams, equations, notebook, reference, structure
+from docs_build import diagrams, equations, notebook, reference
 from docs_build.blocks import Block, replace_blocks
 
 _characters: set[str] = set()
@@ -53,8 +53,6 @@ def prepared(markdown: str) -> str:
     ``{{ parameters NODE }}``, ``{{ topics }}``, ``{{ state_fields }}``, ``{{ cli }}``,
     ``{{ api PACKAGE }}``, ``{{ foreign_robots }}``
         Generated references.
-    ``{{ lines FILE FILE }}``
-        How many lines these files of the package have together.
     ``{{ notebook FILE }}``
         A Python file in cells, executed, with what comes of it.
 
@@ -92,8 +90,6 @@ def _replacement(found: re.Match[str]) -> str:
             return reference.foreign_robots()
         case "cli":
             return reference.command_line()
-        case "lines":
-            return str(structure.lines_of(argument.split()))
         case "notebook":
             return notebook.executed(reference.DOCS.parent / argument)
         case "api":
