@@ -433,24 +433,27 @@ class OptimalGait(GaitMethod):
             raise refusal
         position = (state.position + goal.position) / 2
         halfway = replace(goal, position=position, quaternion=between, joint_positions=None)
-        plans: list[_Plan] = []
-        for aim in (halfway, goal):
-            part = replace(request, state=state, goal=aim)
-            try:
-                plans.append(self._plan_about_center(part, task.cancellation, task.clock))
-            except PlanningError:
-                task.cancellation.raise_if_requested()
-                raise refusal from None
-            shapes = plans[-1].positions
-            base = self._prediction.poses(state, shapes)
+        try:
+            first = self._plan_about_center(
+                replace(request, goal=halfway), task.cancellation, task.clock
+            )
+            base, rates = self._prediction.poses(state, first.positions), np.zeros(self.robot.n)
+            rates[:] = first.final_velocity
             r_WB, attitude = base.position[-1], base.quaternion[-1]
-            state = replace(state, position=r_WB, quaternion=attitude, q=shapes[-1])
+            q = first.positions[-1]
+            arrived = replace(state, position=r_WB, quaternion=attitude, q=q, qdot=rates)
+            last = self._plan_about_center(
+                replace(request, state=arrived), task.cancellation, task.clock
+            )
+        except PlanningError:
+            task.cancellation.raise_if_requested()
+            raise refusal from None
         # A tick of rest joins the halves, each of which begins and ends with its own velocities.
-        shapes = np.vstack([each.positions for each in plans])
-        first, last = plans
+        shapes = np.vstack([first.positions, last.positions])
         notes: Notes = {**first.notes, **last.notes}
         for name in ("starts", "solution_time"):
-            notes[name] = float(sum(np.atleast_1d(each.notes.get(name, 0.0))[0] for each in plans))
+            given = (each.notes.get(name, 0.0) for each in (first, last))
+            notes[name] = sum(each for each in given if isinstance(each, float))
         return _Plan(shapes, notes, last.final_velocity)
 
     def _plan_from_rest(self, task: SearchProblem, *, final_is_given: bool) -> Manoeuvre:
