@@ -98,6 +98,17 @@ def processes(folder: Path, domain: int) -> Iterator[Processes]:
         started.close()
 
 
+CUT = """
+[...document.querySelectorAll("button, label, [role=tab], .mantine-Text-root, div")]
+  .filter(each => each.checkVisibility() && !each.closest("canvas"))
+  .filter(each => [...each.childNodes].some(part => part.nodeType === 3 && part.data.trim()))
+  .filter(each => each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0)
+  .filter(each => getComputedStyle(each).overflowX !== "visible")
+  .map(each => each.textContent.trim().slice(0, 60))
+"""
+"""Texts that are wider than the element that clips them."""
+
+
 class Page:
     """The viewer's page, by what its users see.
 

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from support.accessibility import AXE, ROOT, focus_order, press, problems
 from support.chromium import browser, chromium, keep_picture
-from support.viewer_page import Page, Processes, processes
+from support.viewer_page import CUT, Page, Processes, processes
 
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.report import write_report
@@ -23,16 +23,6 @@ pytestmark = [
 
 SERVICER = ("--params-file", str(ROOT / "config" / "servicer.yaml"))
 SIZES = {"desktop": (1280, 900), "phone": (390, 780)}
-CUT = """
-[...document.querySelectorAll("button, label, [role=tab], .mantine-Text-root, div")]
-  .filter(each => each.checkVisibility() && !each.closest("canvas"))
-  .filter(each => [...each.childNodes].some(part => part.nodeType === 3 && part.data.trim()))
-  .filter(each => each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0)
-  .filter(each => getComputedStyle(each).overflowX !== "visible")
-  .map(each => each.textContent.trim().slice(0, 60))
-"""
-"""Texts that are wider than the element that clips them."""
-
 LOOK_BACK = '[role=slider][aria-label="Look back to (s)"]'
 
 

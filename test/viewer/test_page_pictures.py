@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from support.chromium import Browser, browser, chromium, keep_picture
 from support.up import PATIENCE, Up
-from support.viewer_page import Page
+from support.viewer_page import CUT, Page
 
 pytestmark = [
     pytest.mark.study,
@@ -46,16 +46,6 @@ _UNDER = """
 })
 """
 """The pixel of a point of the scene, and the element that is seen there."""
-
-_CUT = """
-[...document.querySelectorAll("button, label, [role=tab], .mantine-Text-root, div")]
-  .filter(each => each.checkVisibility() && !each.closest("canvas"))
-  .filter(each => [...each.childNodes].some(part => part.nodeType === 3 && part.data.trim()))
-  .filter(each => each.scrollWidth > each.clientWidth + 1 && each.clientWidth > 0)
-  .filter(each => getComputedStyle(each).overflowX !== "visible")
-  .map(each => each.textContent.trim().slice(0, 60))
-"""
-"""Texts that are wider than the element that clips them."""
 
 
 class Looked:
@@ -101,7 +91,7 @@ class Looked:
                     ".forEach(each => each.scrollTo(0, 0))"
                 )
                 self.page.draw()
-                assert self.window.evaluate(_CUT) == [], (name, size, theme)
+                assert self.window.evaluate(CUT) == [], (name, size, theme)
                 keep_picture(self.window, f"{name}-{theme}-{size}")
                 self.page.press("Dark or light")
         self.window.call(
