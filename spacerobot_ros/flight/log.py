@@ -1,0 +1,156 @@
+"""The arrays of a flight, collected tick by tick."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.events import Event
+from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.series import Commands, Signal
+from spacerobot_ros.measures import Outcome
+from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.scenario import Scenario
+from spacerobot_ros.simulation.actuators import PlantWithFaults
+from spacerobot_ros.simulation.commands import CommandValidator, Refusal
+from spacerobot_ros.simulation.sensors import ReportedState
+from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.times import SECOND
+
+
+class FlightLog:
+    """Collects the arrays of a :class:`Flight` tick by tick.
+
+    Parameters
+    ----------
+    plant, reported, commands
+        The plant, its reported quantities, and its commands.
+    period_ns
+        Duration of a tick, ns.
+    """
+
+    def __init__(
+        self,
+        plant: PlantWithFaults,
+        reported: ReportedState,
+        commands: CommandValidator,
+        period_ns: int,
+    ) -> None:
+        self.events: list[Event] = []
+        self.statuses: list[tuple[int, Status]] = []
+        self.schedules: list[tuple[int, GaitSchedule]] = []
+        self.paths: list[tuple[int, BasePath]] = []
+        self.plant_statuses: list[tuple[int, PlantStatus]] = []
+        self.diagnostics: list[tuple[int, tuple[StatusRecord, ...]]] = []
+        self.covariances: list[tuple[int, Array]] = []
+        self.refusals: list[tuple[float, str, Refusal]] = []
+        self._period_ns = period_ns
+        self._thrusters = plant.thrusters
+        self._propellant = np.zeros(1)
+        true = {"pose": plant.pose, "twist": plant.twist, "q": plant.q, "qdot": plant.qdot}
+        # Without sensor errors, the measurements are the true arrays.
+        unused = [f"true_{name}" for name in true]
+        unused += [] if reported.sensors.used else [f"measured_{name}" for name in true]
+        sources = {
+            **{name: x for name, x in reported.quantities.items() if name not in unused},
+            **true,
+        }
+        if self._thrusters is not None:
+            sources["propellant"] = self._propellant
+        self._sources, self._parts = sources, tuple(sources.values())
+        self._states: list[Array] = []
+        """All quantities of each state, in one row per state."""
+        self._commands: dict[str, list[tuple[int, Array]]] = {
+            source.topic: [] for source in commands.sources
+        }
+        self._sizes = {source.topic: len(source.limits) for source in commands.sources}
+        self._setpoints: dict[str, list[Array]] = {}
+        self._plant = plant
+        self._faults_seen: object = None
+        self._ticks_without_pose: list[int] = []
+        self._ticks_without_target: list[int] = []
+        self._reported = reported
+
+    def add_state(self, tick: int) -> None:
+        """Add the current state."""
+        if self._thrusters is not None:
+            self._propellant[0] = self._thrusters.propellant
+        self._states.append(np.concatenate(self._parts))
+        sensors = self._reported.sensors
+        if sensors.used and self._plant.active is not self._faults_seen:
+            self._faults_seen = self._plant.active
+            both = np.concatenate([sensors.pose_covariance, sensors.twist_covariance])
+            self.covariances.append((tick * self._period_ns, both))
+        if sensors.dropout:
+            self._ticks_without_pose.append(tick)
+        if self._reported.misses_target:
+            self._ticks_without_target.append(tick)
+
+    def add_command(
+        self, topic: str, tick: int, values: Array, setpoint: tuple[Array, Array] | None = None
+    ) -> None:
+        """Add a command; planner commands include the setpoint, joint positions and rates."""
+        self._commands.setdefault(topic, []).append((tick, values.copy()))
+        self._sizes.setdefault(topic, len(values))
+        if setpoint is not None:
+            self._setpoints.setdefault(topic, []).append(np.concatenate(setpoint))
+
+    def flight(
+        self,
+        scenario: Scenario,
+        robot: RobotDescription,
+        *,
+        outcome: Outcome,
+        message: str,
+        status: Status | None,
+        gait: PlannerStatus | None,
+        plan_time: float,
+        wall_time: float,
+    ) -> Flight:
+        """Return the flight."""
+        table = np.array(self._states)
+        count, ends = len(table), np.cumsum([source.size for source in self._parts])
+        columns = np.split(table, ends[:-1], axis=1)
+        states = {name: each.copy() for name, each in zip(self._sources, columns, strict=True)}
+        lost = {"pose_lost": self._ticks_without_pose}
+        if self._ticks_without_target:
+            lost["target_lost"] = self._ticks_without_target
+        for name, ticks in lost.items():
+            states[name] = np.zeros((count, 1))
+            states[name][ticks] = 1.0
+        time: Array = np.arange(count) * self._period_ns / SECOND
+        return Flight(
+            scenario=scenario,
+            robot=robot,
+            joint_names=tuple(robot.joint_names),
+            series={name: Signal(time, values) for name, values in states.items()},
+            commands={
+                topic: Commands(
+                    np.array([tick for tick, _ in sent], np.int64),
+                    np.array([values for _, values in sent]).reshape(len(sent), self._sizes[topic]),
+                    np.array(self._setpoints[topic]) if topic in self._setpoints else None,
+                )
+                for topic, sent in self._commands.items()
+            },
+            statuses=tuple(self.statuses),
+            events=tuple(self.events),
+            outcome=outcome,
+            message=message,
+            goal=scenario.goal.kept_at(*np.split(states["pose"][0], [3])),
+            end_effector_goal=scenario.end_effector_goal,
+            schedules=tuple(self.schedules),
+            paths=tuple(self.paths),
+            plant_statuses=tuple(self.plant_statuses),
+            diagnostics=tuple(self.diagnostics),
+            covariances=tuple(self.covariances),
+            status=status,
+            gait=gait,
+            plan_time=plan_time,
+            wall_time=wall_time,
+            refusals=tuple(self.refusals),
+            measures_clearance=scenario.plant.clearance_period > 0,
+        )
