@@ -258,7 +258,8 @@ def verify_command(bag: Path, tolerance: float, engine: str | None) -> None:
     Exit code 0: the commands reproduce every recorded state; 1: a state differs, states are
     missing, or the other engine differs; 2: bad input.
     """
-    from spacerobot_ros.flight.verification import AGREEMENT_TOLERANCE, verify_bag
+    from spacerobot_ros.flight.second_opinion import AGREEMENT_TOLERANCE
+    from spacerobot_ros.flight.verification import verify_bag
 
     result = verify_bag(bag, tolerance, mujoco=engine == "mujoco")
     say(f"flown again {result.ticks} ticks, {result.duration:.9g} s")

@@ -24,8 +24,9 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.errors import PlanningError, numbers
 from spacerobot_ros.flight import trials, verification
+from spacerobot_ros.flight.second_opinion import EngineComparison
 from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
-from spacerobot_ros.flight.verification import Difference, EngineComparison, Verification
+from spacerobot_ros.flight.verification import Difference, Verification
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.planning import METHODS, BasePath, GaitSchedule, Goal, PoseError

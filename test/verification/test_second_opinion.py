@@ -18,7 +18,8 @@ from support.slow import some_fast
 from spacerobot_ros import fly
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.flight.verification import EngineComparison, EngineFlight, verify_bag
+from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
+from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.resources import resource_names, robot_file, share_directory
 from spacerobot_ros.simulation import mujoco_model
