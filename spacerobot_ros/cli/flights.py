@@ -1,4 +1,4 @@
-"""Commands that fly: run, up, goal, scenarios."""
+"""Commands that fly: run, up, goal, request, scenarios."""
 
 from __future__ import annotations
 
@@ -434,6 +434,31 @@ def goal_command(
     if outcome is Outcome.INTERRUPTED:
         fail(f"The goal has no result after {timeout:g} s; the stack still pursues it.")
     if outcome is not Outcome.REACHED:
+        fail()
+
+
+@click.command("request")
+@click.argument(
+    "request",
+    metavar="REQUEST",
+    type=click.Choice(["abort", "stop", "rearm", "pause", "resume", "reset", "play", "hold"]),
+)
+@click.option("--namespace", default="", help="Namespace of the stack.")
+def request_command(request: str, namespace: str) -> None:
+    """Send a REQUEST to a running stack: one of the buttons on its page.
+
+    \b
+    abort          abandon the goal; the joints brake
+    stop           joints brake, and thrusters are off until rearm
+    rearm          accept commands again after a stop
+    pause, resume  stop the simulated time, and continue
+    reset          return to the initial state
+    hold, play     pause a replay, and continue
+    """
+    from spacerobot_ros.session.live import send_request
+    from spacerobot_ros.viewer.state import Request
+
+    if not send_request(Request(request), say, namespace=namespace):
         fail()
 
 

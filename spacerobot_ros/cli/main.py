@@ -17,7 +17,7 @@ from spacerobot_ros.version import __version__
 _COMMAND_NAMES_BY_MODULE = {
     "bags": ("export", "figures", "replay", "report", "salvage", "verify"),
     "campaign": ("campaign",),
-    "flights": ("goal", "run", "scenarios", "up"),
+    "flights": ("goal", "request", "run", "scenarios", "up"),
     "plan": ("plan",),
     "robots": ("analyze", "new", "robots"),
 }

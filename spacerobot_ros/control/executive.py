@@ -164,10 +164,10 @@ class ControlExecutive:
             return ControllerState.STALLED if stalled else self._goal_state
         if mode is not Mode.ESTIMATED:
             return ControllerState.STOPPED
-        # A single pose may arrive late.
-        elapsed = self.controller.time_since_measurement
-        late = elapsed <= _LATE_POSE_PERIODS * self._config.control_period
-        return self._goal_state if late else ControllerState.ESTIMATING
+        # Poses may arrive a few periods late, for example on a busy machine.
+        config, elapsed = self._config, self.controller.time_since_measurement
+        unreported = max(1.5 * config.control_period, _UNREPORTED_SHARE * config.estimation_time)
+        return self._goal_state if elapsed <= unreported else ControllerState.ESTIMATING
 
     # -- goals --------------------------------------------------------------------------------
 
@@ -711,5 +711,5 @@ class ControlExecutive:
                 raise ValueError("a refusal has its own message")
 
 
-_LATE_POSE_PERIODS = 1.5
-"""Longest unreported time without a base measurement, in control periods."""
+_UNREPORTED_SHARE = 0.1
+"""Longest unreported time without a base measurement, as a fraction of ``estimation_time``."""

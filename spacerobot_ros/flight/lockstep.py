@@ -140,7 +140,7 @@ def require_flyable(scenario: Scenario) -> None:
         realtime = " --realtime" if scenario.kills and scenario.lockstep else ""
         raise ParameterError(
             f"The scenario '{scenario.name}' cannot be flown without nodes, because {why}: fly it "
-            f"with `spacerobot run --nodes{realtime}`."
+            f"with `spacerobot run SCENARIO --nodes{realtime}`."
         )
 
 

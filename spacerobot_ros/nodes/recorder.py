@@ -104,8 +104,9 @@ _LOSS_LOG_PERIOD = 5.0
 
 
 class RecorderNode(FlightNode):
-    """Records topics as raw bytes, as rosbag2 does; :class:`Recording` determines the time
-    stamps.
+    """Records topics as raw bytes, as rosbag2 does.
+
+    :class:`Recording` determines the time stamps.
     """
 
     Config: ClassVar = RecorderConfig

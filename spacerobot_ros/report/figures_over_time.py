@@ -47,7 +47,13 @@ from spacerobot_ros.report.figures import (
     set_time,
     sheet,
 )
-from spacerobot_ros.report.flight import FlightReport, GoalSpan, joint_unit, pose_errors
+from spacerobot_ros.report.flight import (
+    FlightReport,
+    GoalSpan,
+    joint_unit,
+    pose_errors,
+    trace_labels,
+)
 from spacerobot_ros.report.signals import Indices, thinned
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
@@ -195,21 +201,22 @@ def figure_of_flights(
         same = [each[key] for each in groups if key in each]
         empty = replace(same[0], signal=Signal.empty(same[0].signal.width))
         signals = [each.get(key, empty).signal for each in groups]
-        windows = [each.window for each in same if each.window is not None]
-        low, high = (np.array(windows).reshape(-1, 2)).T
+        # Only efforts have windows, which contain zero.
+        spans = [each.window or np.quantile(np.append(each.values, 0.0), [0, 1]) for each in same]
+        low, high = np.transpose(spans)
         merged.append(
             replace(
                 same[0],
                 signal=signals[0],
                 beside=signals[1:],
                 goals=[goal for each in same for goal in each.goals],
-                window=(low.min(), high.max()) if len(windows) == len(same) else None,
+                window=(low.min(), high.max()) if any(each.window for each in same) else None,
                 decades=max(each.decades for each in same),
             )
         )
     if not merged:
         return "This figure shows a single flight: specify one bag."
-    first, labels = figures[0], [each.label for each in flights]
+    first, labels = figures[0], trace_labels(flights)
     return time_figure(flights[0], first.name, first.heading, first.heading, merged, flights=labels)
 
 

@@ -42,7 +42,7 @@ from spacerobot_ros.report.figures_over_time import (
     draw_group,
     error_group,
 )
-from spacerobot_ros.report.flight import FlightReport, joint_unit
+from spacerobot_ros.report.flight import FlightReport, joint_unit, trace_labels
 from spacerobot_ros.report.scene import bodies_of, goal_of_base, is_flat, obstacles_of
 from spacerobot_ros.report.signals import Indices
 from spacerobot_ros.report.solids import (
@@ -232,7 +232,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     flown = [flight, *(other for other in beside if len(other.time))]
     tints = [_FLIGHT_COLOURS[k % len(_FLIGHT_COLOURS)] for k in range(len(flown))]
     paths = [(each.pose[:, :3], tint) for each, tint in zip(flown, tints, strict=True)]
-    names = [each.label for each in flown] if beside else ["base"]
+    names = trace_labels(flown) if beside else ["base"]
     keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
     if shows_tool:
         paths.append((flight.tool.values[:, :3], HAND_COLOUR))

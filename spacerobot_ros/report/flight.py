@@ -471,6 +471,16 @@ def read_report(path: Path, namespace: str | None = None) -> FlightReport:
     return FlightReport.of(open_flight_bag(path, namespace))
 
 
+def trace_labels(flights: Sequence[FlightReport]) -> list[str]:
+    """Return a name for each flight: the method or the file name if they differ, or both."""
+    methods = [each.flown_method for each in flights]
+    stems = [each.bag.path.stem for each in flights]
+    for names in (methods, stems):
+        if all(names) and len(set(names)) == len(names):
+            return names
+    return [each.label for each in flights]
+
+
 def joint_unit(flight: FlightReport, name: str) -> str:
     """Return the unit of a joint: m, rad, or ``m or rad`` without a robot description."""
     joint = flight.joint(name)

@@ -13,7 +13,7 @@ from spacerobot_ros.errors import counted, sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.events import event_style, event_text
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
-from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.flight import FlightReport, trace_labels
 from spacerobot_ros.report.page_parts import (
     PagePart,
     facts,
@@ -244,7 +244,7 @@ def charts_of(
         return PagePart()
     charts = {
         "end": max(each.end for each in (flight, *beside)),
-        "charts": [_chart_data(group, [each.label for each in beside]) for group in groups],
+        "charts": [_chart_data(group, trace_labels([flight, *beside])) for group in groups],
         "events": _chart_events(flight),
     }
     return PagePart(
@@ -275,7 +275,7 @@ def _chart_data(group: TraceGroup, labels: Sequence[str]) -> dict[str, Any]:
     if group.beside:
         time = np.unique(np.concatenate([each.time for each in signals]))
         values = np.hstack([each.at(time) for each in signals])
-        names += [f"{name}, {label}" for label in labels for name in group.names]
+        names = [f"{name}, {label}" for label in labels for name in group.names]
     if group.decades:
         # uPlot's own logarithmic axes fail with numbers as small as rounding errors.
         floor, _ = log_range(values, group.decades)

@@ -18,6 +18,7 @@ from lifecycle_msgs.srv import GetState
 from rclpy.experimental import EventsExecutor
 from rclpy.logging import get_logger_effective_level, set_logger_level
 from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.reading import (
@@ -34,6 +35,7 @@ from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.processes import MultiProcessStack, checked_namespace
 from spacerobot_ros.termination import graceful_shutdown
 from spacerobot_ros.times import SECOND, stamp_to_ns
+from spacerobot_ros.viewer.state import SERVICE_BY_REQUEST, Request
 
 
 @contextmanager
@@ -128,7 +130,7 @@ _LONGEST_RECORDER_WAIT = 1.0
 _CHECK_PERIOD = 0.1
 
 
-_NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)\b")
+_NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)( or [mµ]?rad)?\b")
 """A continually changing quantity in a status message."""
 
 
@@ -248,6 +250,55 @@ def send_goal(
         finally:
             for each in clients:
                 each.node.destroy_node()
+            executor.shutdown()
+
+
+def send_request(request: Request, show: Callable[[str], None], *, namespace: str) -> bool:
+    """Call the services of a request, show the responses, and return whether all succeeded.
+
+    Raises
+    ------
+    SpaceRobotError
+        No node offers the service or responds, or the namespace is not a valid ROS namespace.
+    """
+    namespace = checked_namespace(namespace)
+    keys, service, value = SERVICE_BY_REQUEST[request]
+    kind = Trigger if value is None else SetBool
+    call = Trigger.Request() if value is None else SetBool.Request(data=value)
+    nodes = ["coordinated_control" if key == "controller" else key for key in keys]
+    offered = " or ".join(f"'{node}/{service}'" for node in nodes)
+    with ros():
+        client = rclpy.create_node("request", namespace=namespace)
+        executor = EventsExecutor()
+        executor.add_node(client)
+        try:
+            services = [client.create_client(kind, f"{node}/{service}") for node in nodes]
+            deadline = time.monotonic() + _LONGEST_DISCOVERY
+            while not all(each.service_is_ready() for each in services):
+                executor.spin_once(timeout_sec=0.05)
+                if any(each.service_is_ready() for each in services):
+                    # A second node, if any, is discovered at about the same time.
+                    deadline = min(deadline, time.monotonic() + _LONGEST_STATUS_WAIT)
+                if time.monotonic() > deadline:
+                    break
+            ready = [each for each in services if each.service_is_ready()]
+            if not ready:
+                raise SpaceRobotError(
+                    f"No node offers {offered} after {_LONGEST_DISCOVERY:g} s: start a stack, "
+                    "`spacerobot up SCENARIO`, in the same ROS domain and namespace."
+                )
+            succeeded = True
+            for future in [each.call_async(call) for each in ready]:
+                executor.spin_until_future_complete(future, timeout_sec=_LONGEST_DISCOVERY)
+                if not future.done():
+                    raise SpaceRobotError(
+                        f"No response from {offered} within {_LONGEST_DISCOVERY:g} s."
+                    )
+                show(future.result().message)
+                succeeded = succeeded and future.result().success
+            return succeeded
+        finally:
+            client.destroy_node()
             executor.shutdown()
 
 

@@ -309,8 +309,8 @@ def parse_times(
         raise refusal(f"only 'at SECONDS' and 'until SECONDS' may follow {before}")
     for word, text in zip(words[0::2], words[1::2], strict=True):
         times[word] = _parse_number(text, refusal)
-        if abs(times[word]) > MAX_TIME:
-            raise refusal(f"its time is {times[word]:g} s but must be at most {MAX_TIME:g} s")
+        if not 0.0 <= times[word] <= MAX_TIME:
+            raise refusal(f"its time is {times[word]:g} s but must be from 0 to {MAX_TIME:g} s")
     if not times["until"] > times["at"]:
         raise refusal(f"it ends at {times['until']:g} s but begins at {times['at']:g} s")
     return times["at"], times["until"]

@@ -239,7 +239,7 @@ def has_stack_ended(state: StackState) -> bool:
 
 def padded(html: str) -> str:
     """Return HTML with the margins and font size of the other page elements."""
-    return f'<div style="padding:2px 12px;font-size:.85em;line-height:1.35">{html}</div>'
+    return f'<div style="padding:2px 12px 6px;font-size:.85em;line-height:1.35">{html}</div>'
 
 
 def _node_html(state: StackState, key: str, word: str, message: str, level: int) -> str:

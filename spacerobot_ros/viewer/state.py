@@ -184,6 +184,19 @@ class Request(Enum):
     """Pause a replay."""
 
 
+SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
+    Request.ABORT: (("planner", "controller"), "abort", None),
+    Request.STOP: (("plant",), "abort", None),
+    Request.REARM: (("plant",), "rearm", None),
+    Request.RESET: (("plant",), "reset", None),
+    Request.PAUSE: (("plant",), "pause", True),
+    Request.RESUME: (("plant",), "pause", False),
+    Request.PLAY: (("replay",), "pause", False),
+    Request.HOLD: (("replay",), "pause", True),
+}
+"""For each request: nodes, service name, and the value for ``SetBool`` (None: ``Trigger``)."""
+
+
 @dataclass(frozen=True)
 class FlyAction:
     """Send goals, by robot part, all with the same stamp."""

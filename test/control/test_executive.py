@@ -753,7 +753,7 @@ def test_an_abort_without_odom_holds_where_the_robot_is_seen_again() -> None:
     loop.aim(base=goal_at([1.0, 0.0, 0.0]))
     loop.answer()
     loop.executive.abort()
-    loop.answer(2, measured=False)
+    loop.answer(12, measured=False)
     assert loop.state == "estimating"
     loop.place = np.array([0.25, 0.0, 0.0])
     np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
@@ -763,7 +763,7 @@ def test_an_abort_without_odom_holds_where_the_robot_is_seen_again() -> None:
 def test_a_robot_that_held_still_holds_after_a_gap() -> None:
     loop = ExecutiveLoop()
     loop.answer()
-    loop.answer(2, measured=False)
+    loop.answer(12, measured=False)
     assert loop.state == "estimating"
     loop.answer()
     assert loop.state == "holding"
@@ -785,7 +785,7 @@ def test_a_reached_goal_does_not_fail_after_a_gap() -> None:
     loop.aim(base=goal_at([0.0, 0.0, 0.0]))
     loop.answer(20)
     assert loop.state == "reached"
-    loop.answer(2, measured=False)
+    loop.answer(12, measured=False)
     assert loop.state == "estimating"
     # It has drifted in the meantime.
     loop.place = np.array([0.01, 0.0, 0.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import signal
@@ -70,6 +71,16 @@ def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
         # What ROS itself refuses, it says in its own words.
         sentence = ended.stderr.strip().splitlines()[-1].removesuffix(".") + "."
         assert_one_sentence(sentence, *mentions)
+
+
+@pytest.mark.parametrize("node", sorted(NODE_TYPES))
+def test_the_help_of_an_executable_names_its_parameters(warm_python: WarmPython, node: str) -> None:
+    known = json.loads((ROOT / "test" / "expected" / "parameters.json").read_text("utf-8"))
+    words = ("-m", NODE_TYPES[node].__module__, "--help")
+    ended = warm_python.run(words, ROOT, dict(os.environ), timeout=START)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("Usage: ros2 run spacerobot_ros")
+    assert set(known[node]) <= set(ended.stdout.split())
 
 
 NO_SUCH_PARAMETER = {

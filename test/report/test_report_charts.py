@@ -154,8 +154,9 @@ def test_charts_have_the_traces_of_a_flight_beside(
     charts = [each for each in given["charts"] if each["label"] == "joint position"]
     assert sum(chart["own"] for chart in charts) == len(flight.joint_names)
     for chart in charts:
-        own = chart["names"][: chart["own"]]
-        assert chart["names"] == [*own, *(f"{name}, other.mcap" for name in own)]
+        named = [each.split(", ") for each in chart["names"]]
+        own = [name for name, _ in named[: chart["own"]]]
+        assert named == [[name, file] for file in (bag.stem, "other") for name in own]
         time = np.frombuffer(base64.b64decode(chart["time"]), "<f8")
         found = [np.frombuffer(base64.b64decode(each), "<f4") for each in chart["values"]]
         there = time < TICK * (len(shapes) - 0.5)

@@ -190,6 +190,17 @@ def test_goals_are_sent_to_a_robot_that_is_up(
     )
     assert again.returncode == 0, again.stdout + again.stderr
     assert "Executing" in again.stdout
+    stopped = spacerobot("request", "stop")
+    assert (stopped.returncode, stopped.stderr) == (0, "")
+    latched = spacerobot("goal", "0", "0", "0")
+    assert latched.returncode == 1
+    assert "is latched: stopped on request" in latched.stdout
+    for request in ("rearm", "abort"):
+        answer = spacerobot("request", request)
+        assert (answer.returncode, answer.stderr) == (0, ""), request
+    nobody = spacerobot("request", "hold")
+    assert nobody.returncode == 2
+    assert nobody.stderr.startswith("No node offers 'replay/pause' after 10 s")
     robot.send_signal(signal.SIGINT)
     assert robot.wait(PATIENCE) == 0
     assert robot.stdout is not None

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import click
 import rclpy
 from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
@@ -22,6 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.node import FlightNode
+from spacerobot_ros.parameters import declared
 from spacerobot_ros.termination import Terminated, graceful_shutdown, guarded
 
 _LOG = logging.getLogger(__name__)
@@ -110,6 +112,8 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
     The end of the parent is ignored unless the parent requested otherwise; a shell and ``ros2 run``
     make no such request.
 
+    With ``--help``, the node's parameters are printed instead.
+
     Returns the exit code: 0 after a signal, 2 if the node cannot start (the reason is written to
     standard error), or the node's own code if the node ends by itself.
 
@@ -118,6 +122,9 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
     Terminated
         A signal arrived before the node existed, and the caller has its own signal guard.
     """
+    if isinstance(factory, type) and {"-h", "--help"} & set(sys.argv[1:]):
+        print(_help(factory, Path(sys.argv[0]).stem))
+        return 0
     use_loopback_discovery()
     with guarded() as alone:
         try:
@@ -126,6 +133,20 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
             if not alone:
                 raise
             return 0
+
+
+def _help(node: type[FlightNode], executable: str) -> str:
+    """Return what a node does, and its parameters."""
+    text = click.HelpFormatter(max_width=100)
+    text.write_usage(f"ros2 run spacerobot_ros {executable}", "--ros-args -p NAME:=VALUE ...")
+    text.write_paragraph()
+    text.write_text((node.__doc__ or "").partition("\n\n")[0])
+    with text.section("Parameters"):
+        text.write_dl(
+            (each.name, f"{each.description} [{each.default!r}{each.unit and ' ' + each.unit}]")
+            for each in declared(node.Config)
+        )
+    return text.getvalue().rstrip()
 
 
 def start_ros(arguments: list[str] | None) -> None:

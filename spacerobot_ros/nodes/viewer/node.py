@@ -62,6 +62,7 @@ from spacerobot_ros.viewer.server import (
     url_of,
 )
 from spacerobot_ros.viewer.state import (
+    SERVICE_BY_REQUEST,
     Action,
     FlyAction,
     InjectAction,
@@ -78,18 +79,6 @@ ANNOUNCEMENT = "viewer      "
 _LEAST_SHOWN_LOG_LEVEL = 30
 
 _PARTS_WITH_RECEIVED_GOALS = (BASE_GOAL_KEY, DEFAULT_END_EFFECTOR)
-
-_SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
-    Request.ABORT: (("planner", "controller"), "abort", None),
-    Request.STOP: (("plant",), "abort", None),
-    Request.REARM: (("plant",), "rearm", None),
-    Request.RESET: (("plant",), "reset", None),
-    Request.PAUSE: (("plant",), "pause", True),
-    Request.RESUME: (("plant",), "pause", False),
-    Request.PLAY: (("replay",), "pause", False),
-    Request.HOLD: (("replay",), "pause", True),
-}
-"""For each page request: nodes, service name, and request data (None: Trigger)."""
 
 _NODES_WITH_PARAMETERS = ("plant", "planner", "controller")
 
@@ -293,7 +282,7 @@ class ViewerNode(FlightNode):
             return
         self._full_names[key] = name
         # Discovery of a service takes some seconds after its client is created.
-        for keys, service, data in _SERVICE_BY_REQUEST.values():
+        for keys, service, data in SERVICE_BY_REQUEST.values():
             if key in keys:
                 self._client(Trigger if data is None else SetBool, f"{name}/{service}")
         if key in _NODES_WITH_PARAMETERS:
@@ -471,7 +460,7 @@ class ViewerNode(FlightNode):
             )
 
     def _call_service(self, request: Request) -> None:
-        keys, service, data = _SERVICE_BY_REQUEST[request]
+        keys, service, data = SERVICE_BY_REQUEST[request]
         called = False
         for key in keys:
             name = self._full_names.get(key)
