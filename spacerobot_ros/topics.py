@@ -1,4 +1,4 @@
-"""Table of all topics, used by publishers, reports and the documentation.
+"""Table of all topics, used by publishers, reports and the documentation, and requests to a stack.
 
 For the state topics of the plant, the table also lists the values in the messages, as needed
 by the publisher and by the re-simulation of bags. A new state topic needs an entry here
@@ -8,8 +8,9 @@ and a quantity in :mod:`spacerobot_ros.simulation.sensors`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 
 _POSE_MEMBERS = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
 _TWIST_MEMBERS = (*(f"linear.{x}" for x in "xyz"), *(f"angular.{x}" for x in "xyz"))
@@ -501,3 +502,33 @@ def state_topics(end_effectors: Iterable[str] = ()) -> list[Topic]:
     """
     poses = {topic.name: topic for topic in map(pose_topic, end_effectors)}
     return [topic for topic in {**poses, **TOPICS}.values() if topic.state]
+
+
+class Request(Enum):
+    """A request that a service of the stack performs."""
+
+    ABORT = "abort"
+    """The planner and the controller drop their goals; the joints brake."""
+    STOP = "stop"
+    """The joints brake, the thrusters are off, and commands are rejected until ``REARM``."""
+    REARM = "rearm"
+    PAUSE = "pause"
+    RESUME = "resume"
+    RESET = "reset"
+    PLAY = "play"
+    """Continue a replay."""
+    HOLD = "hold"
+    """Pause a replay."""
+
+
+SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
+    Request.ABORT: (("planner", "controller"), "abort", None),
+    Request.STOP: (("plant",), "abort", None),
+    Request.REARM: (("plant",), "rearm", None),
+    Request.RESET: (("plant",), "reset", None),
+    Request.PAUSE: (("plant",), "pause", True),
+    Request.RESUME: (("plant",), "pause", False),
+    Request.PLAY: (("replay",), "pause", False),
+    Request.HOLD: (("replay",), "pause", True),
+}
+"""For each request: nodes, service name, and the value for ``SetBool`` (None: ``Trigger``)."""

@@ -456,7 +456,7 @@ def request_command(request: str, namespace: str) -> None:
     hold, play     pause a replay, and continue
     """
     from spacerobot_ros.session.live import send_request
-    from spacerobot_ros.viewer.state import Request
+    from spacerobot_ros.topics import Request
 
     if not send_request(Request(request), say, namespace=namespace):
         fail()

@@ -51,8 +51,8 @@ from spacerobot_ros.report.flight import (
     FlightReport,
     GoalSpan,
     joint_unit,
+    labels_of,
     pose_errors,
-    trace_labels,
 )
 from spacerobot_ros.report.signals import Indices, thinned
 
@@ -216,7 +216,7 @@ def figure_of_flights(
         )
     if not merged:
         return "This figure shows a single flight: specify one bag."
-    first, labels = figures[0], trace_labels(flights)
+    first, labels = figures[0], labels_of(flights)
     return time_figure(flights[0], first.name, first.heading, first.heading, merged, flights=labels)
 
 

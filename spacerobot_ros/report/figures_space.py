@@ -42,7 +42,7 @@ from spacerobot_ros.report.figures_over_time import (
     draw_group,
     error_group,
 )
-from spacerobot_ros.report.flight import FlightReport, joint_unit, trace_labels
+from spacerobot_ros.report.flight import FlightReport, joint_unit, labels_of
 from spacerobot_ros.report.scene import bodies_of, goal_of_base, is_flat, obstacles_of
 from spacerobot_ros.report.signals import Indices
 from spacerobot_ros.report.solids import (
@@ -76,19 +76,13 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
     scenes = [placed_solids(bodies, instant) for instant in range(len(indices))]
     around = placed_solids(obstacles_of(flight), 0)
     across = min(len(indices), 2 if narrow() else 3)
-    rows = [[1.0] * across for _ in range(0, len(indices), across)]
-    sizes = {"bottom": 0.15, "left": 0.2, "gap": 0.42}
     height = 2.0 if narrow() else 2.9 if across > 2 else 3.9
-    figure, panels = sheet(rows, [height] * len(rows), **sizes)
+    figure, places = _panels(len(indices), across, height, bottom=0.15, left=0.2, gap=0.42)
     points = np.concatenate([corner_points(scene) for scene in scenes])
     view = view_of(flight)
     if (goal := goal_of_base(flight, MAX_MESH_FACES)) is not None:
         points = with_near(points, np.concatenate(outlines(goal)), view)
     points = with_near(points, corner_points(around), view)
-    places = [axes for row in panels for axes in row]
-    for axes in places[len(indices) :]:
-        axes.set_visible(False)
-    places = places[: len(indices)]
     for axes, scene, index in zip(places, scenes, indices, strict=True):
         draw_robot(axes, [*scene, *around], points, view)
         axes.set_title(f"t = {flight.time[index]:.5g} s")
@@ -232,7 +226,7 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     flown = [flight, *(other for other in beside if len(other.time))]
     tints = [_FLIGHT_COLOURS[k % len(_FLIGHT_COLOURS)] for k in range(len(flown))]
     paths = [(each.pose[:, :3], tint) for each, tint in zip(flown, tints, strict=True)]
-    names = trace_labels(flown) if beside else ["base"]
+    names = labels_of(flown) if beside else ["base"]
     keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
     if shows_tool:
         paths.append((flight.tool.values[:, :3], HAND_COLOUR))
@@ -292,20 +286,23 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     return ReportFigure("path", "Paths", caption, figure)
 
 
-def _square_panels(
-    count: int, across: int, stacked: float, beside: float
-) -> tuple[Figure, list[Axes]]:
-    """Return ``count`` panels: stacked in a narrow figure, else ``across`` per row; the heights are
-    ``stacked`` and ``beside``, inches.
-    """
-    if narrow():
-        figure, panels = sheet([[1.0]] * count, [stacked] * count, gap=0.75)
-    else:
-        figure, panels = sheet([[1.0] * across], [beside])
+def _panels(count: int, across: int, height: float, **sizes: float) -> tuple[Figure, list[Axes]]:
+    """Return ``count`` panels with a height in inches, ``across`` per row."""
+    rows = [[1.0] * across for _ in range(0, count, across)]
+    figure, panels = sheet(rows, [height] * len(rows), **sizes)
     places = [axes for row in panels for axes in row]
     for axes in places[count:]:
         axes.set_visible(False)
     return figure, places[:count]
+
+
+def _square_panels(
+    count: int, across: int, stacked: float, beside: float
+) -> tuple[Figure, list[Axes]]:
+    """Return panels that are stacked in a narrow figure, else in a row; heights in inches."""
+    if narrow():
+        return _panels(count, 1, stacked, gap=0.75)
+    return _panels(count, across, beside)
 
 
 _LOOP_JOINTS, _SHOWN_CYCLES = 3, 3

@@ -78,23 +78,6 @@ class FlightReport(Flight):
     bag: FlightBag
     meshes: dict[str, TriangleMesh] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, bag: FlightBag, flight: Flight | None = None) -> FlightReport:
-        """Return the report data of a bag; its flight is read unless it is given.
-
-        Raises
-        ------
-        RecordingError
-            A message is damaged.
-        """
-        flight = since(flight or read_flight(bag), bag.began)
-        attachments = bag.bag.attachments
-        return cls(
-            **{each.name: getattr(flight, each.name) for each in fields(flight)},
-            bag=bag,
-            meshes=meshes_from_attachments(flight.robot, attachments) if flight.robot else {},
-        )
-
     # -- signals ------------------------------------------------------------------------------
 
     @cached_property
@@ -166,12 +149,6 @@ class FlightReport(Flight):
         return self.signal("true_target_pose") or self.signal("target_pose")
 
     # -- names --------------------------------------------------------------------
-
-    @property
-    def label(self) -> str:
-        """Short name that distinguishes several flights: the file name and the method."""
-        path, method = self.bag.path, self.flown_method
-        return f"{path.stem} ({method})" if method else path.name
 
     @property
     def flown_method(self) -> str:
@@ -248,7 +225,7 @@ class FlightReport(Flight):
             for time, status in self.executing
             if (goal := reported_goal(status, self.goals))
         ]
-        return self._targets_until_next(found or _timed_goals(self.goals))
+        return self._targets_until_next(found or [(sent.time, sent.goal) for sent in self.goals])
 
     @property
     def base_goal(self) -> Goal | None:
@@ -312,7 +289,7 @@ class FlightReport(Flight):
     @property
     def tool_targets(self) -> list[GoalSpan]:
         """End-effector goals, each valid until the next goal."""
-        return self._targets_until_next(_timed_goals(self.tool_goals))
+        return self._targets_until_next([(sent.time, sent.goal) for sent in self.tool_goals])
 
     def _targets_until_next(self, goals: list[tuple[float, Goal]]) -> list[GoalSpan]:
         ends = [*(time for time, _ in goals), self.end][1:]
@@ -441,10 +418,6 @@ class FlightReport(Flight):
         return next((joint for joint in joints if joint.name == name), None)
 
 
-def _timed_goals(goals: Sequence[SentGoal]) -> list[tuple[float, Goal]]:
-    return [(sent.time, sent.goal) for sent in goals]
-
-
 def pose_errors(pose: Signal, targets: Sequence[GoalSpan]) -> Signal:
     """Return the goal minus the pose (N, 7) at the M times with a goal: position and rotation
     vector (M, 6)."""
@@ -468,17 +441,23 @@ def read_report(path: Path, namespace: str | None = None) -> FlightReport:
     RecordingError
         There is no such bag or robot, or the bag is damaged.
     """
-    return FlightReport.of(open_flight_bag(path, namespace))
+    bag = open_flight_bag(path, namespace)
+    flight = since(read_flight(bag), bag.began)
+    return FlightReport(
+        **{each.name: getattr(flight, each.name) for each in fields(flight)},
+        bag=bag,
+        meshes=meshes_from_attachments(flight.robot, bag.bag.attachments) if flight.robot else {},
+    )
 
 
-def trace_labels(flights: Sequence[FlightReport]) -> list[str]:
-    """Return a name for each flight: the method or the file name if they differ, or both."""
+def labels_of(flights: Sequence[FlightReport]) -> list[str]:
+    """Return a name for each of several flights: the method, or the file name if methods recur."""
     methods = [each.flown_method for each in flights]
-    stems = [each.bag.path.stem for each in flights]
-    for names in (methods, stems):
+    paths = [each.bag.path for each in flights]
+    for names in (methods, [path.stem for path in paths]):
         if all(names) and len(set(names)) == len(names):
             return names
-    return [each.label for each in flights]
+    return list(map(str, paths))
 
 
 def joint_unit(flight: FlightReport, name: str) -> str:

@@ -13,7 +13,7 @@ from spacerobot_ros.errors import counted, sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.report.events import event_style, event_text
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
-from spacerobot_ros.report.flight import FlightReport, trace_labels
+from spacerobot_ros.report.flight import FlightReport, labels_of
 from spacerobot_ros.report.page_parts import (
     PagePart,
     facts,
@@ -139,7 +139,7 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
         return []
     flights = [flight, *beside]
     parts = ["<h2>Runs side by side</h2>", table("runs", *runs_table(flights))]
-    files = [each.label for each in flights]
+    files = labels_of(flights)
     if goals := different_goals(flights):
         parts += ["<h3>Goals that differ</h3>", table("goals", ("Goal", *files), goals)]
     if rows := different_parameters([each.scenario for each in flights]):
@@ -244,7 +244,7 @@ def charts_of(
         return PagePart()
     charts = {
         "end": max(each.end for each in (flight, *beside)),
-        "charts": [_chart_data(group, trace_labels([flight, *beside])) for group in groups],
+        "charts": [_chart_data(group, labels_of([flight, *beside])) for group in groups],
         "events": _chart_events(flight),
     }
     return PagePart(

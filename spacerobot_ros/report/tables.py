@@ -18,7 +18,7 @@ from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
 from spacerobot_ros.planning.execution.status import PlannerStatus, time_to_end
-from spacerobot_ros.report.flight import FlightReport, joint_unit
+from spacerobot_ros.report.flight import FlightReport, joint_unit, labels_of
 from spacerobot_ros.scenario import Published
 
 _NO_VALUE = "–"
@@ -116,7 +116,7 @@ def runs_table(flights: Sequence[FlightReport]) -> Table:
     ]
     labels = list(dict.fromkeys(label for values in found for label in values))
     rows = [(label, *(values.get(label, _NO_VALUE) for values in found)) for label in labels]
-    return Table(("Flight", *(flight.label for flight in flights)), rows)
+    return Table(("Flight", *labels_of(flights)), rows)
 
 
 def _extreme_values(flight: FlightReport) -> dict[str, str]:

@@ -25,7 +25,7 @@ from spacerobot_ros.report.figures import (
     sheet,
     widen_panels,
 )
-from spacerobot_ros.report.flight import FlightReport, read_report, trace_labels
+from spacerobot_ros.report.flight import FlightReport, labels_of, read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.player import player_of, view_of_flight
 from spacerobot_ros.report.scene import bodies_of, obstacles_of
@@ -102,7 +102,7 @@ def _report_figure(draw: Draw, flights: Sequence[FlightReport]) -> ReportFigure 
     drawn = [figure, *(draw(each) for each in flights[1:])]
     merged = over_time.figure_of_flights(flights, drawn)
     assert isinstance(merged, ReportFigure)
-    first, *others = trace_labels(flights)
+    first, *others = labels_of(flights)
     styles = f"Solid lines: {first}; other line styles: {enumeration(others)}."
     return replace(merged, caption=f"{figure.caption} {styles}")
 

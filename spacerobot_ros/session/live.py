@@ -35,7 +35,7 @@ from spacerobot_ros.session.mission_client import MissionClient
 from spacerobot_ros.session.processes import MultiProcessStack, checked_namespace
 from spacerobot_ros.termination import graceful_shutdown
 from spacerobot_ros.times import SECOND, stamp_to_ns
-from spacerobot_ros.viewer.state import SERVICE_BY_REQUEST, Request
+from spacerobot_ros.topics import SERVICE_BY_REQUEST, Request
 
 
 @contextmanager

@@ -254,8 +254,6 @@ def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Dist
             raise refusal("its frame must be world or link")
         in_link, rest = rest[1] == "link", rest[2:]
     start, end = parse_times(rest, f"the {given[-1]}", now, refusal)
-    if start < 0.0:
-        raise refusal(f"it begins at {start:g} s, before the simulation begins")
     return Disturbance(link, vectors["force"], vectors["torque"], in_link, start, end)
 
 

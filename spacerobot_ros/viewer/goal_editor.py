@@ -45,12 +45,19 @@ def react(register: Callable[[Any], Any], defer: Defer, act: Callable[[Any], Non
     ``register`` is the method ``on_click`` or ``on_update`` of the element. The function is called
     only for user changes, not for values set by the page.
     """
+    react_to_client(register, defer, lambda _, value: act(value))
+
+
+def react_to_client(
+    register: Callable[[Any], Any], defer: Defer, act: Callable[[Any, Any], None]
+) -> None:
+    """Call a function like :func:`react`, with the client (a browser) and the value."""
 
     @register
     async def _(event: Any) -> None:
         if event.client is not None:
-            value = getattr(event.target, "value", None)
-            defer(lambda: act(value))
+            client, value = event.client, getattr(event.target, "value", None)
+            defer(lambda: act(client, value))
 
 
 GOAL_SETTLING_TIME_S = 0.3

@@ -26,9 +26,10 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets
+from spacerobot_ros.topics import Request
 from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.content import RecentItems
-from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor, react
+from spacerobot_ros.viewer.goal_editor import Defer, GoalEditor, react, react_to_client
 from spacerobot_ros.viewer.server import ViewerConfig
 from spacerobot_ros.viewer.state import (
     Action,
@@ -37,7 +38,6 @@ from spacerobot_ros.viewer.state import (
     Measured,
     Notice,
     Part,
-    Request,
     SeekAction,
     StackState,
     goals_from_text,
@@ -634,22 +634,15 @@ class Page:
         look = gui.add_button(
             "Look at the robot", color="gray", hint="Point the camera of this browser at the robot."
         )
-
-        @look.on_click
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                defer(lambda: self._aim_camera(event.client.camera))
-
+        react_to_client(look.on_click, defer, lambda client, _: self._aim_camera(client.camera))
         presets = gui.add_button_group(
             "View from", tuple(_PRESETS), hint="Rotate this browser's camera."
         )
-
-        @presets.on_click
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                offset = _PRESETS[str(event.target.value)]
-                defer(lambda: self._aim_camera(event.client.camera, offset))
-
+        react_to_client(
+            presets.on_click,
+            defer,
+            lambda client, name: self._aim_camera(client.camera, _PRESETS[name]),
+        )
         self._follow: Any = gui.add_checkbox(
             "Follow the robot", initial_value=False, hint="All cameras move with the base."
         )
@@ -666,15 +659,14 @@ class Page:
         async def _(client: Any) -> None:
             defer(lambda: self._aim_camera(client.camera))
 
-        self._style = gui.add_button("Dark or light", color="gray")
+        style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
 
-        @self._style.on_click
-        async def _(event: Any) -> None:
-            if event.client is not None:
-                dark = not themes.get(event.client.client_id, self._config.dark)
-                themes[event.client.client_id] = dark
-                event.client.gui.configure_theme(dark_mode=dark, **_THEME)
+        def switch_theme(client: Any, _: Any) -> None:
+            dark = themes[client.client_id] = not themes.get(client.client_id, self._config.dark)
+            client.gui.configure_theme(dark_mode=dark, **_THEME)
+
+        react_to_client(style.on_click, defer, switch_theme)
 
     # -- the robot and its goal -----------------------------------------------------------------
 

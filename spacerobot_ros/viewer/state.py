@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from spacerobot_ros.planning.execution.goal_file import (
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.simulation.clearance import ClearanceStatus
 from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.topics import Request
 
 
 @dataclass(frozen=True)
@@ -165,36 +165,6 @@ class Notice:
     level: int = 0
     time_s: float | None = None
     source: str = ""
-
-
-class Request(Enum):
-    """A request that a service of the stack performs."""
-
-    ABORT = "abort"
-    """The planner and the controller drop their goals; the joints brake."""
-    STOP = "stop"
-    """The joints brake, the thrusters are off, and commands are rejected until ``REARM``."""
-    REARM = "rearm"
-    PAUSE = "pause"
-    RESUME = "resume"
-    RESET = "reset"
-    PLAY = "play"
-    """Continue a replay."""
-    HOLD = "hold"
-    """Pause a replay."""
-
-
-SERVICE_BY_REQUEST: Mapping[Request, tuple[tuple[str, ...], str, bool | None]] = {
-    Request.ABORT: (("planner", "controller"), "abort", None),
-    Request.STOP: (("plant",), "abort", None),
-    Request.REARM: (("plant",), "rearm", None),
-    Request.RESET: (("plant",), "reset", None),
-    Request.PAUSE: (("plant",), "pause", True),
-    Request.RESUME: (("plant",), "pause", False),
-    Request.PLAY: (("replay",), "pause", False),
-    Request.HOLD: (("replay",), "pause", True),
-}
-"""For each request: nodes, service name, and the value for ``SetBool`` (None: ``Trigger``)."""
 
 
 @dataclass(frozen=True)

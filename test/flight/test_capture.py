@@ -25,14 +25,14 @@ from spacerobot_ros.flight.captures import (
 )
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
-from spacerobot_ros.flight.reading import namespaces, open_flight_bag, read_run
+from spacerobot_ros.flight.reading import namespaces, read_run
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.model.description import Inertia
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.payload_estimation import PAYLOAD_PARAMETERS
-from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.tables import headline
 from spacerobot_ros.scenario import load_scenario
 
@@ -502,7 +502,7 @@ def test_a_goal_without_its_automatic_capture_is_not_complete(capture: Flight) -
 
 
 def test_a_report_has_a_card_of_the_capture() -> None:
-    report = FlightReport.of(open_flight_bag(BAGS / "capture.mcap"))
+    report = read_report(BAGS / "capture.mcap")
     cards = {label: (value, note) for label, value, note in headline(report)}
     value, note = cards["Target captured"]
     (time,) = [each.time_s for each in report.events if each.kind is EventKind.CAPTURED]
@@ -510,5 +510,5 @@ def test_a_report_has_a_card_of_the_capture() -> None:
     assert note == "< 1 µm from the grapple"
     report = replace(report, events=())
     assert ("Target captured", "no") in {card[:2] for card in headline(report)}
-    without = FlightReport.of(open_flight_bag(BAGS / "servicer.mcap"))
+    without = read_report(BAGS / "servicer.mcap")
     assert "Target captured" not in {label for label, _, _ in headline(without)}

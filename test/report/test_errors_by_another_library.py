@@ -33,7 +33,7 @@ from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
-from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.scenario import load_scenario
@@ -172,7 +172,7 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     (metrics,) = metrics_of_each([flight.measured(clearance=False)], flight.robot)
     same(metrics["position_error_m"], metrics["attitude_error_rad"], 9)
 
-    report = FlightReport.of(open_flight_bag(bag))
+    report = read_report(bag)
     texts = Cells(page(report, PagePart(""), [])).texts
     cards = texts[texts.index("Position error") :], texts[texts.index("Attitude error") :]
     near, turned = (" ".join(x.strip() for x in card[:5]) for card in cards)
@@ -211,7 +211,7 @@ def assert_all_say_of_the_end_effector(bag: Path, flight: Flight) -> None:
     assert flight.robot is not None
     (metrics,) = metrics_of_each([flight.measured(clearance=False)], flight.robot)
     assert metrics["end_effector_position_error_m"] == pytest.approx(distance, rel=1e-9)
-    report = FlightReport.of(open_flight_bag(bag))
+    report = read_report(bag)
     texts = Cells(page(report, PagePart(""), [])).texts
     card = " ".join(texts[texts.index("End-effector error") :][:3])
     lines = _summary_lines(summary | {"plan_time_s": 0.0, "wall_time_s": 1.0})
@@ -325,7 +325,7 @@ def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_pa
         assert not each.verdict.complete
         assert each.verdict.word == "Reached according to the measured pose"
     assert_all_say(bag, read, position_counts=True)
-    report = page(FlightReport.of(open_flight_bag(bag)), PagePart(""), [])
+    report = page(read_report(bag), PagePart(""), [])
     outcome = "<b>Reached according to the measured pose</b>"
     assert f'<p class="outcome reached partly">{outcome}' in report
     command = CliRunner().invoke(main, ["run", "faults/biased_pose", "--bag", f"{bag}.again"])

@@ -95,10 +95,10 @@ FORM = (
         ("hand force 1 2 3 torque 0 0 -1.1e6", "components of its torque must be at most 1e+06"),
         ("hand force 1 2 3 in space", "its frame must be world or link"),
         ("hand force 1 2 3 in", "its frame must be world or link"),
-        ("hand force 1 2 3 at -1", "it begins at -1 s, before the simulation begins"),
+        ("hand force 1 2 3 at -1", "its time is -1 s but must be from 0 to 1e+09 s"),
         ("hand force 1 2 3 at 5 until 5", "it ends at 5 s but begins at 5 s"),
         ("hand force 1 2 3 at nan", "'nan' is not a finite number"),
-        ("hand force 1 2 3 until 2e9", "its time is 2e+09 s but must be at most 1e+09 s"),
+        ("hand force 1 2 3 until 2e9", "its time is 2e+09 s but must be from 0 to 1e+09 s"),
         (
             "hand torque 1 2 3 for 5",
             "only 'at SECONDS' and 'until SECONDS' may follow the torque",

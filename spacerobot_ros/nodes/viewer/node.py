@@ -41,7 +41,7 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.times import LATEST_NS, SECOND
-from spacerobot_ros.topics import goal_topic
+from spacerobot_ros.topics import SERVICE_BY_REQUEST, Request, goal_topic
 from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.page import Page
 from spacerobot_ros.viewer.reachability import (
@@ -62,13 +62,11 @@ from spacerobot_ros.viewer.server import (
     url_of,
 )
 from spacerobot_ros.viewer.state import (
-    SERVICE_BY_REQUEST,
     Action,
     FlyAction,
     InjectAction,
     Notice,
     Part,
-    Request,
     SeekAction,
     StackState,
 )
