@@ -445,7 +445,7 @@ def goal_command(
 )
 @click.option("--namespace", default="", help="Namespace of the stack.")
 def request_command(request: str, namespace: str) -> None:
-    """Send a REQUEST to a running stack: one of the buttons on its page.
+    """Abort, stop, rearm, pause or reset a running stack.
 
     \b
     abort          abandon the goal; the joints brake

@@ -335,7 +335,7 @@ def log_html(notices: Iterable[Notice]) -> str:
         color = _LEVEL_COLORS[notice.level] if notice.level else "inherit"
         rows.append(
             f'<div style="margin:2px 0"><span style="color:{_FAINT_COLOR}">{time} '
-            f'{escape(notice.source)}</span> <span style="color:{color}">'
+            f'{escape(notice.source.strip("/"))}</span> <span style="color:{color}">'
             f"{escape(notice.message)}</span></div>"
         )
     return padded("".join(rows) or "No events yet.")
