@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 from support.nodes_apart import START, NodeProcess
@@ -188,3 +189,13 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(
     (sentence,) = (line for line in recorder.said.splitlines() if "has ended" in line)
     assert_one_sentence(sentence, str(bag))
     assert "Traceback" not in recorder.said
+
+
+def test_two_nodes_with_one_name_warn_each_other(start: Start, harness: Harness) -> None:
+    first = start("plant", FAST)
+    probe = harness.probe({"heartbeat": DiagnosticStatus})
+    harness.spin_until(lambda: probe.count("heartbeat") > 5)
+    assert "Another node" not in first.said
+    second = start("plant", {"robot": "planar_manipulator"})
+    warning = "Another node '/plant' runs in this ROS domain"
+    harness.spin_until(lambda: warning in first.said and warning in second.said, timeout=START)

@@ -88,13 +88,13 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
         assert window.evaluate("flightCharts.charts.length") >= 5
         assert window.evaluate("document.querySelectorAll('.lane').length") == 1
         below = lanes(window)
-        for words in FAULTS.get(Path(name).name, ()):
-            assert any(words in text for text in below), (words, below)
-        assert any("goal" in text for text in below)
-        if EventKind.FAULT_INJECTED in kinds:
-            assert any(text.startswith("fault on: ") for text in below)
-        if EventKind.STUCK_JOINT in kinds:
-            assert any(text.startswith("stuck joint: ") for text in below)
+        expected = {"goal", *FAULTS.get(Path(name).name, ())}
+        expected |= {"fault on: "} if EventKind.FAULT_INJECTED in kinds else set()
+        expected |= {"stuck joint: "} if EventKind.STUCK_JOINT in kinds else set()
+        for words in expected:
+            # On a phone, only the kind of an event may fit.
+            shown = words if width > 600 else words.split(":")[0]
+            assert any(shown in text for text in below), (width, words, below)
 
 
 def lanes(window: Browser) -> list[Any]:

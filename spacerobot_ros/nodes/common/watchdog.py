@@ -32,6 +32,11 @@ suspended.
 """
 
 _REPORT_PERIOD = 1.0  # wall s, while a node is silent
+
+_TOLERATED_ECHOES = 2
+"""Heartbeats with the name of a node that may exceed those that it has sent, such as the last ones
+of a process that it replaces."""
+
 HEARTBEAT_QOS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -146,6 +151,8 @@ class Liveness:
         self._timeout = 0.0
         self._busy = 0
         """Number of running computations that may take a long time."""
+        self._foreign = 0
+        """Heartbeats received with the name of this node, minus those that it has sent."""
 
     def configure(self, timeout: float) -> None:
         """Subscribe to heartbeats and create the diagnostics publisher; a cleanup destroys both.
@@ -198,14 +205,23 @@ class Liveness:
 
     def _publish(self, pulse: HeartbeatState) -> None:
         name = self._node.get_fully_qualified_name()
+        self._foreign -= 1
         self._publisher.publish(
             DiagnosticStatus(name=name, message=pulse.value, hardware_id=self._role)
         )
 
     def _on_heartbeat(self, received: DiagnosticStatus) -> None:
         watchdog, message = self._watchdog, read_status(received)
-        own = message.name == self._node.get_fully_qualified_name()
-        if watchdog is None or own or message.hardware_id not in self._watched:
+        if message.name == self._node.get_fully_qualified_name():
+            self._foreign += 1
+            if self._foreign > _TOLERATED_ECHOES:
+                self._node.get_logger().warning(
+                    f"Another node '{message.name}' runs in this ROS domain: end it, or give one "
+                    "of the two another namespace or ROS_DOMAIN_ID.",
+                    once=True,
+                )
+            return
+        if watchdog is None or message.hardware_id not in self._watched:
             return
         back = watchdog.hear(message.name, message.message)
         if back is not None:
