@@ -155,13 +155,14 @@ def verify_bag(
         # An earlier version did not compute servo efforts, and published zeros.
         resimulation.states["effort"][:] = 0.0
     published = [p for p in published if p.is_determined_by(resimulation.states)]
-    missing = _missing_states(flight, published, resimulation)
+    missing = _missing_states(resimulation, published)
     if first > 0:
         # The first state is an input: the commands before it are not in the bag.
         published = [p.after(first) for p in published]
-    _require_no_reset(flight, published, resimulation)
-    found = _Comparison(flight, published, resimulation, tolerance).result()
-    return replace(found, missing=missing, second_opinion=_second_opinion(resimulation, published))
+    _require_no_reset(resimulation, published)
+    return _compare(
+        resimulation, published, tolerance, missing, _second_opinion(resimulation, published)
+    )
 
 
 # -- the contents of the bag ------------------------------------------------------------------
@@ -233,6 +234,9 @@ class _RecordedPlant:
     @property
     def path(self) -> Path:
         return self.recorded.path
+
+    def format_time(self, tick: int) -> str:
+        return f"{tick * self.config.period_ns / SECOND:.9g} s"
 
 
 def _injections(recorded: FlightBag, topic: str, period_ns: int) -> dict[int, list[str]]:
@@ -373,29 +377,21 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
     return published
 
 
-def _missing_states(
-    flight: _RecordedPlant, published: list[_PublishedTopic], resimulation: _Resimulation
-) -> str:
+def _missing_states(resimulation: _Resimulation, published: list[_PublishedTopic]) -> str:
     """Return a message about states that the bag lacks; empty for none."""
-    recorded = flight.recorded
+    recorded = resimulation.flight.recorded
     counts = recorded.metadata.get("recorder", {})
-    written, lost = (_parse_count(counts.get(name)) for name in ("messages", "messages_lost"))
+    texts = (counts.get(name, "") for name in ("messages", "messages_lost"))
+    written, lost = (int(text) if text.isdecimal() else 0 for text in texts)
     held = recorded.bag.message_count()
     if resimulation.first == 0 and written > held:
         return f"its recorder wrote {written} messages, but it contains {held}."
     states = {int(t) for p in published if p.topic.name == "joint_states" for t in p.ticks}
     lacking = {tick for tick in resimulation.commanded_ticks if tick >= resimulation.first} - states
     if len(lacking) > lost:
-        time = min(lacking) * flight.config.period_ns / SECOND
-        return (
-            f"it has commands for {len(lacking)} states that are missing, the first at "
-            f"{time:.9g} s."
-        )
+        time = resimulation.flight.format_time(min(lacking))
+        return f"it has commands for {len(lacking)} states that are missing, the first at {time}."
     return ""
-
-
-def _parse_count(text: str | None) -> int:
-    return int(text) if text is not None and text.isdecimal() else 0
 
 
 def _initial_state(
@@ -445,6 +441,7 @@ class _Resimulation:
     that was run in parallel.
     """
 
+    flight: _RecordedPlant
     first: int
     end: int
     states: dict[str, Array]
@@ -485,7 +482,7 @@ def _resimulate(
         joints.command[joints.kept] = rates[joints.kept]
     recorded = [flight.commands(source) for source in commands.sources]
     states: dict[str, Array] = {}
-    done = _Resimulation(first, last, states, frozenset(recorded[0]))
+    done = _Resimulation(flight, first, last, states, frozenset(recorded[0]))
     if mujoco and plant.capturing is not None:
         raise SpaceRobotError(
             f"The bag {flight.path} has a target, whose capture MuJoCo does not model: verify it "
@@ -543,9 +540,7 @@ def _second_opinion(
     return resimulation.engine.comparison(ticks, odom.values[rows, :7], joints.values[columns, :n])
 
 
-def _require_no_reset(
-    flight: _RecordedPlant, published: list[_PublishedTopic], resimulation: _Resimulation
-) -> None:
+def _require_no_reset(resimulation: _Resimulation, published: list[_PublishedTopic]) -> None:
     """Reject a bag in which a state is published twice, the second time as the initial state."""
     for p in published:
         if p.topic.name != "joint_states" or not p.values.shape[1]:
@@ -555,105 +550,102 @@ def _require_no_reset(
         back: NDArray[np.bool_] = np.all(near, axis=1)
         repeated = np.flatnonzero((np.diff(p.ticks) <= 0) & back[1:] & ~back[:-1])
         if repeated.size:
-            time = p.ticks[repeated[0] + 1] * flight.config.period_ns / SECOND
+            time = resimulation.flight.format_time(p.ticks[repeated[0] + 1])
             raise RecordingError(
-                f"In the bag {flight.path} the plant was reset at {time:.9g} s; only flights "
-                "without a reset can be verified."
+                f"In the bag {resimulation.flight.path} the plant was reset at {time}; only "
+                "flights without a reset can be verified."
             )
 
 
 # -- comparison -------------------------------------------------------------------------------
 
 
-class _Comparison:
-    def __init__(
-        self,
-        flight: _RecordedPlant,
-        published: list[_PublishedTopic],
-        resimulation: _Resimulation,
-        tolerance: float,
-    ) -> None:
-        self._flight, self._resimulation, self._tolerance = flight, resimulation, tolerance
-        self._period = flight.config.period_ns
-        self._pairs = [(p, *self._deviation(p)) for p in published]
+def _compare(
+    done: _Resimulation,
+    published: list[_PublishedTopic],
+    tolerance: float,
+    missing: str,
+    second_opinion: EngineComparison | None,
+) -> Verification:
+    compared = [(p, *_deviation(p, done)) for p in published]
+    found: tuple[int, Difference] | None = None
+    for p, expected, deviation in compared:
+        # Not "greater": NaN is a difference.
+        wrong = ~(deviation <= tolerance)
+        rows = np.flatnonzero(wrong.any(axis=1))
+        if not rows.size:
+            continue
+        row = int(rows[np.argmin(p.ticks[rows])])
+        tick = int(p.ticks[row])
+        if found is None or tick < found[0]:
+            column = int(np.flatnonzero(wrong[row])[0])
+            found = (
+                tick,
+                _difference_at(done, p, expected, row, column, _command_remark(done, tick)),
+            )
+    end = np.inf if found is None else found[0]
+    largest, largest_at = 0.0, None
+    for p, expected, deviation in compared:
+        before = p.ticks < end
+        counted = np.where(before[:, np.newaxis], deviation, 0.0)
+        if counted.size and counted.max() > largest:
+            row, column = map(int, np.unravel_index(int(counted.argmax()), counted.shape))
+            largest = float(counted.max())
+            largest_at = _difference_at(done, p, expected, row, column)
+    ticks = done.end - done.first
+    return Verification(
+        ticks=ticks,
+        duration=ticks * done.flight.config.period_ns / SECOND,
+        messages=sum(len(p.ticks) for p in published),
+        topics=tuple(p.name for p in published),
+        largest=largest,
+        largest_at=largest_at,
+        difference=None if found is None else found[1],
+        missing=missing,
+        second_opinion=second_opinion,
+    )
 
-    def result(self) -> Verification:
-        difference = self._first_difference()
-        end = np.inf if difference is None else round(difference.time * SECOND / self._period)
-        largest, largest_at = 0.0, None
-        for p, expected, deviation in self._pairs:
-            before = p.ticks < end
-            counted = np.where(before[:, np.newaxis], deviation, 0.0)
-            if counted.size and counted.max() > largest:
-                row, column = map(int, np.unravel_index(int(counted.argmax()), counted.shape))
-                largest = float(counted.max())
-                largest_at = self._difference_at(p, expected, row, column)
-        ticks = self._resimulation.end - self._resimulation.first
-        return Verification(
-            ticks=ticks,
-            duration=ticks * self._period / SECOND,
-            messages=sum(len(p.ticks) for p, _, _ in self._pairs),
-            topics=tuple(p.name for p, _, _ in self._pairs),
-            largest=largest,
-            largest_at=largest_at,
-            difference=difference,
-        )
 
-    def _deviation(self, p: _PublishedTopic) -> tuple[Array, Array]:
-        """Return the expected values and the deviations, both in the shape of the bag's values."""
-        rows = np.minimum(p.ticks, self._resimulation.end) - self._resimulation.first
-        expected = p.expected(self._resimulation.states, rows)
-        deviation = np.abs(p.values - expected) / np.maximum(1.0, np.abs(expected))
-        deviation[p.ticks > self._resimulation.end] = np.nan
-        return expected, deviation
+def _deviation(p: _PublishedTopic, done: _Resimulation) -> tuple[Array, Array]:
+    """Return the expected values and the deviations, both in the shape of the bag's values."""
+    expected = p.expected(done.states, np.minimum(p.ticks, done.end) - done.first)
+    deviation = np.abs(p.values - expected) / np.maximum(1.0, np.abs(expected))
+    deviation[p.ticks > done.end] = np.nan
+    return expected, deviation
 
-    def _first_difference(self) -> Difference | None:
-        found: tuple[int, Difference] | None = None
-        for p, expected, deviation in self._pairs:
-            # Not "greater": NaN is a difference.
-            wrong = ~(deviation <= self._tolerance)
-            rows = np.flatnonzero(wrong.any(axis=1))
-            if not rows.size:
-                continue
-            row = int(rows[np.argmin(p.ticks[rows])])
-            tick = int(p.ticks[row])
-            if found is None or tick < found[0]:
-                column = int(np.flatnonzero(wrong[row])[0])
-                found = (
-                    tick,
-                    self._difference_at(p, expected, row, column, self._command_remark(tick)),
-                )
-        return found[1] if found else None
 
-    def _difference_at(
-        self, p: _PublishedTopic, expected: Array, row: int, column: int, remark: str = ""
-    ) -> Difference:
-        return Difference(
-            float(p.ticks[row] * self._period / SECOND),
-            p.name,
-            p.labels[column],
-            float(p.values[row, column]),
-            float(expected[row, column]),
-            remark,
-        )
+def _difference_at(
+    done: _Resimulation,
+    p: _PublishedTopic,
+    expected: Array,
+    row: int,
+    column: int,
+    remark: str = "",
+) -> Difference:
+    return Difference(
+        float(p.ticks[row] * done.flight.config.period_ns / SECOND),
+        p.name,
+        p.labels[column],
+        float(p.values[row, column]),
+        float(expected[row, column]),
+        remark,
+    )
 
-    def _command_remark(self, tick: int) -> str:
-        """Return a clause on why the commands of a tick had no effect; empty if they had one."""
-        done, before = self._resimulation, tick - 1
-        if tick > done.end:
-            return f" (its plant had stopped: {done.stopped.rstrip('.')})"
-        if done.latched is not None and tick > done.latched:
-            time = self._format_time(done.latched)
-            return f" (a fault latched at {time}; rearming is not recorded)"
-        if before in done.refusals:
-            topic, refusal = done.refusals[before]
-            name = f"{self._flight.recorded.namespace}/{topic}"
-            stamp = self._format_time(before)
-            return f" (the command on {name} stamped {stamp} is rejected: {refusal.clause})"
-        if tick > done.first and before not in done.commanded_ticks:
-            name = f"{self._flight.recorded.namespace}/joint_commands"
-            return f" (no message on {name} is stamped {self._format_time(before)})"
-        return ""
 
-    def _format_time(self, tick: int) -> str:
-        return f"{tick * self._period / SECOND:.9g} s"
+def _command_remark(done: _Resimulation, tick: int) -> str:
+    """Return a clause on why the commands of a tick had no effect; empty if they had one."""
+    flight, before = done.flight, tick - 1
+    if tick > done.end:
+        return f" (its plant had stopped: {done.stopped.rstrip('.')})"
+    if done.latched is not None and tick > done.latched:
+        time = flight.format_time(done.latched)
+        return f" (a fault latched at {time}; rearming is not recorded)"
+    if before in done.refusals:
+        topic, refusal = done.refusals[before]
+        name = f"{flight.recorded.namespace}/{topic}"
+        stamp = flight.format_time(before)
+        return f" (the command on {name} stamped {stamp} is rejected: {refusal.clause})"
+    if tick > done.first and before not in done.commanded_ticks:
+        name = f"{flight.recorded.namespace}/joint_commands"
+        return f" (no message on {name} is stamped {flight.format_time(before)})"
+    return ""

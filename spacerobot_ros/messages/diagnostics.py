@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,9 +15,6 @@ from spacerobot_ros.simulation.status import latched_text
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import LATEST_NS
 
-PROPELLANT_KEY = "propellant_kg"
-"""Key of the propellant consumption."""
-
 _MOMENTUM_ROUNDING = 1e-9
 """Largest changes of linear and angular momentum due to rounding, divided by the mass, m/s and
 m^2/s."""
@@ -24,6 +22,9 @@ m^2/s."""
 _MILLISECONDS = 1e3
 
 _OK, _WARN, _ERROR = 0, 1, 2
+
+_Content: TypeAlias = tuple[int, str, Mapping[str, object]]
+"""Level, message and values of a record."""
 
 
 def diagnostic_name(node: str, part: str) -> str:
@@ -127,30 +128,24 @@ class PlantDiagnostics:
         """Return the current diagnostics."""
         before, self._reported = self._reported, self._counters()
         refused, limited = (now != then for now, then in zip(self._reported, before, strict=True))
+        plant, real_time = self._plant, self._real_time
+        parts = {
+            "commands": self._of_commands(refused=refused),
+            "actuators": self._of_actuators(limited=limited),
+            "strokes": self._of_strokes(),
+            "momentum": self._of_momentum(),
+            "faults": self._of_faults(),
+        }
+        if plant.thrusters is not None:
+            parts["thrusters"] = self._of_thrusters(plant.thrusters)
+        robot = plant.robot.description.name
         found = [
-            self._of_commands(refused=refused),
-            self._of_actuators(limited=limited),
-            self._of_strokes(),
-            self._of_momentum(),
-            self._of_faults(),
+            _record(diagnostic_name(self._node, part), *content, robot)
+            for part, content in parts.items()
         ]
-        if self._plant.thrusters is not None:
-            found.append(self._of_thrusters(self._plant.thrusters))
-        if self._real_time is not None:
-            found.append(
-                timing_record(self._node, self._plant.robot.description.name, self._real_time)
-            )
+        if real_time is not None:
+            found.append(timing_record(self._node, robot, real_time))
         return found
-
-    def _record(
-        self, part: str, level: int, message: str, values: Mapping[str, object]
-    ) -> StatusRecord:
-        name, robot = diagnostic_name(self._node, part), self._plant.robot.description.name
-        return _record(name, level, message, values, robot)
-
-    @property
-    def _ticks_lost(self) -> int:
-        return self._real_time.ticks_lost if self._real_time is not None else 0
 
     def _counters(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the counters that determine the levels of command and actuator diagnostics."""
@@ -160,7 +155,11 @@ class PlantDiagnostics:
             tuple(int(n) for counts in limits for n in counts),
         )
 
-    def _of_commands(self, *, refused: bool) -> StatusRecord:
+    @property
+    def _ticks_lost(self) -> int:
+        return self._real_time.ticks_lost if self._real_time is not None else 0
+
+    def _of_commands(self, *, refused: bool) -> _Content:
         commands = self._commands
         level, message = _WARN if refused else _OK, "commands arrive"
         if not commands.in_force:
@@ -170,78 +169,61 @@ class PlantDiagnostics:
             message = f"{latched_text(commands.fault)}."
         elif refused and self._last_refusal:
             message = self._last_refusal
-        return self._record(
-            "commands",
-            level,
-            message,
-            {
-                "refused": commands.counts.total(),
-                **{f"refused.{reason.value}": n for reason, n in commands.counts.items()},
-                "latched_fault": commands.fault,
-                "timeouts": self.command_timeouts,
-                "deadlines_missed": self._ticks_lost,
-            },
-        )
+        values = {
+            "refused": commands.counts.total(),
+            **{f"refused.{reason.value}": n for reason, n in commands.counts.items()},
+            "latched_fault": commands.fault,
+            "timeouts": self.command_timeouts,
+            "deadlines_missed": self._ticks_lost,
+        }
+        return level, message, values
 
-    def _of_actuators(self, *, limited: bool) -> StatusRecord:
-        return self._record(
-            "actuators",
-            _WARN if limited else _OK,
-            "joints are limited by the URDF" if limited else "within limits",
-            {
-                f"{what}_limited.{joint}": count
-                for what, counts in self._plant.limit_counts.items()
-                for joint, count in zip(self._plant.robot.joint_names, counts, strict=True)
-            },
-        )
+    def _of_actuators(self, *, limited: bool) -> _Content:
+        counts = {
+            f"{what}_limited.{joint}": count
+            for what, counts in self._plant.limit_counts.items()
+            for joint, count in zip(self._plant.robot.joint_names, counts, strict=True)
+        }
+        if limited:
+            return _WARN, "joints are limited by the URDF", counts
+        return _OK, "within limits", counts
 
-    def _of_strokes(self) -> StatusRecord:
+    def _of_strokes(self) -> _Content:
         robot, q = self._plant.robot, self._plant.q
         margins = np.minimum(q - robot.lower, robot.upper - q)
-        return self._record(
-            "strokes",
-            _OK,
-            "distance of each joint from its nearer limit, m or rad",
-            {
-                joint: f"{margin:.6g}"
-                for joint, margin in zip(robot.joint_names, margins, strict=True)
-            },
-        )
+        values = {
+            joint: f"{margin:.6g}" for joint, margin in zip(robot.joint_names, margins, strict=True)
+        }
+        return _OK, "distance of each joint from its nearer limit, m or rad", values
 
-    def _of_momentum(self) -> StatusRecord:
+    def _of_momentum(self) -> _Content:
         plant = self._plant
         change = plant.momentum[:6] - plant.expected_momenta
         linear, angular = np.linalg.norm(change[:3]), np.linalg.norm(change[3:])
+        values = {
+            "linear_change": f"{linear:.3e}",
+            "angular_change": f"{angular:.3e}",
+            "kinetic_energy_J": f"{plant.momentum[6]:.6e}",
+        }
         # The threshold exceeds rounding errors of bodies that move at up to 1 m/s.
         leaks = max(linear, angular) > _MOMENTUM_ROUNDING * plant.robot.total_mass
-        return self._record(
-            "momentum",
-            _ERROR if leaks else _OK,
-            "momentum changes that no thruster accounts for"
-            if leaks
-            else "momentum is accounted for",
-            {
-                "linear_change": f"{linear:.3e}",
-                "angular_change": f"{angular:.3e}",
-                "kinetic_energy_J": f"{plant.momentum[6]:.6e}",
-            },
-        )
+        if leaks:
+            return _ERROR, "momentum changes that no thruster accounts for", values
+        return _OK, "momentum is accounted for", values
 
-    def _of_faults(self) -> StatusRecord:
-        active = [str(each) for each in self._plant.injected]
-        faults, disturbances = (
-            [str(each) for each in given]
-            for given in (self._plant.active, self._plant.disturbances)
-        )
-        return self._record(
-            "faults",
-            _WARN if active else _OK,
-            f"injected: {'; '.join(active)}" if active else "no fault is injected",
-            {f"fault_{i}": fault for i, fault in enumerate(faults, 1)}
-            | {f"disturbance_{i}": each for i, each in enumerate(disturbances, 1)},
-        )
+    def _of_faults(self) -> _Content:
+        plant, active = self._plant, "; ".join(map(str, self._plant.injected))
+        given = {"fault": plant.active, "disturbance": plant.disturbances}
+        values = {
+            f"{kind}_{i}": str(each)
+            for kind, those in given.items()
+            for i, each in enumerate(those, 1)
+        }
+        if active:
+            return _WARN, f"injected: {active}", values
+        return _OK, "no fault is injected", values
 
-    def _of_thrusters(self, thrusters: ThrusterPlant) -> StatusRecord:
+    def _of_thrusters(self, thrusters: ThrusterPlant) -> _Content:
         """Return propellant, pulses and unmet wrenches; a warning if there are new unmet
         wrenches."""
         modulator = thrusters.modulator
@@ -251,22 +233,19 @@ class PlantDiagnostics:
         if unmet:
             sentences.append("the requested wrench exceeds the available thrust")
         force, torque = np.linalg.norm(modulator.unmet[:3]), np.linalg.norm(modulator.unmet[3:])
-        return self._record(
-            "thrusters",
-            _WARN if sentences else _OK,
-            "; ".join(sentences) or "the requested wrench is produced",
-            {
-                PROPELLANT_KEY: f"{thrusters.propellant:.9g}",
-                "pulses": int(modulator.pulses.sum()),
-                "unmet_ticks": modulator.unmet_periods,
-                "unmet_force_N": f"{force:.6g}",
-                "unmet_torque_Nm": f"{torque:.6g}",
-                **{
-                    f"pulses.{name}": count
-                    for name, count in zip(thrusters.table.names, modulator.pulses, strict=True)
-                },
+        values = {
+            "propellant_kg": f"{thrusters.propellant:.9g}",
+            "pulses": int(modulator.pulses.sum()),
+            "unmet_ticks": modulator.unmet_periods,
+            "unmet_force_N": f"{force:.6g}",
+            "unmet_torque_Nm": f"{torque:.6g}",
+            **{
+                f"pulses.{name}": count
+                for name, count in zip(thrusters.table.names, modulator.pulses, strict=True)
             },
-        )
+        }
+        message = "; ".join(sentences) or "the requested wrench is produced"
+        return _WARN if sentences else _OK, message, values
 
 
 def timing_record(node: str, robot: str, real_time: RealTime) -> StatusRecord:
