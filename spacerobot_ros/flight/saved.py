@@ -32,8 +32,9 @@ from spacerobot_ros.messages.builders import (
     trajectory_message,
 )
 from spacerobot_ros.messages.diagnostics import encode_diagnostics
-from spacerobot_ros.messages.layout import encode, stamped_copies
+from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.markers import RobotMarkers, goal_markers
+from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -204,9 +205,11 @@ def _stamped_stream(
 ) -> _Stream:
     """Return a stream of copies of a message with other stamps and numbers."""
 
+    template = MessageTemplate(topic.type, message)
+
     def copies(rows: slice) -> list[bytes]:
         chosen = {path: values[rows] for path, values in columns.items()}
-        return stamped_copies(message, topic.type, stamps[rows], chosen)
+        return template.copies(stamps[rows], chosen)
 
     return _Stream(topic, stamps, copies)
 

@@ -41,14 +41,10 @@ DTYPES = {
 ENCAPSULATION = 4
 """Length of the CDR header, bytes; alignment is relative to the end of the header."""
 
-BIG_ENDIAN, LITTLE_ENDIAN = b"\x00\x00", b"\x00\x01"
-"""First two bytes of a CDR message in either byte order."""
+LITTLE_ENDIAN = b"\x00\x01"
+"""First two bytes of a little-endian CDR message."""
 
 _TIME_TYPES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-
-
-class TooLongError(Exception):
-    """A list of strings or messages has more elements than the layout reader allows."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +84,6 @@ class Layout:
     elements
         Whether to include the fields inside lists, with paths such as
         ``markers[2].pose.position.x``.
-    max_elements
-        Largest number of strings or messages in a list.
 
     Attributes
     ----------
@@ -114,8 +108,6 @@ class Layout:
     ------
     IndexError
         The message ends before its last field.
-    TooLongError
-        A list has more strings or messages than ``max_elements``.
     """
 
     def __init__(
@@ -125,7 +117,6 @@ class Layout:
         fields: Fields | None = None,
         *,
         elements: bool = False,
-        max_elements: float = math.inf,
     ) -> None:
         self.leaves: dict[str, Leaf] = {}
         self.counts: dict[str, int] = {}
@@ -135,7 +126,7 @@ class Layout:
         self.lengths: list[int] = []
         self.fixed: list[tuple[int, int]] = []
         self.end = ENCAPSULATION
-        self._message, self._elements, self._max_elements = message, elements, max_elements
+        self._message, self._elements = message, elements
         self._fields = fields_of(type_name) if fields is None else fields
         self._walk(type_name, "")
 
@@ -158,10 +149,6 @@ class Layout:
         if kind == Nodetype.BASE and detail[0] != "string":
             self._add_numbers(DTYPES[detail[0]], path, (count,))
             return
-        if count > self._max_elements:
-            raise TooLongError(
-                f"it has a list of {count} entries, more than {self._max_elements:.0f}"
-            )
         begin, inner = self.end, None
         for i in range(count):
             if self._elements and path is not None:
@@ -330,36 +317,6 @@ def encode_list(
         begin = layout.leaves[f"{name}[2].{path}"].offset - second
         rows[:, begin : begin + size] = data[1:]
     return bytes(head) + rows.tobytes() + raw[third:]
-
-
-def stamped_copies(
-    prototype: bytes,
-    type_name: str,
-    stamps_ns: NDArray[np.int64],
-    columns: Mapping[str, NDArray[np.float64]],
-) -> list[bytes]:
-    """Return copies of a message with new stamps and values.
-
-    Parameters
-    ----------
-    prototype, type_name
-        The message; its lists must have their final lengths.
-    stamps_ns
-        (N,) header or clock stamps, ns; ignored if the message has neither.
-    columns
-        Numbers (N, size), keyed by the path of their first field.
-    """
-    leaves = Layout(prototype, type_name).leaves
-    table = np.tile(np.frombuffer(prototype, np.uint8), (len(stamps_ns), 1))
-    for path in ("header.stamp.sec", "clock.sec"):
-        if path in leaves:
-            begin = leaves[path].offset
-            table[:, begin : begin + 8] = seconds_and_nanoseconds(stamps_ns).view(np.uint8)
-    for path, values in columns.items():
-        data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
-        begin = leaves[path].offset
-        table[:, begin : begin + data.shape[1]] = data
-    return [row.tobytes() for row in table]
 
 
 def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:

@@ -19,14 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, counted
-from spacerobot_ros.messages.definitions import fields_of, message_definition, message_type
-from spacerobot_ros.messages.layout import (
-    BIG_ENDIAN,
-    LITTLE_ENDIAN,
-    Layout,
-    TooLongError,
-    encode,
-)
+from spacerobot_ros.messages.definitions import fields_of
+from spacerobot_ros.messages.layout import LITTLE_ENDIAN, Layout, encode, seconds_and_nanoseconds
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation.commands import (
@@ -41,12 +35,9 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 
 _OTHER_JOINTS_BYTES = 65536
-"""Size allowed for unknown joints in a measured state, bytes."""
+"""Size allowed for joints of other robots in a message, bytes."""
 
 _NOT_FINITE_RATES = "velocities are not finite"
-
-_MAX_LIST_TEXTS = 10_000
-"""Largest number of strings in a list; a faulty publisher may send a million."""
 
 _HEADER_BYTES = 4096
 _POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
@@ -116,6 +107,25 @@ class MessageTemplate:
             self._buffer[place] = stamp
         return bytes(self._buffer)
 
+    def copies(self, stamps_ns: npt.NDArray[np.int64], columns: Mapping[str, Array]) -> list[bytes]:
+        """Return one message per stamp.
+
+        Parameters
+        ----------
+        stamps_ns
+            (N,) header or clock stamps, ns.
+        columns
+            Numbers (N, size), keyed by the path of their first field.
+        """
+        table = np.tile(np.frombuffer(self._buffer, np.uint8), (len(stamps_ns), 1))
+        for place in self._stamps:
+            table[:, place] = seconds_and_nanoseconds(stamps_ns).view(np.uint8)
+        for path, values in columns.items():
+            data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
+            begin = self._leaves[path].offset
+            table[:, begin : begin + data.shape[1]] = data
+        return [row.tobytes() for row in table]
+
 
 def joint_template(joint_names: Sequence[str]) -> MessageTemplate:
     """Return a JointState template with zeros for all quantities of the given joints."""
@@ -146,7 +156,7 @@ class TemplateReader:
         self._fields = fields_of(type_name)
         self._size = -1
         self.raw = bytes(2)  # The initial template matches no message.
-        """The accepted message, little-endian."""
+        """The accepted message."""
         self._fixed_spans: list[tuple[slice, bytes]] = []
         self._value_spans: dict[str, tuple[int, int]] = {}
         self._layout: Layout | None = None
@@ -196,21 +206,13 @@ class TemplateReader:
     def _learn_layout(self, raw: bytes) -> None:
         if len(raw) > self._max_size:
             raise UnreadableError(f"it has {len(raw)} bytes; at most {self._max_size} are expected")
-        name = self._type_name
         try:
-            if raw[:2] == BIG_ENDIAN:
-                raw = _as_little_endian(raw, name)
             if raw[:2] != LITTLE_ENDIAN:
-                raise IndexError("it is not in CDR")
-            layout = Layout(raw, name, self._fields, elements=True, max_elements=_MAX_LIST_TEXTS)
+                raise IndexError("it is not in little-endian CDR")
+            layout = Layout(raw, self._type_name, self._fields, elements=True)
         except IndexError as error:
-            short = name.rpartition("/")[2]
+            short = self._type_name.rpartition("/")[2]
             raise UnreadableError(f"its bytes are not a {short}") from error
-        except TooLongError as error:
-            # The stamp of the refused message stays readable, but its bytes do not count as
-            # accepted.
-            self.raw, self._size = raw[: HEADER_STAMP.stop], -1
-            raise CommandError(str(error)) from error
         self.raw, self._size, self._layout = raw, len(raw), layout
         fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
         self._fixed_spans = [(slice(a, b), raw[a:b]) for a, b in fixed]
@@ -220,15 +222,6 @@ class TemplateReader:
             count = leaf.shape[0] if wanted is None else wanted
             if count:
                 self._value_spans[path] = leaf.offset, count
-
-
-def _as_little_endian(raw: bytes, type_name: str) -> bytes:
-    """Return a big-endian message as little-endian; IndexError if it does not have the type."""
-    kind = message_type(type_name, message_definition(type_name).encode())
-    try:
-        return kind.serialise(kind.decode(raw))
-    except Exception as error:  # Decoding raises any kind of error, depending on the bytes.
-        raise IndexError(str(error)) from error
 
 
 class JointReader:
@@ -245,7 +238,7 @@ class JointReader:
     quantities
         Quantities to read; the first is required in every message.
     measured
-        Whether messages are measured states, which have bounded stamps and sizes.
+        Whether messages are measured states, which have bounded stamps.
     followers
         Names of mimic joints, which are not model coordinates.
     """
@@ -262,11 +255,9 @@ class JointReader:
         self._followers = followers
         self.ignored: Counter[str] = Counter()
         """Number of ignored parts of accepted messages, by description."""
-        max_size = math.inf
-        if measured:
-            # Each joint adds its name, a length and three numbers; a machine also has other joints.
-            own = sum(len(name.encode()) + 32 for name in joint_names)
-            max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
+        # Each joint adds its name, a length and three numbers; a machine also has other joints.
+        own = sum(len(name.encode()) + 32 for name in joint_names)
+        max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
         spans: dict[str, int | None] = dict.fromkeys(quantities)
         self._reader = TemplateReader(JOINT_STATE, spans, max_size)
