@@ -1,7 +1,7 @@
 """Bag file: MCAP with rosbag2 metadata.
 
-``mcap.writer.Writer`` makes the records. Files are locked, never overwritten, and complete up to
-the last record even if the process is killed or the disk is full.
+Files are locked, never overwritten, and complete up to the last record even if the process is
+killed or the disk is full.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO, Any, cast
 
 import yaml
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos, QosTime
 
@@ -199,6 +201,9 @@ def _rosbag2_metadata(
 _MESSAGE_HEAD_SIZE = 31
 """Length of a message header in a chunk, bytes."""
 
+_CHUNK = bytes([Opcode.CHUNK])
+"""First byte of a chunk."""
+
 
 class BagExistsError(RecordingError):
     """The bag file exists and must not be overwritten."""
@@ -231,34 +236,13 @@ def _create_locked_file(path: Path, overwrite: bool) -> io.FileIO:
     return raw
 
 
-class _Tail:
-    """Data written by the library that has not been passed to the operating system yet.
-
-    The library must not encounter a full disk: its indexes would no longer match the file.
-    """
-
-    def __init__(self) -> None:
-        self.start = 0
-        self.data = bytearray()
-
-    def write(self, data: bytes) -> None:
-        self.data += data
-
-    def tell(self) -> int:
-        return self.start + len(self.data)
-
-    def flush(self) -> None:
-        """Do nothing; the library requires this method."""
-
-
-class McapFile:
-    """An MCAP file to which whole chunks are appended.
+class McapFile(Writer):
+    """A writer of MCAP records whose file is complete up to its last record.
 
     Chunks, attachments and metadata records are passed to the operating system immediately; failed
     writes are undone. If the process dies, the file is complete except for the record being added.
     An open file is locked: the same path cannot be opened a second time. If the disk is full or
-    fails, calls that add records raise RecordingError; the file is then unchanged and must be
-    closed.
+    fails, calls that add records raise RecordingError, and the file must be closed.
 
     The parent folders of ``path`` are created. For ``compression``, ``chunk_size`` and
     ``overwrite``, see :class:`~spacerobot_ros.bag.BagWriter`; ``profile`` is the profile in the
@@ -283,10 +267,12 @@ class McapFile:
         """Earliest and latest log times, ns."""
         self.bytes_waiting = 0
         """Size of the messages in the current chunk, bytes."""
+        self.size = 0
+        """Number of bytes passed to the operating system."""
         self._counts_in_file: Counter[int] = Counter()
-        self._tail = _Tail()
-        self._library = Writer(
-            cast("IO[bytes]", self._tail),
+        output = SimpleNamespace(write=self._append, tell=lambda: self.size, flush=lambda: None)
+        super().__init__(
+            cast("IO[bytes]", output),
             chunk_size=chunk_size,
             compression=CompressionType[compression.upper()],
         )
@@ -297,16 +283,10 @@ class McapFile:
             reason = getattr(error, "strerror", None) or error
             raise RecordingError(f"Cannot create the bag {path}: {reason}.") from error
         try:
-            self._library.start(profile, library="spacerobot_ros")
-            self._commit()
+            self.start(profile, library="spacerobot_ros")
         except RecordingError:
             self.close()
             raise
-
-    @property
-    def size(self) -> int:
-        """Number of bytes passed to the operating system."""
-        return self._tail.start
 
     def check(self) -> None:
         """Raise RecordingError unless the path still names this file with its full size."""
@@ -324,50 +304,26 @@ class McapFile:
         if problem:
             raise RecordingError(f"The bag {self.path} was lost during recording: {problem}.")
 
-    def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Add a type definition; return its ID."""
-        number = self._library.register_schema(name, encoding, data)
-        self._commit_full_chunk()
-        return number
-
-    def add_channel(
-        self, topic: str, encoding: str, schema_id: int, metadata: dict[str, str]
-    ) -> int:
-        """Add a channel; return its ID."""
-        number = self._library.register_channel(topic, encoding, schema_id, metadata)
-        self._commit_full_chunk()
-        return number
-
-    def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> bool:
-        """Add a message; return whether it completed a chunk."""
-        self._library.add_message(channel_id, log_time_ns, data, publish_time_ns)
+    def add_message(
+        self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0
+    ) -> None:
+        """Add a message; times are in ns."""
         self.message_counts[channel_id] += 1
         self.bytes_waiting += _MESSAGE_HEAD_SIZE + len(data)
-        if self.start_ns is None or log_time_ns < self.start_ns:
-            self.start_ns = log_time_ns
-        if self.end_ns is None or log_time_ns > self.end_ns:
-            self.end_ns = log_time_ns
-        return self._commit_full_chunk()
-
-    def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:
-        """Append a whole file."""
-        self._library.add_attachment(0, log_time_ns, name, media_type, data)
-        self._commit()
-
-    def add_metadata(self, name: str, data: dict[str, str]) -> None:
-        """Append a key-value metadata record."""
-        self._library.add_metadata(name, data)
-        self._commit()
+        if self.start_ns is None or log_time < self.start_ns:
+            self.start_ns = log_time
+        if self.end_ns is None or log_time > self.end_ns:
+            self.end_ns = log_time
+        super().add_message(channel_id, log_time, data, publish_time, sequence)
 
     def add_rosbag2_metadata(self, topics: Sequence[RecordedTopic]) -> None:
         """Append rosbag2's metadata record for the messages written so far."""
         values = _rosbag2_metadata(self.path.name, topics, self.start_ns, self.end_ns)
         self.add_metadata(METADATA_NAME, values)
 
-    def flush(self) -> bool:
-        """Complete the current chunk; return whether there was one."""
-        self._library.flush()
-        return self._commit_full_chunk()
+    def flush(self) -> None:
+        """Complete the current chunk."""
+        Writer.flush(self)
 
     def finish(self, topics: Sequence[RecordedTopic] | None = None) -> None:
         """Complete and close the file; if topics are given, add rosbag2's topic record first."""
@@ -375,8 +331,7 @@ class McapFile:
             self.flush()
             if topics is not None:
                 self.add_rosbag2_metadata(topics)
-            self._library.finish()
-            self._commit()
+            Writer.finish(self)
         finally:
             self.close()
 
@@ -385,18 +340,8 @@ class McapFile:
         with suppress(OSError):
             self._raw.close()
 
-    def _commit_full_chunk(self) -> bool:
-        """Commit the current chunk if the library has completed it; return whether it has."""
-        if not self._tail.data:
-            return False
-        self.bytes_waiting = 0
-        self._commit()
-        self._counts_in_file = self.message_counts.copy()
-        return True
-
-    def _commit(self) -> None:
-        """Pass the library's data to the operating system, completely or not at all."""
-        data, self._tail.data = self._tail.data, bytearray()
+    def _append(self, data: bytes) -> None:
+        """Pass records to the operating system, completely or not at all."""
         rest = memoryview(data)
         try:
             while rest:
@@ -410,4 +355,6 @@ class McapFile:
                 f"Cannot write the bag {self.path}: {error.strerror or error}; "
                 f"the {self.message_counts.total()} messages already written are safe."
             ) from error
-        self._tail.start += len(data)
+        self.size += len(data)
+        if data[:1] == _CHUNK:
+            self.bytes_waiting, self._counts_in_file = 0, self.message_counts.copy()

@@ -185,18 +185,18 @@ class _Copy:
         match found:
             case Message() as message if message.channel_id in self._channels:
                 number, _ = self._channels[message.channel_id]
-                self._file.write(number, message.data, message.log_time, message.publish_time)
+                self._file.add_message(number, message.log_time, message.data, message.publish_time)
             case Schema() as schema if schema.id not in self._schemas:
-                number = self._file.add_schema(schema.name, schema.encoding, schema.data)
+                number = self._file.register_schema(schema.name, schema.encoding, schema.data)
                 self._schemas[schema.id] = number, schema.name
             case Channel() as channel if channel.id not in self._channels:
                 schema_id, _ = self._schemas.get(channel.schema_id, (0, ""))
-                number = self._file.add_channel(
+                number = self._file.register_channel(
                     channel.topic, channel.message_encoding, schema_id, channel.metadata
                 )
                 self._channels[channel.id] = number, channel
             case Attachment() as file:
-                self._file.add_attachment(file.name, file.data, file.media_type, file.log_time)
+                self._file.add_attachment(0, file.log_time, file.name, file.media_type, file.data)
             case Metadata() as metadata if metadata.name != METADATA_NAME:
                 self._file.add_metadata(metadata.name, metadata.metadata)
 

@@ -216,11 +216,11 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         if log_time_ns < 0 or publish_time_ns < 0:
             raise RecordingError(f"The bag {self.path} cannot store negative times.")
         try:
-            completed_chunk = self._file.write(channel_id, data, log_time_ns, publish_time_ns)
+            self._file.add_message(channel_id, log_time_ns, data, publish_time_ns)
         except RecordingError as error:
             self._refusal = str(error)
             raise
-        if completed_chunk and self._is_full():
+        if not self._file.bytes_waiting and self._is_full():
             with self._adding():
                 self._begin_next_file()
 
@@ -229,7 +229,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
         ``media_type`` is for example ``application/xml``; ``log_time_ns`` is the recording time.
         """
-        self._add(lambda file: file.add_attachment(name, data, media_type, log_time_ns))
+        self._add(lambda file: file.add_attachment(0, log_time_ns, name, media_type, data))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
         """Add a key-value metadata record to the bag."""
@@ -244,8 +244,10 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         """Pass the current chunk to the operating system, so that it survives if the process is
         killed."""
         with self._adding():
-            if self._file.flush() and self._is_full():
-                self._begin_next_file()
+            if self._file.bytes_waiting:
+                self._file.flush()
+                if self._is_full():
+                    self._begin_next_file()
 
     def close(self) -> None:
         """Write pending messages and the summary, and close the file; further calls do nothing.
@@ -275,9 +277,9 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         hash_string = type_hash(type_name)
         if type_name not in self._schema_ids:
             text = message_definition(type_name).encode()
-            self._schema_ids[type_name] = self._file.add_schema(type_name, "ros2msg", text)
+            self._schema_ids[type_name] = self._file.register_schema(type_name, "ros2msg", text)
         metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": hash_string}
-        return self._file.add_channel(name, "cdr", self._schema_ids[type_name], metadata)
+        return self._file.register_channel(name, "cdr", self._schema_ids[type_name], metadata)
 
     def _is_full(self) -> bool:
         max_size, max_duration_ns = self._limits
