@@ -553,13 +553,20 @@ class LockstepFlight:
             plan_time = self._planner.statistics.plan_time_s
         if self._controller is not None and self._controller.executive is not None:
             plan_time += self._controller.executive.plan_time
-        return self.log.flight(
-            self._scenario,
-            self._robots.description or self._robots.plant.description,
+        scenario, data = self._scenario, self.log.data()
+        robot = self._robots.description or self._robots.plant.description
+        return Flight(
+            scenario=scenario,
+            robot=robot,
+            joint_names=tuple(robot.joint_names),
             outcome=outcome,
             message=message,
+            goal=scenario.goal.kept_at(*np.split(data["series"]["pose"].values[0], [3])),
+            end_effector_goal=scenario.end_effector_goal,
             status=self._status,
             gait=self._follower.gait,
             plan_time=plan_time,
             wall_time=wall_time,
+            measures_clearance=scenario.plant.clearance_period > 0,
+            **data,
         )

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.events import Event
-from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.series import Commands, Signal
-from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.execution.status import PlannerStatus
-from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.commands import CommandValidator, Refusal
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -23,7 +21,7 @@ from spacerobot_ros.times import SECOND
 
 
 class FlightLog:
-    """Collects the arrays of a :class:`Flight` tick by tick.
+    """Collects the arrays of a :class:`~spacerobot_ros.flight.flight.Flight` tick by tick.
 
     Parameters
     ----------
@@ -99,58 +97,30 @@ class FlightLog:
         if setpoint is not None:
             self._setpoints.setdefault(topic, []).append(np.concatenate(setpoint))
 
-    def flight(
-        self,
-        scenario: Scenario,
-        robot: RobotDescription,
-        *,
-        outcome: Outcome,
-        message: str,
-        status: Status | None,
-        gait: PlannerStatus | None,
-        plan_time: float,
-        wall_time: float,
-    ) -> Flight:
-        """Return the flight."""
+    def data(self) -> dict[str, Any]:
+        """Return the collected fields of the flight by name."""
         table = np.array(self._states)
-        count, ends = len(table), np.cumsum([source.size for source in self._parts])
+        ends = np.cumsum([source.size for source in self._parts])
         columns = np.split(table, ends[:-1], axis=1)
         states = {name: each.copy() for name, each in zip(self._sources, columns, strict=True)}
         lost = {"pose_lost": self._ticks_without_pose}
         if self._ticks_without_target:
             lost["target_lost"] = self._ticks_without_target
         for name, ticks in lost.items():
-            states[name] = np.zeros((count, 1))
+            states[name] = np.zeros((len(table), 1))
             states[name][ticks] = 1.0
-        time: Array = np.arange(count) * self._period_ns / SECOND
-        return Flight(
-            scenario=scenario,
-            robot=robot,
-            joint_names=tuple(robot.joint_names),
-            series={name: Signal(time, values) for name, values in states.items()},
-            commands={
-                topic: Commands(
-                    np.array([tick for tick, _ in sent], np.int64),
-                    np.array([values for _, values in sent]).reshape(len(sent), self._sizes[topic]),
-                    np.array(self._setpoints[topic]) if topic in self._setpoints else None,
-                )
-                for topic, sent in self._commands.items()
-            },
-            statuses=tuple(self.statuses),
-            events=tuple(self.events),
-            outcome=outcome,
-            message=message,
-            goal=scenario.goal.kept_at(*np.split(states["pose"][0], [3])),
-            end_effector_goal=scenario.end_effector_goal,
-            schedules=tuple(self.schedules),
-            paths=tuple(self.paths),
-            plant_statuses=tuple(self.plant_statuses),
-            diagnostics=tuple(self.diagnostics),
-            covariances=tuple(self.covariances),
-            status=status,
-            gait=gait,
-            plan_time=plan_time,
-            wall_time=wall_time,
-            refusals=tuple(self.refusals),
-            measures_clearance=scenario.plant.clearance_period > 0,
-        )
+        time: Array = np.arange(len(table)) * self._period_ns / SECOND
+        commands = {
+            topic: Commands(
+                np.array([tick for tick, _ in sent], np.int64),
+                np.array([values for _, values in sent]).reshape(len(sent), self._sizes[topic]),
+                np.array(self._setpoints[topic]) if topic in self._setpoints else None,
+            )
+            for topic, sent in self._commands.items()
+        }
+        return {
+            "series": {name: Signal(time, values) for name, values in states.items()},
+            "commands": commands,
+            # The public lists are fields of the same names.
+            **{name: tuple(each) for name, each in vars(self).items() if name[0] != "_"},
+        }
