@@ -39,7 +39,7 @@ from spacerobot_ros.control.goals import END_EFFECTOR
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.flight.log import FlightLog
+from spacerobot_ros.flight.series import FlightLog
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.diagnostics import PlantDiagnostics, state_diagnostics
 from spacerobot_ros.messages.statuses import StatusRecord

@@ -25,7 +25,9 @@ from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.messages.builders import (
+    RobotMarkers,
     RobotTransforms,
+    goal_markers,
     goal_messages,
     path_message,
     state_message,
@@ -33,7 +35,6 @@ from spacerobot_ros.messages.builders import (
 )
 from spacerobot_ros.messages.diagnostics import encode_diagnostics
 from spacerobot_ros.messages.layout import encode
-from spacerobot_ros.messages.markers import RobotMarkers, goal_markers
 from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import Array

@@ -24,8 +24,7 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import PlannerCommander
 from spacerobot_ros.commanding.trajectory_output import Outcome, TrajectoryEnd, TrajectoryOutput
 from spacerobot_ros.errors import ParameterError, PlanningError
-from spacerobot_ros.messages.builders import path_message, trajectory_message
-from spacerobot_ros.messages.markers import goal_markers
+from spacerobot_ros.messages.builders import goal_markers, path_message, trajectory_message
 from spacerobot_ros.messages.readers import joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.commander import CommanderNode

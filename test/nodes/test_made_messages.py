@@ -23,18 +23,18 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from spacerobot_ros.commanding.fly_to import FlyToResult, GoalErrors, Progress
 from spacerobot_ros.errors import PlanningError, SpaceRobotError
-from spacerobot_ros.messages.builders import path_message
+from spacerobot_ros.messages.builders import (
+    MARKER_ARRAY,
+    RobotMarkers,
+    goal_markers,
+    path_message,
+    shape_marker,
+)
 from spacerobot_ros.messages.diagnostics import (
     PlantDiagnostics,
     encode_diagnostics,
 )
 from spacerobot_ros.messages.layout import encode
-from spacerobot_ros.messages.markers import (
-    MARKER_ARRAY,
-    RobotMarkers,
-    goal_markers,
-    shape_marker,
-)
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion

@@ -15,11 +15,11 @@ from visualization_msgs.msg import MarkerArray
 from spacerobot_ros.messages.builders import (
     STATIC_TRANSFORMS,
     TRANSFORMS,
+    RobotMarkers,
     RobotTransforms,
     state_message,
 )
 from spacerobot_ros.messages.diagnostics import PlantDiagnostics, encode_diagnostics
-from spacerobot_ros.messages.markers import RobotMarkers
 from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
