@@ -23,13 +23,7 @@ from spacerobot_ros.bag.mcap_reading import (
     read_record,
 )
 from spacerobot_ros.bag.series import TopicSeries
-from spacerobot_ros.bag.tables import (
-    TopicTable,
-    table_of,
-    to_pandas,
-    to_xarray,
-    with_euler_angles,
-)
+from spacerobot_ros.bag.tables import TopicTable, table_of, to_pandas, to_xarray, with_euler_angles
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError, counted, printable
 from spacerobot_ros.files import load_yaml, warn_once
 from spacerobot_ros.messages.definitions import MessageType, message_type

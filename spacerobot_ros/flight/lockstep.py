@@ -27,10 +27,7 @@ from enum import Enum
 import numpy as np
 
 from spacerobot_ros.commanding.commander import Commander
-from spacerobot_ros.commanding.controller import (
-    JOINT_REFERENCE,
-    ControllerCommander,
-)
+from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
 from spacerobot_ros.commanding.goal_follower import GoalFollower, Status
 from spacerobot_ros.commanding.host import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.planner import PlannerCommander

@@ -44,13 +44,7 @@ from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import (
-    TOPICS,
-    Topic,
-    pose_topic,
-    state_topics,
-    topic_named,
-)
+from spacerobot_ros.topics import TOPICS, Topic, pose_topic, state_topics, topic_named
 from spacerobot_ros.version import __version__
 
 _GOAL_STAMP_NS = 1

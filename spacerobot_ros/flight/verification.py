@@ -15,12 +15,7 @@ from numpy.typing import NDArray
 from spacerobot_ros.bag import Bag, read_bag
 from spacerobot_ros.errors import CommandError, ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.events import EventKind
-from spacerobot_ros.flight.reading import (
-    FlightBag,
-    namespaces,
-    recorded_actuation,
-    recorded_target,
-)
+from spacerobot_ros.flight.reading import FlightBag, namespaces, recorded_actuation, recorded_target
 from spacerobot_ros.flight.second_opinion import EngineComparison, EngineFlight
 from spacerobot_ros.messages.readers import CommandReader, UnreadableError
 from spacerobot_ros.model import SpaceRobot

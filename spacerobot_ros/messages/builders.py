@@ -14,17 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.messages.layout import (
-    encode,
-    encode_list,
-    seconds_and_nanoseconds,
-)
-from spacerobot_ros.messages.readers import (
-    ODOMETRY,
-    JointReader,
-    MessageTemplate,
-    TemplateReader,
-)
+from spacerobot_ros.messages.layout import encode, encode_list, seconds_and_nanoseconds
+from spacerobot_ros.messages.readers import ODOMETRY, JointReader, MessageTemplate, TemplateReader
 from spacerobot_ros.model.description import (
     DEFAULT_END_EFFECTOR,
     Array,

@@ -91,12 +91,8 @@ class Layout:
         Fields by path, such as ``pose.pose.position.x``.
     counts
         Number of strings or messages in each list.
-    starts
-        First byte after the length field of each list of strings or messages.
     texts
         Byte span of each list of strings.
-    ends
-        First byte after each element of a list of strings or messages, if ``elements`` is set.
     lengths
         First bytes of the length fields (uint32) of strings and lists.
     fixed
@@ -120,9 +116,7 @@ class Layout:
     ) -> None:
         self.leaves: dict[str, Leaf] = {}
         self.counts: dict[str, int] = {}
-        self.starts: dict[str, int] = {}
         self.texts: dict[str, slice] = {}
-        self.ends: dict[str, int] = {}
         self.lengths: list[int] = []
         self.fixed: list[tuple[int, int]] = []
         self.end = ENCAPSULATION
@@ -157,10 +151,8 @@ class Layout:
                 self._walk(detail, None if inner is None else f"{inner}.")
             else:
                 self._add_value(detail[0], inner)
-            if inner is not None:
-                self.ends[inner] = self.end
         if path is not None:
-            self.counts[path], self.starts[path] = count, begin
+            self.counts[path] = count
             if kind == Nodetype.BASE:
                 self.texts[path] = slice(begin, self.end)
 
@@ -286,7 +278,7 @@ def encode_list(
     element: Mapping[str, Any],
     columns: Mapping[str, NDArray[Any]],
 ) -> bytes:
-    """Return a message that contains a list of many messages with one layout.
+    """Return a message whose last field is a list of many messages with one layout.
 
     Parameters
     ----------
@@ -303,20 +295,20 @@ def encode_list(
     if not count:
         return encode(type_name, values)
     # Three elements show the layout: only the padding of the first may differ.
-    raw = encode(type_name, {**values, name: [element] * 3})
-    layout = Layout(raw, type_name, elements=True)
-    first, second, third = (layout.ends[f"{name}[{i}]"] for i in range(3))
-    head = bytearray(raw[:first])
-    struct.pack_into("<I", head, layout.starts[name] - 4, count)
-    rows = np.tile(np.frombuffer(raw[second:third], np.uint8), (count - 1, 1))
+    few = [encode(type_name, {**values, name: [element] * k}) for k in range(4)]
+    none, _, second, _ = map(len, few)
+    leaves = Layout(few[3], type_name, elements=True).leaves
+    head = bytearray(few[1])
+    struct.pack_into("<I", head, none - 4, count)
+    rows = np.tile(np.frombuffer(few[3][second:], np.uint8), (count - 1, 1))
     for path, column in columns.items():
         data = np.ascontiguousarray(column).view(np.uint8).reshape(count, -1)
         size = data.shape[1]
-        begin = layout.leaves[f"{name}[0].{path}"].offset
+        begin = leaves[f"{name}[0].{path}"].offset
         head[begin : begin + size] = data[0].tobytes()
-        begin = layout.leaves[f"{name}[2].{path}"].offset - second
+        begin = leaves[f"{name}[2].{path}"].offset - second
         rows[:, begin : begin + size] = data[1:]
-    return bytes(head) + rows.tobytes() + raw[third:]
+    return bytes(head) + rows.tobytes()
 
 
 def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:

@@ -23,11 +23,7 @@ from spacerobot_ros.messages.definitions import fields_of
 from spacerobot_ros.messages.layout import LITTLE_ENDIAN, Layout, encode, seconds_and_nanoseconds
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.simulation.commands import (
-    CommandSource,
-    CommandValidator,
-    Refusal,
-)
+from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
 from spacerobot_ros.times import HEADER_STAMP, LATEST_NS, SECOND, unpack_stamp
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
