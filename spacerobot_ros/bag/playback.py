@@ -192,14 +192,18 @@ class Playback:
             )
         self._bag = bag
         self._loop = loop
-        self._start_ns = min(bag.start_time_ns + round(start * SECOND), _LATEST_TIME_NS)
-        end_ns = self._start_ns + round(duration * SECOND) if duration else _LATEST_TIME_NS
+        self.start_ns = min(bag.start_time_ns + round(start * SECOND), _LATEST_TIME_NS)
+        """Log time at which the replay starts, ns."""
+        end_ns = self.start_ns + round(duration * SECOND) if duration else _LATEST_TIME_NS
         self._end_ns = min(end_ns, _LATEST_TIME_NS)
-        self._last_ns = max(min(bag.end_time_ns, self._end_ns), self._start_ns)
-        self.topics = [_replay_topic(bag, _with_slash(name)) for name in topics or bag.topics]
-        self._names = [topic.name for topic in self.topics]
+        self._last_ns = max(min(bag.end_time_ns, self._end_ns), self.start_ns)
+        self.duration_s = (self._last_ns - self.start_ns) / SECOND
+        """Time from the first to the last replayed message, s."""
+        self._names = [_with_slash(name) for name in topics or bag.topics]
+        profiles = {name: [*bag.qos(name), QosProfile()][0] for name in self._names}
+        self.topics = [ReplayTopic(name, bag.topics[name], profiles[name]) for name in self._names]
         self._rate = rate
-        self._bag_ns = self._start_ns
+        self._bag_ns = self.start_ns
         self._clock_ns: int | None = None
         """Clock time at bag time `_bag_ns`; None if bag time is paused."""
         self._begin()
@@ -221,7 +225,7 @@ class Playback:
         if self._next_message is None:
             return now
         # Pending messages are published late, not skipped.
-        return min(now, max(self._next_message.log_time_ns, self._start_ns))
+        return min(now, max(self._next_message.log_time_ns, self.start_ns))
 
     def run(self, clock_ns: int) -> None:
         """Let time advance; ``clock_ns`` is the current clock time."""
@@ -241,9 +245,9 @@ class Playback:
             The bag is damaged.
         """
         taken: list[ReplayMessage] = []
-        while self._next_message is not None and self._clock_ns is not None:
-            due = self._next_message.log_time_ns <= self._time(clock_ns)
-            if not due or len(taken) >= max_count:
+        while len(taken) < max_count:
+            due = self.next_due_time()
+            if due is None or due > clock_ns:
                 break
             taken.append(self._take_next_message())
         return taken
@@ -260,7 +264,7 @@ class Playback:
         replay."""
         if self._next_message is None:
             return None
-        self._set_time(max(self._next_message.log_time_ns, self._start_ns), clock_ns)
+        self._set_time(max(self._next_message.log_time_ns, self.start_ns), clock_ns)
         return self._take_next_message()
 
     def seek(self, bag_ns: int, clock_ns: int) -> list[ReplayMessage]:
@@ -277,23 +281,13 @@ class Playback:
         RecordingError
             The bag is damaged.
         """
-        at = min(max(bag_ns, self._start_ns), self._last_ns)
-        recent = max(at - _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS, self._start_ns)
-        begins = at == self._start_ns and self._clock_ns is None
+        at = min(max(bag_ns, self.start_ns), self._last_ns)
+        recent = max(at - _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS, self.start_ns)
+        begins = at == self.start_ns and self._clock_ns is None
         shown = self._last_messages(at, recent, at if begins else at - 1)
         self._set_time(at, clock_ns)
         self._set_coming(self._messages(self._names, at, self._end_ns))
         return shown
-
-    @property
-    def start_ns(self) -> int:
-        """Log time at which the replay starts, ns."""
-        return self._start_ns
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last replayed message, s."""
-        return (self._last_ns - self._start_ns) / SECOND
 
     def close(self) -> None:
         """Close the bag; the replay has no more messages."""
@@ -318,9 +312,9 @@ class Playback:
 
     def _begin(self) -> None:
         """Schedule all messages from the start time on, after earlier latched messages."""
-        found = self._messages(self._names, self._start_ns, self._end_ns)
+        found = self._messages(self._names, self.start_ns, self._end_ns)
         first = list(islice(found, 1))
-        start = self._start_ns
+        start = self.start_ns
         earlier = self._last_messages(start, start, start - 1) if first else []
         self._set_coming(chain(earlier, first, found))
 
@@ -330,8 +324,8 @@ class Playback:
         self._next_message = next(self._coming, None)
         if self._next_message is None and self._loop:
             # A repeated replay begins at the log time of the last message.
-            span = self._clock_span(max(message.log_time_ns, self._start_ns))
-            self._set_time(self._start_ns, (self._clock_ns or 0) + span)
+            span = self._clock_span(max(message.log_time_ns, self.start_ns))
+            self._set_time(self.start_ns, (self._clock_ns or 0) + span)
             self._begin()
         return message
 
@@ -352,8 +346,3 @@ class Playback:
 
 def _with_slash(topic: str) -> str:
     return topic if topic.startswith("/") else f"/{topic}"
-
-
-def _replay_topic(bag: Bag, name: str) -> ReplayTopic:
-    profiles = bag.qos(name)
-    return ReplayTopic(name, bag.topics[name], profiles[0] if profiles else QosProfile())

@@ -502,11 +502,6 @@ class RecordedRobot:
         self.bag = bag
         self.namespace = namespace
 
-    def topic_names(self) -> list[str]:
-        """Return the names of all topics of the robot, relative to its namespace."""
-        prefix = f"{self.namespace}/"
-        return [name.removeprefix(prefix) for name in self.bag.topics if name.startswith(prefix)]
-
     def get(self, name: str) -> TopicSeries | None:
         """Return a topic of the stack; None if the topic has no messages or a different type."""
         topic = f"{self.namespace}/{name}"

@@ -192,7 +192,12 @@ class FlightBag(RecordedRobot):
                 found[quantity] = _completed(true, measured)
                 if len(true) and quantity != "effort":
                     found[f"measured_{quantity}"] = measured.between(*true.time[[0, -1]].tolist())
-        poses = (name for name in self.topic_names() if name.endswith("/pose"))
+        prefix = f"{self.namespace}/"
+        poses = (
+            name.removeprefix(prefix)
+            for name in self.bag.topics
+            if name.startswith(prefix) and name.endswith("/pose")
+        )
         for name in filter(self.__contains__, (*_QUANTITY_TOPICS, *poses)):
             for field in topic_named(name).state:
                 found[field.quantity] = self.quantity(name, field)
