@@ -29,7 +29,7 @@ from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, 
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import Topic, state_topics
+from spacerobot_ros.topics import StateField, state_topics
 
 TOLERANCE = 1e-9
 """Accepted deviation: absolute for values below 1 (SI units), relative for larger values."""
@@ -129,7 +129,7 @@ def verify_bag(
         The robot or the plant parameters in the bag are invalid, or MuJoCo is not installed.
     """
     flight = _RecordedPlant.of(read_bag(path))
-    published = _published_topics(flight)
+    published = _published_fields(flight)
     first = min(int(p.ticks.min()) for p in published)
     last = max(int(p.ticks.max()) for p in published)
     if first == last:
@@ -137,7 +137,7 @@ def verify_bag(
             f"The bag {flight.path} contains the states of only one tick: there is nothing to "
             f"verify."
         )
-    states = sum(len(p.ticks) for p in published)
+    states = sum({p.name: len(p.ticks) for p in published}.values())
     if first < 0 or last - first > _MAX_SILENT_TICKS + _MAX_TICKS_PER_STATE * states:
         raise RecordingError(
             f"The states in the bag {flight.path} are stamped {first * flight.config.period_ns}"
@@ -146,7 +146,8 @@ def verify_bag(
         )
     initial, rates = _initial_state(first, published, flight)
     resimulation = _resimulate(flight, initial, rates, first, last, mujoco=mujoco)
-    if flight.config.actuation == "velocity" and not _has_efforts(published):
+    efforts = (p.values.any() for p in published if p.field.quantity == "effort")
+    if flight.config.actuation == "velocity" and not any(efforts):
         # An earlier version did not compute servo efforts, and published zeros.
         resimulation.states["effort"][:] = 0.0
     published = [p for p in published if p.is_determined_by(resimulation.states)]
@@ -297,50 +298,46 @@ def _plant_config(recorded: FlightBag) -> PlantConfig:
 
 
 @dataclass(frozen=True)
-class _PublishedTopic:
-    """The messages of one topic: ticks (N,), numbers (N, m), and the name of each number."""
+class _PublishedField:
+    """A field of a topic: ticks (N,) of the messages, values (N, m), and the name of each value."""
 
-    topic: Topic
+    topic: str
     name: str
+    """Topic name with its namespace."""
+    field: StateField
     ticks: NDArray[np.int64]
     values: Array
     labels: list[str]
 
-    def after(self, tick: int) -> _PublishedTopic:
+    def after(self, tick: int) -> _PublishedField:
         """Omit the messages up to and including a tick; thruster on-times are counted from that
         tick."""
         kept = self.ticks > tick
         values = self.values[kept]
-        if self.topic.array_entries_of == "thrusters" and not kept.all():
-            count = self.values.shape[1] // len(self.topic.state)
-            values[:, :count] -= self.values[~kept][-1, :count]
+        if self.field.quantity == "thruster_on_time" and not kept.all():
+            values -= self.values[~kept][-1]
         return replace(self, ticks=self.ticks[kept], values=values)
 
     def is_determined_by(self, states: dict[str, Array]) -> bool:
-        """Whether a re-simulation contains all quantities of the topic, with the same sizes."""
-        names = [each.quantity for each in self.topic.state]
-        if not all(name in states for name in names):
-            return False
-        return sum(states[name].shape[1] for name in names) == self.values.shape[1]
+        """Whether a re-simulation contains the quantity, with the same size."""
+        found = states.get(self.field.quantity)
+        return found is not None and found.shape[1] == self.values.shape[1]
 
     def expected(self, states: dict[str, Array], rows: NDArray[np.int64]) -> Array:
         """Return the re-simulated values for each message, as an array of the same shape as the
         bag's values."""
-        expected = np.hstack([states[each.quantity][rows] for each in self.topic.state])
-        start = 0
-        for each in self.topic.state:
-            if each.quaternion is not None:
-                q = slice(start + each.quaternion, start + each.quaternion + 4)
-                opposite = np.sum(expected[:, q] * self.values[:, q], axis=1) < 0
-                expected[opposite, q] *= -1.0
-            start += states[each.quantity].shape[1]
+        expected = states[self.field.quantity][rows]
+        if self.field.quaternion is not None:
+            q = slice(self.field.quaternion, self.field.quaternion + 4)
+            opposite = np.sum(expected[:, q] * self.values[:, q], axis=1) < 0
+            expected[opposite, q] *= -1.0
         return expected
 
 
-def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
+def _published_fields(flight: _RecordedPlant) -> list[_PublishedField]:
     """Read the state topics; topics without a header get the stamps of the odometry."""
-    recorded, period, names = flight.recorded, flight.config.period_ns, flight.robot.joint_names
-    published: list[_PublishedTopic] = []
+    recorded, period = flight.recorded, flight.config.period_ns
+    published: list[_PublishedField] = []
     clock = recorded["odom"].stamp_ns
     topics = state_topics(flight.config.end_effectors)
     for topic in sorted(topics, key=lambda topic: _COMPARED_FIRST.get(topic.name, 2)):
@@ -357,22 +354,16 @@ def _published_topics(flight: _RecordedPlant) -> list[_PublishedTopic]:
                 f"A message on {series.topic} of the bag {flight.path} is stamped "
                 f"{stamps[between[0]] / SECOND:.9g} s, between the plant's ticks."
             )
-        named = recorded.names(topic.name) if topic.array_entries_of == "thrusters" else names
-        labels = [each.labels(named) for each in topic.state]
-        table = np.hstack(
-            [
-                series.table(each.columns, len(words))
-                for each, words in zip(topic.state, labels, strict=True)
-            ]
-        )
-        # The message has the wrong number of values.
-        table[np.isnan(table).any(axis=1)] = np.nan
-        flat = [label for words in labels for label in words]
-        published.append(_PublishedTopic(topic, series.topic, ticks, table, flat))
+        of_thrusters = topic.array_entries_of == "thrusters"
+        names = recorded.names(topic.name) if of_thrusters else flight.robot.joint_names
+        for each in topic.state:
+            labels = each.labels(names)
+            values = series.table(each.columns, len(labels))
+            published.append(_PublishedField(topic.name, series.topic, each, ticks, values, labels))
     return published
 
 
-def _missing_states(resimulation: _Resimulation, published: list[_PublishedTopic]) -> str:
+def _missing_states(resimulation: _Resimulation, published: list[_PublishedField]) -> str:
     """Return a message about states that the bag lacks; empty for none."""
     recorded = resimulation.flight.recorded
     counts = recorded.metadata.get("recorder", {})
@@ -381,7 +372,7 @@ def _missing_states(resimulation: _Resimulation, published: list[_PublishedTopic
     held = recorded.bag.message_count()
     if resimulation.first == 0 and written > held:
         return f"its recorder wrote {written} messages, but it contains {held}."
-    states = {int(t) for p in published if p.topic.name == "joint_states" for t in p.ticks}
+    states = {int(t) for p in published if p.topic == "joint_states" for t in p.ticks}
     lacking = {tick for tick in resimulation.commanded_ticks if tick >= resimulation.first} - states
     if len(lacking) > lost:
         time = resimulation.flight.format_time(min(lacking))
@@ -390,7 +381,7 @@ def _missing_states(resimulation: _Resimulation, published: list[_PublishedTopic
 
 
 def _initial_state(
-    first: int, published: list[_PublishedTopic], flight: _RecordedPlant
+    first: int, published: list[_PublishedField], flight: _RecordedPlant
 ) -> tuple[InitialState | None, Array]:
     """Return the first state in the bag, and its joint velocities (n,).
 
@@ -398,28 +389,23 @@ def _initial_state(
     """
     if first == 0:
         return None, np.zeros(flight.robot.n)
-    parts = {p.topic.name: p.values[p.ticks == first] for p in published}
-    needed = ("odom", "joint_states", "momentum")
-    if not all(len(parts.get(name, ())) for name in needed):
+    found = {p.field.quantity: p.values[p.ticks == first] for p in published}
+    needed = ("measured_pose", "measured_q", "measured_qdot", "momentum")
+    if not all(len(found.get(name, ())) for name in needed):
         raise RecordingError(
             f"The bag {flight.path} starts mid-flight, and its first state lacks odom, "
             f"joint_states or momentum."
         )
-    n, joints = flight.robot.n, parts["joint_states"][0]
+    pose, q, qdot, momentum = (found[name][0] for name in needed)
     state = InitialState(
-        position=parts["odom"][0][:3],
-        quaternion=parts["odom"][0][3:7],
-        joint_positions=np.clip(joints[:n], flight.robot.lower, flight.robot.upper),
-        joint_velocities=joints[n : 2 * n] if flight.config.actuation == "effort" else None,
-        linear_momentum=parts["momentum"][0][:3],
-        angular_momentum=parts["momentum"][0][3:6],
+        position=pose[:3],
+        quaternion=pose[3:],
+        joint_positions=np.clip(q, flight.robot.lower, flight.robot.upper),
+        joint_velocities=qdot if flight.config.actuation == "effort" else None,
+        linear_momentum=momentum[:3],
+        angular_momentum=momentum[3:6],
     )
-    return state, joints[n : 2 * n]
-
-
-def _has_efforts(published: list[_PublishedTopic]) -> bool:
-    with_efforts = (p for p in published if p.topic.state[-1].quantity == "effort")
-    return any(p.values[:, -p.values.shape[1] // 3 :].any() for p in with_efforts)
+    return state, qdot
 
 
 # -- re-simulation ----------------------------------------------------------------------------
@@ -523,33 +509,33 @@ def _resimulate(
 
 
 def _second_opinion(
-    resimulation: _Resimulation, published: list[_PublishedTopic]
+    resimulation: _Resimulation, published: list[_PublishedField]
 ) -> EngineComparison | None:
     """Return the engine's differences from the true states in the bag; None: no engine was run."""
     if resimulation.engine is None:
         return None
-    topics = {p.topic.name: p for p in published}
-    odom, joints = (topics.get(f"{name}_true", topics[name]) for name in ("odom", "joint_states"))
-    ticks, rows, columns = np.intersect1d(odom.ticks, joints.ticks, return_indices=True)
-    n = joints.values.shape[1] // 3
-    return resimulation.engine.comparison(ticks, odom.values[rows, :7], joints.values[columns, :n])
+    found = {p.field.quantity: p for p in published}
+    pose, q = (found.get(f"true_{name}", found[f"measured_{name}"]) for name in ("pose", "q"))
+    ticks, rows, columns = np.intersect1d(pose.ticks, q.ticks, return_indices=True)
+    return resimulation.engine.comparison(ticks, pose.values[rows], q.values[columns])
 
 
-def _require_no_reset(resimulation: _Resimulation, published: list[_PublishedTopic]) -> None:
+def _require_no_reset(resimulation: _Resimulation, published: list[_PublishedField]) -> None:
     """Reject a bag in which a state is published twice, the second time as the initial state."""
-    for p in published:
-        if p.topic.name != "joint_states" or not p.values.shape[1]:
-            continue
-        begun = p.expected(resimulation.states, np.zeros(len(p.ticks), dtype=np.int64))
-        near = np.isclose(p.values, begun, atol=TOLERANCE)
-        back: NDArray[np.bool_] = np.all(near, axis=1)
-        repeated = np.flatnonzero((np.diff(p.ticks) <= 0) & back[1:] & ~back[:-1])
-        if repeated.size:
-            time = resimulation.flight.format_time(p.ticks[repeated[0] + 1])
-            raise RecordingError(
-                f"In the bag {resimulation.flight.path} the plant was reset at {time}; only "
-                "flights without a reset can be verified."
-            )
+    joints = [p for p in published if p.topic == "joint_states" and p.values.shape[1]]
+    if not joints:
+        return
+    ticks, back = joints[0].ticks, np.ones(len(joints[0].ticks), dtype=np.bool_)
+    for p in joints:
+        begun = p.expected(resimulation.states, np.zeros(len(ticks), dtype=np.int64))
+        back &= np.all(np.isclose(p.values, begun, atol=TOLERANCE), axis=1)
+    repeated = np.flatnonzero((np.diff(ticks) <= 0) & back[1:] & ~back[:-1])
+    if repeated.size:
+        time = resimulation.flight.format_time(ticks[repeated[0] + 1])
+        raise RecordingError(
+            f"In the bag {resimulation.flight.path} the plant was reset at {time}; only flights "
+            "without a reset can be verified."
+        )
 
 
 # -- comparison -------------------------------------------------------------------------------
@@ -557,7 +543,7 @@ def _require_no_reset(resimulation: _Resimulation, published: list[_PublishedTop
 
 def _compare(
     done: _Resimulation,
-    published: list[_PublishedTopic],
+    published: list[_PublishedField],
     tolerance: float,
     missing: str,
     second_opinion: EngineComparison | None,
@@ -591,8 +577,8 @@ def _compare(
     return Verification(
         ticks=ticks,
         duration=ticks * done.flight.config.period_ns / SECOND,
-        messages=sum(len(p.ticks) for p in published),
-        topics=tuple(p.name for p in published),
+        messages=sum({p.name: len(p.ticks) for p in published}.values()),
+        topics=tuple(dict.fromkeys(p.name for p in published)),
         largest=largest,
         largest_at=largest_at,
         difference=None if found is None else found[1],
@@ -601,7 +587,7 @@ def _compare(
     )
 
 
-def _deviation(p: _PublishedTopic, done: _Resimulation) -> tuple[Array, Array]:
+def _deviation(p: _PublishedField, done: _Resimulation) -> tuple[Array, Array]:
     """Return the expected values and the deviations, both in the shape of the bag's values."""
     expected = p.expected(done.states, np.minimum(p.ticks, done.end) - done.first)
     deviation = np.abs(p.values - expected) / np.maximum(1.0, np.abs(expected))
@@ -611,7 +597,7 @@ def _deviation(p: _PublishedTopic, done: _Resimulation) -> tuple[Array, Array]:
 
 def _difference_at(
     done: _Resimulation,
-    p: _PublishedTopic,
+    p: _PublishedField,
     expected: Array,
     row: int,
     column: int,
