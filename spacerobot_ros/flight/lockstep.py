@@ -41,7 +41,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.diagnostics import PlantDiagnostics, state_diagnostics
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
@@ -74,8 +74,6 @@ class Robots:
     plant: SpaceRobot
     planner: SpaceRobot
     controller: SpaceRobot
-    description: RobotDescription | None = None
-    """Description of the plant, with the URDF to record; None selects the model's description."""
     method: GaitMethod | None = None
     """Gait method for the planner's robot and configuration; by default, the method is built for
     this flight."""
@@ -283,11 +281,7 @@ class LockstepFlight:
 
     # -- the flight ---------------------------------------------------------------------------
 
-    def fly(
-        self,
-        progress: Progress = lambda now, end: False,
-        longest: float = math.inf,
-    ) -> Flight:
+    def fly(self, progress: Progress, longest: float) -> Flight:
         """Fly until the goal is completed; for parameters see :func:`fly_scenario`."""
         began = time.perf_counter()
         interrupted = self._fly(progress, longest)
@@ -485,20 +479,23 @@ class LockstepFlight:
         """Send the goals as a mission client does: before the first state."""
         scenario, goal = self._scenario, self._scenario.goal
         # A pose is checked, and its quaternion normalised, on reception.
-        given = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
-        hands, asked = goal.end_effectors, goal.asked
-        given = replace(given, end_effectors=hands, base=goal.base, asked=asked)
-        given = replace(given, waypoints=goal.waypoints)
+        checked = Goal.checked(goal.position, goal.quaternion, goal.joint_positions)
+        given = replace(goal, quaternion=checked.quaternion)
         if self._planner is not None:
             self._planner.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: given)
         if self._controller is not None:
-            unshaped = replace(given, joint_positions=None, end_effectors=(), base=POSE)
-            unshaped = replace(unshaped, asked=asked & goal.base)
+            unshaped = replace(
+                given,
+                joint_positions=None,
+                end_effectors=(),
+                base=POSE,
+                asked=goal.asked & goal.base,
+            )
             if given.base:
                 self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
             heard = [
                 each
-                for each in hands
+                for each in goal.end_effectors
                 if self._planner is None or each.link in ("", DEFAULT_END_EFFECTOR)
             ]
             if heard:
@@ -551,7 +548,7 @@ class LockstepFlight:
         if self._controller is not None and self._controller.executive is not None:
             plan_time += self._controller.executive.plan_time
         scenario, data = self._scenario, self.log.data()
-        robot = self._robots.description or self._robots.plant.description
+        robot = self._robots.plant.description
         return Flight(
             scenario=scenario,
             robot=robot,
