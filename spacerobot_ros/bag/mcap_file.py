@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from types import SimpleNamespace
 from typing import IO, Any, cast
@@ -23,7 +22,6 @@ from typing import IO, Any, cast
 import yaml
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
-from rosbags.interfaces import Qos, QosTime
 
 from spacerobot_ros.bag.mcap_reading import require_regular
 from spacerobot_ros.errors import RecordingError
@@ -32,13 +30,15 @@ from spacerobot_ros.times import SECOND
 
 # -- quality of service -----------------------------------------------------------------------
 
-INFINITE_NS = 2**63 - 1
+_INFINITE_NS = 2**63 - 1
 """Infinite duration, in nanoseconds (``RMW_DURATION_INFINITE``)."""
+
+_INFINITE_DURATION = dict(zip(("sec", "nsec"), divmod(_INFINITE_NS, SECOND), strict=True))
 
 
 @dataclass(frozen=True)
 class QosProfile:
-    """Quality of service offered by a topic's publisher.
+    """Quality of service offered by a topic's publisher; all durations are infinite.
 
     Policies are rmw's lower-case strings (``rmw_qos_*_policy_to_str``), the only form that ``ros2
     bag play`` accepts.
@@ -54,27 +54,15 @@ class QosProfile:
     durability
         ``volatile``, ``transient_local`` (latched), or one of the last three values of
         ``reliability``.
-    deadline_ns
-        Longest time between two messages, in nanoseconds.
-    lifespan_ns
-        Message lifespan, in nanoseconds.
     liveliness
         ``automatic``, ``manual_by_topic``, or one of the last three values of ``reliability``.
-    liveliness_lease_duration_ns
-        Time for which a silent publisher is considered alive, in nanoseconds.
-    avoid_ros_namespace_conventions
-        Whether the topic is a bare DDS topic.
     """
 
     history: str = "keep_last"
     depth: int = 10
     reliability: str = "reliable"
     durability: str = "volatile"
-    deadline_ns: int = INFINITE_NS
-    lifespan_ns: int = INFINITE_NS
     liveliness: str = "automatic"
-    liveliness_lease_duration_ns: int = INFINITE_NS
-    avoid_ros_namespace_conventions: bool = False
 
     @classmethod
     def from_yaml(cls, text: str) -> list[QosProfile]:
@@ -91,13 +79,19 @@ class QosProfile:
         # This import loads all of rosbags, and few bags are replayed.
         from rosbags.rosbag2.metadata import parse_qos
 
+        profiles = []
         try:
             if len(text) > _MAX_YAML_CHARACTERS:
                 raise ValueError("it is too long")
             entries = [cls().to_dict() | entry for entry in load_yaml(text) or []]
-            return [cls(**_profile_arguments(profile)) for profile in parse_qos(entries)]
-        except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
+            for given in parse_qos(entries):
+                if type(given.depth) is not int or not 0 <= given.depth <= _INFINITE_NS:
+                    raise ValueError(f"its depth is {given.depth!r}")
+                words = {name: getattr(given, name).name.lower() for name in _POLICIES}
+                profiles.append(cls(depth=given.depth, **words))
+        except (ValueError, TypeError, AttributeError, KeyError) as error:
             raise RecordingError(f"A QoS profile of the bag cannot be read: {error}.") from error
+        return profiles
 
     def to_yaml(self) -> str:
         """Return a channel's ``offered_qos_profiles`` with this profile, in rosbag2's format."""
@@ -105,32 +99,24 @@ class QosProfile:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the profile as it appears in rosbag2's YAML."""
-        entry: dict[str, Any] = {}
-        for name, value in vars(self).items():
-            if name.endswith("_ns"):
-                seconds, rest = divmod(value, SECOND)
-                entry[name.removesuffix("_ns")] = {"sec": seconds, "nsec": rest}
-            else:
-                entry[name] = value
-        return entry
-
-
-def _profile_arguments(profile: Qos) -> dict[str, Any]:
-    if type(profile.depth) is not int or not 0 <= profile.depth <= INFINITE_NS:
-        raise ValueError(f"its depth is {profile.depth!r}")
-    arguments: dict[str, Any] = {}
-    for name, value in profile._asdict().items():
-        if isinstance(value, QosTime):
-            nanoseconds = int(value.sec) * SECOND + int(value.nsec)
-            arguments[f"{name}_ns"] = min(nanoseconds, INFINITE_NS)
-        else:
-            arguments[name] = value.name.lower() if isinstance(value, Enum) else value
-    return arguments
+        return {
+            "history": self.history,
+            "depth": self.depth,
+            "reliability": self.reliability,
+            "durability": self.durability,
+            "deadline": {**_INFINITE_DURATION},
+            "lifespan": {**_INFINITE_DURATION},
+            "liveliness": self.liveliness,
+            "liveliness_lease_duration": {**_INFINITE_DURATION},
+            "avoid_ros_namespace_conventions": False,
+        }
 
 
 LATCHED = QosProfile(depth=1, durability="transient_local")
 """Reliable, transient local, depth 1: late subscribers receive the last message."""
 
+
+_POLICIES = ("history", "reliability", "durability", "liveliness")
 
 _MAX_YAML_CHARACTERS = 65_536
 
@@ -160,7 +146,7 @@ class RecordedTopic:
 def _rosbag2_metadata(
     file_name: str, topics: Sequence[RecordedTopic], start_ns: int | None, end_ns: int | None
 ) -> dict[str, str]:
-    start, duration = INFINITE_NS, 0
+    start, duration = _INFINITE_NS, 0
     if start_ns is not None and end_ns is not None:
         start, duration = start_ns, end_ns - start_ns
     content = {

@@ -278,10 +278,6 @@ class MessageType:
         decode = definition.deserialize_cdr_le if little else definition.deserialize_cdr_be
         return decode(data[4:], 0, definition.cls, self._store)[0]
 
-    def serialise(self, message: Any) -> bytes:
-        """Return a message as ROS serialises it."""
-        return bytes(self._store.serialize_cdr(message, self._definition.name))
-
 
 message_type = lru_cache(maxsize=64)(MessageType)
 """Return a :class:`MessageType`; its code is generated once and shared by all bags."""

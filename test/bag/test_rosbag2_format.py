@@ -192,11 +192,7 @@ def test_rosbags_reads_the_quality_of_service(tmp_path: Path) -> None:
         depth=7,
         reliability="best_effort",
         durability="volatile",
-        deadline_ns=1_500_000_000,
-        lifespan_ns=2,
         liveliness="manual_by_topic",
-        liveliness_lease_duration_ns=3 * 10**9,
-        avoid_ros_namespace_conventions=True,
     )
     with BagWriter(tmp_path / "a.mcap") as writer:
         writer.write(writer.add_topic("/a", STRING, qos), string("a"), 1, 1)
@@ -208,11 +204,11 @@ def test_rosbags_reads_the_quality_of_service(tmp_path: Path) -> None:
                 7,
                 QosReliability.BEST_EFFORT,
                 QosDurability.VOLATILE,
-                QosTime(1, 500_000_000),
-                QosTime(0, 2),
+                QosTime(9223372036, 854775807),
+                QosTime(9223372036, 854775807),
                 QosLiveliness.MANUAL_BY_TOPIC,
-                QosTime(3, 0),
-                True,
+                QosTime(9223372036, 854775807),
+                False,
             )
         ]
 
