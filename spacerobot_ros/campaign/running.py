@@ -21,14 +21,7 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
 from spacerobot_ros.campaign.rows import ERROR, FLIGHTS, Row
-from spacerobot_ros.campaign.workers import (
-    KILLED,
-    THIS_PROCESS,
-    Cluster,
-    TaskDistributor,
-    Workers,
-    open_workers,
-)
+from spacerobot_ros.campaign.workers import KILLED, TaskDistributor, Workers, open_workers
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import scenario_to_fly
 from spacerobot_ros.flight.lockstep import fly_scenario
@@ -77,7 +70,8 @@ def run_campaign(
     folder: Path,
     *,
     engine: str = "auto",
-    cluster: Cluster = THIS_PROCESS,
+    workers: int = 0,
+    scheduler: str = "",
     show: Callable[[Progress], None] = lambda progress: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Progress:
@@ -91,8 +85,10 @@ def run_campaign(
         Dataset folder.
     engine
         Engine name, or ``auto``.
-    cluster
-        The workers that fly.
+    workers
+        Number of worker processes on this machine; 0: only this process is used.
+    scheduler
+        Address of a dask.distributed scheduler, whose workers fly instead; empty: none.
     show
         Function that is called with the progress after each task and a few times per second.
     stopped
@@ -112,12 +108,12 @@ def run_campaign(
     """
     draws, dataset = Draws(campaign), Dataset(folder)
     wanted = campaign.engine if engine == "auto" else engine
-    chosen = select_engine(campaign, wanted, local=not cluster.scheduler)
+    chosen = select_engine(campaign, wanted, local=not scheduler)
     with ExitStack() as opened:
-        workers = None
-        if cluster.scheduler and len(dataset.flown_numbers()) < len(draws):
+        opened_workers = None
+        if scheduler and len(dataset.flown_numbers()) < len(draws):
             # Before the folder is created, so that a missing scheduler leaves no folder behind.
-            workers = opened.enter_context(open_workers(cluster, len(draws)))
+            opened_workers = opened.enter_context(open_workers(len(draws), workers, scheduler))
         done = dataset.begin(campaign)
         numbers = [number for number in range(len(draws)) if number not in done]
         began, before = time.monotonic(), len(draws) - len(numbers)
@@ -129,9 +125,9 @@ def run_campaign(
 
         flown = 0
         try:
-            if workers is None and cluster.workers and numbers:
-                workers = opened.enter_context(open_workers(cluster, len(numbers)))
-            for batch in _fly_rows(campaign, draws, numbers, chosen.name, workers, stopped):
+            if workers and not scheduler and numbers:
+                opened_workers = opened.enter_context(open_workers(len(numbers), workers))
+            for batch in _fly_rows(campaign, draws, numbers, chosen.name, opened_workers, stopped):
                 dataset.add(batch)
                 flown += len(batch)
                 show(progress(flown))

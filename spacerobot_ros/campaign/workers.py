@@ -64,25 +64,6 @@ KILLED = "killed"
 """Outcome of a flight during which a worker died twice."""
 
 
-@dataclass(frozen=True)
-class Cluster:
-    """The workers that fly a campaign.
-
-    Attributes
-    ----------
-    workers
-        Number of processes on this machine; if 0, only this process is used.
-    scheduler
-        Address of the dask.distributed scheduler; if empty, processes on this machine are used.
-    """
-
-    workers: int = 0
-    scheduler: str = ""
-
-
-THIS_PROCESS = Cluster()
-
-
 # -- a task in a worker -----------------------------------------------------------------------
 
 
@@ -183,19 +164,12 @@ class LocalWorkers:
                 self._pool = self._make_pool()
                 return self._pool.submit(fly_task, *arguments)
 
-    def ended(self, tasks: list[_Task]) -> list[_Task]:
-        """Return the finished tasks, or an empty list if no task finishes for some time."""
-        return list(wait(tasks, _POLL_PERIOD, FIRST_COMPLETED).done)
-
     def result(self, task: _Task) -> list[Row | Fallback]:
         """Return the result of a finished task, or raise its exception."""
         try:
             return task.result()
         except BrokenProcessPool as error:
             raise WorkerDeath from error
-
-    def cancel(self, tasks: list[_Task]) -> None:
-        """Stop tasks; :meth:`close` terminates the processes."""
 
     def close(self) -> None:
         """End the processes, and no other child of this process."""
@@ -243,6 +217,7 @@ class DaskWorkers:
 
     def __init__(self, client: Any) -> None:
         self._client = client
+        self._executor = client.get_executor(pure=False, retries=0)
         self._checked: set[str] = set()
         self._empty_since = math.inf
         """Monotonic time at which the scheduler lost its last worker; infinite if it has a
@@ -270,23 +245,11 @@ class DaskWorkers:
             warn_once("The scheduler has no workers: the flights are waiting for a worker.")
         return max(1, workers)
 
-    def submit(self, *arguments: Any) -> Any:
+    def submit(self, *arguments: Any) -> _Task:
         """Queue a task; the arguments are those of :func:`fly_task`."""
-        return self._client.submit(fly_task, *arguments, pure=False, retries=0)
+        return self._executor.submit(fly_task, *arguments)
 
-    def ended(self, tasks: list[Any]) -> list[Any]:
-        """Return the finished tasks, or an empty list if no task finishes for some time."""
-        import distributed
-
-        try:
-            distributed.wait(tasks, timeout=_POLL_PERIOD, return_when="FIRST_COMPLETED")
-        except TimeoutError:
-            return []
-        except CancelledError as error:
-            raise _lost_scheduler_error() from error
-        return [task for task in tasks if task.done()]
-
-    def result(self, task: Any) -> list[Row | Fallback]:
+    def result(self, task: _Task) -> list[Row | Fallback]:
         """Return the result of a finished task.
 
         Raises
@@ -300,7 +263,7 @@ class DaskWorkers:
         from distributed.scheduler import KilledWorker
 
         try:
-            made: list[Row | Fallback] = task.result()
+            return task.result()
         except KilledWorker as error:
             raise WorkerDeath from error
         except (CancelledError, CommClosedError) as error:
@@ -312,14 +275,8 @@ class DaskWorkers:
             raise SpaceRobotError(
                 "The scheduler or a worker cannot load the task "
                 f"({str(error).splitlines()[0]}): the scheduler and all workers require "
-                f"{_PACKAGE_NAME}[campaign] "
-                f"{__version__}."
+                f"{_PACKAGE_NAME}[campaign] {__version__}."
             ) from error
-        return made
-
-    def cancel(self, tasks: list[Any]) -> None:
-        """Stop unfinished tasks."""
-        self._client.cancel(tasks, force=True)
 
     def _require_package(self, workers: Iterable[str]) -> None:
         """Refuse workers without this package, which would fail at every task."""
@@ -347,16 +304,17 @@ Workers = LocalWorkers | DaskWorkers
 
 
 @contextmanager
-def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
-    """Yield the workers of a cluster, with no more processes than flights.
+def open_workers(flights: int, workers: int, scheduler: str = "") -> Iterator[Workers]:
+    """Yield ``workers`` processes on this machine, no more than flights, or the workers of a
+    dask.distributed ``scheduler``.
 
     Raises
     ------
     SpaceRobotError
         dask.distributed is not installed, or there is no scheduler at the address.
     """
-    if not cluster.scheduler:
-        local = LocalWorkers(min(cluster.workers, max(1, flights)))
+    if not scheduler:
+        local = LocalWorkers(min(workers, max(1, flights)))
         try:
             yield local
         finally:
@@ -376,11 +334,9 @@ def open_workers(cluster: Cluster, flights: int) -> Iterator[Workers]:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     with dask.config.set(settings):
         try:
-            client = Client(cluster.scheduler, timeout="20s")
+            client = Client(scheduler, timeout="20s")
         except (OSError, TimeoutError, ValueError) as error:
-            raise SpaceRobotError(
-                f"There is no scheduler at {cluster.scheduler}: {error}."
-            ) from error
+            raise SpaceRobotError(f"There is no scheduler at {scheduler}: {error}.") from error
         with client:
             yield DaskWorkers(client)
 
@@ -435,7 +391,7 @@ class TaskDistributor:
         self._fallbacks: deque[int] = deque()
         """Draws that the engine passes on to engine ``flights``."""
         self._reasons: dict[int, str] = {}
-        self._running: dict[Any, _SubmittedTask] = {}
+        self._running: dict[_Task, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
         """Draws in tasks whose worker has died."""
 
@@ -446,16 +402,16 @@ class TaskDistributor:
             waiting or self._fallbacks or self._retry_alone or self._running
         ) and not self._stopped():
             self._submit_tasks(waiting)
-            ended = self._workers.ended(list(self._running))
-            if not ended:
-                yield []
-            for task in ended:
-                yield self._collect_rows(task)
-        if self._running:
-            # Tasks that have finished since.
-            for task in self._workers.ended(list(self._running)):
-                yield self._collect_rows(task)
-            self._workers.cancel(list(self._running))
+            yield from self._finished_rows(_POLL_PERIOD) or [[]]
+        # Tasks that have finished since.
+        yield from self._finished_rows(0.0)
+        for task in self._running:
+            task.cancel()
+
+    def _finished_rows(self, patience: float) -> list[list[Row]]:
+        """Return the rows of each finished task, after at most ``patience`` s of wall time."""
+        finished = wait(self._running, patience, FIRST_COMPLETED).done
+        return [self._collect_rows(task) for task in finished]
 
     def _submit_tasks(self, waiting: deque[int]) -> None:
         workers = self._workers.count()
@@ -477,7 +433,7 @@ class TaskDistributor:
         task = self._workers.submit(self._packed, this_code(), draws, engine, alone)
         self._running[task] = _SubmittedTask(numbers, engine, alone)
 
-    def _collect_rows(self, ended: Any) -> list[Row]:
+    def _collect_rows(self, ended: _Task) -> list[Row]:
         """Return the rows of a task; none if its worker died."""
         task = self._running.pop(ended)
         try:

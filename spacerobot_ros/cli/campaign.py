@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,7 +19,6 @@ from spacerobot_ros.errors import ParameterError
 
 if TYPE_CHECKING:
     from spacerobot_ros.campaign.running import Progress
-    from spacerobot_ros.campaign.workers import Cluster
 
 
 _ENGINES = ("auto", "lanes", "flights", "cuda")
@@ -86,12 +85,10 @@ def campaign_command() -> None:
 def fly(
     file: Path | None,
     flights: int | None,
-    engine: str,
-    workers: int,
-    scheduler: str,
     out: Path | None,
     report: Path | None,
     compare: tuple[Path, Path] | None,
+    **how: Any,
 ) -> None:
     """Fly the campaign in FILE and write its dataset and report.
 
@@ -115,16 +112,13 @@ def fly(
     1: every flight was rejected or failed with an error; 2: bad input; 130: Ctrl-C, finished
     flights are kept.
     """
-    from spacerobot_ros.campaign.workers import Cluster
-
-    cluster = Cluster(0 if scheduler else workers, scheduler)
     if (file is None) == (compare is None):
         raise ParameterError("Give one campaign FILE, or two after --compare, not both.")
     if compare is not None:
-        _compare(compare, flights, engine, cluster, out, report)
+        _compare(compare, flights, out, report, how)
         return
     assert file is not None
-    folder, progress = _fly_campaign(file, flights, engine, cluster, out)
+    folder, progress = _fly_campaign(file, flights, out, how)
     _write_report(folder, report)
     exit_if_terminated()
     _require_flights(progress)
@@ -160,7 +154,7 @@ def rerun(folder: Path, number: int, bag: Path | None) -> None:
 
 
 def _fly_campaign(
-    file: Path, flights: int | None, engine: str, cluster: Cluster, out: Path | None, name: str = ""
+    file: Path, flights: int | None, out: Path | None, how: dict[str, Any], name: str = ""
 ) -> tuple[Path, Progress]:
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.running import run_campaign
@@ -173,9 +167,7 @@ def _fly_campaign(
     for line in campaign.description_lines:
         say(line)
     with graceful_shutdown() as stopped, _progress_bar(campaign.name) as show:
-        progress = run_campaign(
-            campaign, folder, engine=engine, cluster=cluster, show=show, stopped=stopped
-        )
+        progress = run_campaign(campaign, folder, show=show, stopped=stopped, **how)
     flown = f"{progress.flown} of {progress.total} flights"
     say(f"{campaign.name}: {flown}, {progress.flights_per_second:.3g} per second; {folder}")
     return folder, progress
@@ -221,10 +213,9 @@ def _write_report(folder: Path, report: Path | None) -> None:
 def _compare(
     files: tuple[Path, Path],
     flights: int | None,
-    engine: str,
-    cluster: Cluster,
     out: Path | None,
     report: Path | None,
+    how: dict[str, Any],
 ) -> None:
     from spacerobot_ros.campaign.config import load_campaign
     from spacerobot_ros.campaign.report import require_same_draws, write_comparison
@@ -236,7 +227,7 @@ def _compare(
     base = out or Path("out") / "_".join(names)
     flown = []
     for file, name in zip(files, names, strict=True):
-        flown.append(_fly_campaign(file, flights, engine, cluster, base / name, name))
+        flown.append(_fly_campaign(file, flights, base / name, how, name))
         exit_if_terminated()
     path = report or base / "report.html"
     (first, first_end), (second, second_end) = flown

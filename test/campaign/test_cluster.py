@@ -23,7 +23,6 @@ from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.campaign.workers import (
-    Cluster,
     open_workers,
     serialise_campaign,
     this_code,
@@ -221,14 +220,11 @@ def test_workers_of_this_machine_listen_nowhere() -> None:
 
     before = listening()
     made = campaign(**{**GIVEN, "flights": 2})
-    with open_workers(Cluster(workers=2), 2) as workers:
+    with open_workers(2, workers=2) as workers:
         tasks = [
             workers.submit(serialise_campaign(made), this_code(), [draw], "flights", True)
             for draw in Draws(made)
         ]
-        ended: list[Any] = []
-        while len(ended) < len(tasks):
-            ended = workers.ended(tasks)
         assert [workers.result(task)[0].draw.number for task in tasks] == [0, 1]
         assert len(here.children()) >= 2
         assert listening() == before
