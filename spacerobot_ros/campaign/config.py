@@ -353,10 +353,5 @@ def passes_criteria(
 ) -> bool:
     """Return whether a flight reached its goal and met every criterion."""
     return outcome == "reached" and all(
-        meets_criterion(criterion, metrics) for criterion in criteria
+        each.minimum <= metrics.get(each.metric, math.nan) <= each.maximum for each in criteria
     )
-
-
-def meets_criterion(criterion: Criterion, metrics: Mapping[str, float]) -> bool:
-    """Return whether a metric has a value that meets the criterion."""
-    return criterion.minimum <= metrics.get(criterion.metric, math.nan) <= criterion.maximum

@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.metrics import metric_of
-from spacerobot_ros.campaign.results import PASSING, Results, messages_of
+from spacerobot_ros.campaign.results import PASSING, Results
 from spacerobot_ros.campaign.rows import ERROR
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
@@ -78,7 +79,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     lines += [f"required    {c}: {results.share_meeting(c)}" for c in results.campaign.criteria]
     lines += [
         f"{outcome:<11} {count} of {len(results)}: {message}"
-        for outcome, count, message in messages_of(results)
+        for outcome, count, message in results.shown_messages
         if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
     ]
     found = results.influences()
@@ -183,8 +184,7 @@ def _success_section(results: Results) -> str:
 
 
 def _criteria_section(results: Results) -> str:
-    outcomes = results.columns["outcome"]
-    reached = share(sum(outcome == "reached" for outcome in outcomes), len(results))
+    reached = share(results.columns["outcome"] == "reached")
     rows = [["the goal is reached", *_share_cells(reached), "", ""]]
     for criterion in results.campaign.criteria:
         values = percentiles(results.columns[criterion.metric])
@@ -204,7 +204,7 @@ def _share_cells(met: Share) -> list[str]:
 
 
 def _outcomes_section(results: Results) -> str:
-    rows = [[outcome, f"{count}", reason] for outcome, count, reason in messages_of(results)]
+    rows = [[outcome, f"{count}", reason] for outcome, count, reason in results.shown_messages]
     made = table("outcomes", ["outcome", "flights", "message"], rows)
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):
@@ -356,8 +356,7 @@ def _convergence_section(results: Results) -> list[str]:
     at = np.unique(np.geomspace(min(10, count), count, 60).astype(int))
     if len(at) < 2:
         return []
-    passed = np.cumsum(results.passed)
-    shares = [share(int(passed[k - 1]), int(k)) for k in at]
+    shares = [share(results.passed[:k]) for k in at]
     figure, axes = _figure_with_axes(2, 2, 2.4)
     axes[0].fill_between(
         at,
@@ -446,7 +445,9 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     SpaceRobotError
         The file cannot be written.
     """
-    first, second = (Results.of(folder) for folder in folders)
+    # Metrics required by only one campaign are also compared if both have them.
+    required = [name for each in folders for name in Dataset(each).campaign().named_metrics]
+    first, second = (Results.of(folder, required) for folder in folders)
     require_same_draws(first.campaign, second.campaign)
     common = np.intersect1d(first.flight_numbers, second.flight_numbers)
     rows_a = np.searchsorted(first.flight_numbers, common)
@@ -456,7 +457,6 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
             f"'{first.campaign.name}' and '{second.campaign.name}' have no flown draws in common: "
             "fly more flights of one of them."
         )
-    # Metrics required by only one campaign are also compared if both have them.
     names = list(dict.fromkeys([*first.shown_metrics, *second.shown_metrics]))
     names = [name for name in names if name in first.columns and name in second.columns]
     # A flight whose goal was refused has not moved: its numbers are those of the start.
@@ -510,7 +510,7 @@ def _difference_line(each: PairedDifference, second: str, first: str) -> str:
 def _notes_on_failures(first: Results, second: Results) -> list[str]:
     notes = []
     for each in (first, second):
-        missed = [found for found in messages_of(each) if found[0] != "reached"]
+        missed = [found for found in each.messages if found[0] != "reached"]
         for outcome, count, message in sorted(missed, key=lambda found: -found[1])[:1]:
             share = f"{count} of {len(each)} flights"
             notes.append(f"Of {each.campaign.name}, {share} have the outcome {outcome}: {message}")

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-import sys
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import groupby, islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from spacerobot_ros.campaign.config import Campaign, Criterion, meets_criterion
+from spacerobot_ros.campaign.config import Campaign, Criterion
 from spacerobot_ros.campaign.dataset import DRAW_PREFIX, Dataset
 from spacerobot_ros.campaign.draws import Draws, require_module
 from spacerobot_ros.campaign.metrics import metric_of
@@ -40,8 +41,7 @@ _MAX_BOUND_DISTANCE = 100.0
 """Distance from a bound, in standard deviations, beyond which flights are considered equal in this
 order."""
 
-_REASON = "reason"
-_TEXT_COLUMNS = ("outcome", _REASON, "engine", "fallback")
+_ROW_COLUMNS = ("flight", "passed", "outcome", "reason", "engine", "fallback", "wall_time_s")
 
 _MAIN_METRICS = (
     *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg"),
@@ -49,69 +49,10 @@ _MAIN_METRICS = (
     *("detumbling_time_s", "detumbling_bound_s"),
 )
 
+_FLAG_METRICS = [name for name, metric in METRICS.items() if metric.yes_or_no]
+
 _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
 """Uncontrolled goal components in a flight's message."""
-
-
-class Columns(Mapping[str, Any]):
-    """Dataset columns by name, with values in flight order; columns are read on demand.
-
-    Numbers are arrays (N,) with NaN for missing values; strings are lists with None for missing
-    values.
-
-    Parameters
-    ----------
-    dataset
-        The dataset.
-
-    Raises
-    ------
-    ParameterError
-        It has no rows.
-    """
-
-    def __init__(self, dataset: Dataset) -> None:
-        self._dataset = dataset
-        self._known: dict[str, Any] = {}
-        self._known["flight"] = dataset.table(["flight"])["flight"].to_numpy().astype(float)
-
-    def read(self, names: Iterable[str]) -> None:
-        """Read several columns, opening each file once."""
-        left = [name for name in names if name not in self._known]
-        table = self._dataset.table(left)
-        text = require_module("pyarrow").string()
-        for name in left:
-            self._known[name] = None
-            if name not in table.column_names:
-                continue
-            column = table[name]
-            # Converted data is freed immediately: a million rows of a column take 8 MB.
-            table = table.drop_columns([name])
-            if name in _TEXT_COLUMNS or column.type == text:
-                self._known[name] = self._texts(column.cast(text))
-            else:
-                # Missing numbers become NaN; seeds beyond 2^53 are rounded.
-                self._known[name] = column.cast("double", safe=False).to_numpy()
-
-    def _texts(self, column: Any) -> list[str | None]:
-        """Return a string column; equal strings share one object."""
-        known: dict[str | None, str | None] = {}
-        return [known.setdefault(x, x) for chunk in column.chunks for x in chunk.to_pylist()]
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self._known:
-            self.read([name])
-        # The reasons of a million flights take 300 MB, and are not kept.
-        values = self._known.pop(name) if name == _REASON else self._known[name]
-        if values is None:
-            raise KeyError(name)
-        return values
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name, values in self._known.items() if values is not None)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
 
 
 @dataclass(frozen=True)
@@ -124,23 +65,25 @@ class Results:
         The campaign.
     folder
         Folder of the dataset.
-    flight_numbers
-        (N,) flight numbers.
     columns
-        Columns by name: arrays of numbers, lists of strings.
+        The report's columns (N,) by name, in flight order: numbers, with NaN for missing values,
+        or strings.
+    messages
+        Each outcome with a message and its number of flights, the most frequent first. Numbers are
+        omitted from a message unless they are the same in all these flights.
     planned_flights
         Number of flights in the whole campaign.
     """
 
     campaign: Campaign
     folder: Path
-    flight_numbers: Array
     columns: Mapping[str, Any]
+    messages: Sequence[tuple[str, int, str]]
     planned_flights: int
 
     @classmethod
-    def of(cls, folder: Path) -> Results:
-        """Read a dataset.
+    def of(cls, folder: Path, others: Sequence[str] = ()) -> Results:
+        """Read a dataset, including the columns of other metrics.
 
         Raises
         ------
@@ -149,12 +92,18 @@ class Results:
         """
         dataset = Dataset(folder)
         campaign = dataset.campaign()
-        columns = Columns(dataset)
-        shown = {*_MAIN_METRICS, *campaign.named_metrics}
-        shown |= {name for name, metric in METRICS.items() if metric.yes_or_no}
-        drawn = [f"{DRAW_PREFIX}{name}" for name in campaign.names]
-        columns.read(["passed", "wall_time_s", *drawn, *sorted(shown)])
-        return cls(campaign, folder, columns["flight"], columns, len(Draws(campaign)))
+        metrics = dict.fromkeys([*_MAIN_METRICS, *campaign.named_metrics, *_FLAG_METRICS, *others])
+        draws = [f"{DRAW_PREFIX}{name}" for name in campaign.names]
+        table = dataset.table([*_ROW_COLUMNS, *draws, *metrics])
+        messages = _messages(table.select(["outcome", "reason"]))
+        table = table.drop_columns(["reason"])  # A million messages take 300 MB as strings.
+        columns = {name: _values(table[name]) for name in table.column_names}
+        return cls(campaign, folder, columns, messages, len(Draws(campaign)))
+
+    @property
+    def flight_numbers(self) -> Array:
+        """(N,) flight numbers."""
+        return np.asarray(self.columns["flight"])
 
     def __len__(self) -> int:
         return len(self.flight_numbers)
@@ -182,47 +131,36 @@ class Results:
     @property
     def success_share(self) -> Share:
         """Share of flights that passed."""
-        return share(int(self.passed.sum()), len(self))
+        return share(self.passed)
 
     @property
     def drawn_numbers(self) -> dict[str, Array]:
         """(N,) drawn values by dispersion name; numbers only."""
         columns = {name: self.columns[f"{DRAW_PREFIX}{name}"] for name in self.campaign.names}
-        return {name: x for name, x in columns.items() if isinstance(x, np.ndarray)}
+        return {name: x for name, x in columns.items() if x.dtype != object}
 
-    @property
+    @cached_property
     def shown_metrics(self) -> list[str]:
         """Report metrics that have values: the metrics named in the campaign, and the main
         metrics."""
-        names = self.campaign.named_metrics
-        names += [name for name in _MAIN_METRICS if name not in names]
+        names = dict.fromkeys([*self.campaign.named_metrics, *_MAIN_METRICS])
         return [name for name in names if np.isfinite(self.columns.get(name, np.nan)).any()]
 
     @property
     def refused(self) -> Flags:
         """(N,) whether each flight's goal was refused."""
-        return np.array([outcome == "refused" for outcome in self.columns["outcome"]], dtype=bool)
+        return np.asarray(self.columns["outcome"] == "refused")
 
-    @cached_property
-    def messages(self) -> tuple[list[str], dict[str, str]]:
-        """Each flight's message without numbers; and, for each such message, the message with
-        numbers if the numbers are the same in all flights.
-        """
-        found: list[str] = []
-        forms: dict[str, str] = {}
-        for reason in self.columns[_REASON]:
-            text = reason or ""
-            # Equal messages are one object.
-            message = sys.intern(re.sub(r"-?\d[\d.e+-]*", "…", text))
-            found.append(message)
-            if forms.setdefault(message, text) != text:
-                forms[message] = message
-        return found, forms
+    @property
+    def shown_messages(self) -> list[tuple[str, int, str]]:
+        """The most frequent messages of each outcome."""
+        by_outcome = groupby(self.messages, key=itemgetter(0))
+        return [each for _, found in by_outcome for each in islice(found, _MESSAGES_SHOWN)]
 
     @property
     def not_controlled(self) -> list[str]:
         """Goal components that successful flights did not control, according to their messages."""
-        notes = [_NOT_CONTROLLED.search(text) for text in self.messages[1]]
+        notes = [_NOT_CONTROLLED.search(text) for _, _, text in self.messages]
         named = {part for note in notes if note for part in note[1].split(" and ")}
         return sorted(named)
 
@@ -234,12 +172,8 @@ class Results:
     @property
     def sampler_shares(self) -> dict[str, Share]:
         """Shares of flights for which a flag (yes or no) is true, by metric name."""
-        found = {}
-        for name, metric in METRICS.items():
-            values = self.columns.get(name)
-            if metric.yes_or_no and values is not None and np.isfinite(values).any():
-                found[name] = share(int((values == 1.0).sum()), len(self))
-        return found
+        flags = {name: self.columns.get(name, np.full(1, np.nan)) for name in _FLAG_METRICS}
+        return {name: share(x == 1.0) for name, x in flags.items() if np.isfinite(x).any()}
 
     def metrics(self) -> dict[str, Array]:
         """Return the columns of the report metrics."""
@@ -247,21 +181,17 @@ class Results:
 
     def share_meeting(self, criterion: Criterion) -> Share:
         """Return the share of flights that meet a criterion."""
-        values = self.columns[criterion.metric].tolist()
-        met = sum(meets_criterion(criterion, {criterion.metric: value}) for value in values)
-        return share(met, len(self))
+        values = self.columns[criterion.metric]
+        return share((criterion.minimum <= values) & (values <= criterion.maximum))
 
     def influences(self) -> list[Influence]:
         """Return the sensitivities, strongest first, with Sobol indices if available."""
-        passing = {PASSING: self.passed.astype(float)}
-        found = corrected_for_multiple_tests(
-            influences(self.drawn_numbers, passing | self.metrics())
-        )
+        metrics = {PASSING: self.passed.astype(float), **self.metrics()}
+        found = corrected_for_multiple_tests(influences(self.drawn_numbers, metrics))
         whole = self.campaign.sampler == "saltelli" and len(self) == self.planned_flights
         if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
             names = list(self.drawn_numbers)
-            indices = {PASSING: sobol_indices(names, self.passed.astype(float))}
-            indices |= {name: sobol_indices(names, x) for name, x in self.metrics().items()}
+            indices = {name: sobol_indices(names, values) for name, values in metrics.items()}
             for place, each in enumerate(found):
                 if known := indices[each.metric].get(each.cause):
                     first, total = known[:2], known[2:]
@@ -277,7 +207,7 @@ class Results:
     def success_by_bins(self, name: str) -> list[Bin]:
         """Return the shares of flights that passed as a function of the drawn values with a given
         name."""
-        return success_by_bins(np.asarray(self.columns[f"{DRAW_PREFIX}{name}"]), self.passed)
+        return success_by_bins(self.columns[f"{DRAW_PREFIX}{name}"], self.passed)
 
     def worst_rows(self) -> list[int]:
         """Return the rows of the worst flights: first failed flights, then flights that missed a
@@ -292,33 +222,43 @@ class Results:
             spread = x[np.isfinite(x)].std() if np.isfinite(x).any() else 1.0
             over = np.maximum(x - criterion.maximum, criterion.minimum - x) / (spread or 1.0)
             # A missing metric counts as beyond its bounds.
-            badness = np.maximum(
-                badness,
-                np.clip(
-                    np.nan_to_num(over, nan=_MAX_BOUND_DISTANCE),
-                    -_MAX_BOUND_DISTANCE,
-                    _MAX_BOUND_DISTANCE,
-                ),
-            )
+            over = np.nan_to_num(over, nan=_MAX_BOUND_DISTANCE)
+            badness = np.maximum(badness, np.clip(over, -_MAX_BOUND_DISTANCE, _MAX_BOUND_DISTANCE))
         if not self.campaign.criteria:
             badness = np.nan_to_num(self.columns["position_error_m"])
-        badness += 1e6 * (np.array(self.columns["outcome"]) != "reached")
+        badness += 1e6 * (self.columns["outcome"] != "reached")
         badness += 1e3 * ~self.passed
         order = np.lexsort((self.flight_numbers, -badness))
         return [int(row) for row in order[:_WORST_FLIGHTS_SHOWN]]
 
 
-def messages_of(results: Results) -> list[tuple[str, int, str]]:
-    """Return the outcomes, each with its most frequent message and number of flights.
-
-    Messages that differ only in numbers are merged, and the numbers are omitted.
-    """
-    messages, forms = results.messages
-    kinds: dict[str, Counter[str]] = {}
-    for outcome, message in zip(results.columns["outcome"], messages, strict=True):
-        kinds.setdefault(outcome, Counter())[message] += 1
+def _messages(table: Any) -> list[tuple[str, int, str]]:
+    """Return the messages of :class:`Results` from a pyarrow table of outcomes and reasons."""
+    compute = require_module("pyarrow.compute")
+    reasons = compute.fill_null(table["reason"], "")
+    forms = compute.replace_substring_regex(reasons, r"-?\d[\d.e+-]*", "…")
+    table = table.select(["outcome"]).append_column("form", forms).append_column("reason", reasons)
+    groups = table.group_by(["outcome", "form"], use_threads=False).aggregate(
+        [("reason", "count"), ("reason", "min"), ("reason", "max")]
+    )
+    kinds: dict[str, list[tuple[int, str]]] = {}
+    for group in groups.to_pylist():
+        same = group["reason_min"] == group["reason_max"]
+        text = group["reason_min"] if same else group["form"]
+        kinds.setdefault(group["outcome"], []).append((group["reason_count"], text))
+    by_count = sorted(kinds.items(), key=lambda kind: -sum(count for count, _ in kind[1]))
     return [
-        (outcome, count, forms[message])
-        for outcome, counts in sorted(kinds.items(), key=lambda kind: -kind[1].total())
-        for message, count in counts.most_common(_MESSAGES_SHOWN)
+        (outcome, count, text)
+        for outcome, found in by_count
+        for count, text in sorted(found, key=lambda each: -each[0])
     ]
+
+
+def _values(column: Any) -> npt.NDArray[Any]:
+    """Return a pyarrow column as an array of numbers or strings; equal strings are one object."""
+    arrow = require_module("pyarrow")
+    if column.type == arrow.string():
+        encoded = column.combine_chunks().dictionary_encode()
+        return np.array(encoded.dictionary.to_pylist(), object)[encoded.indices.to_numpy()]
+    # Missing numbers become NaN.
+    return np.asarray(column.cast("double").to_numpy())

@@ -49,8 +49,9 @@ class Share:
         )
 
 
-def share(count: int, total: int) -> Share:
-    """Return a share with its intervals; if there are no flights, both intervals are 0 to 1."""
+def share(flags: Flags) -> Share:
+    """Return the share of flights (N,) with a flag; without flights, its intervals are 0 to 1."""
+    count, total = int(np.count_nonzero(flags)), len(flags)
     if not total:
         return Share(0, 0, 0.0, 1.0, (0.0, 1.0))
     from scipy.stats import binomtest
@@ -96,7 +97,7 @@ def success_by_bins(drawn: npt.NDArray[Any], passed: Flags) -> list[Bin]:
     for of in bins:
         if of.any():
             inside = np.unique(drawn[of])
-            found.append(Bin(inside[0], inside[-1], share(int(passed[of].sum()), int(of.sum()))))
+            found.append(Bin(inside[0], inside[-1], share(passed[of])))
     return found
 
 

@@ -16,7 +16,7 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
-from spacerobot_ros.campaign.config import Criterion, load_campaign, meets_criterion
+from spacerobot_ros.campaign.config import Criterion, load_campaign, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
 from spacerobot_ros.campaign.rows import Row
@@ -51,7 +51,7 @@ def wilson(count: int, total: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize(("count", "total"), [(3, 11), (11, 11), (0, 7), (40, 41)])
 def test_shares_have_intervals(count: int, total: int) -> None:
-    found = share(count, total)
+    found = share(np.arange(total) < count)
     assert found.value == count / total
     assert (found.interval_low, found.interval_high) == pytest.approx(
         wilson(count, total), abs=1e-12
@@ -66,7 +66,7 @@ def test_shares_have_intervals(count: int, total: int) -> None:
 
 
 def test_a_share_of_nothing_is_between_none_and_all() -> None:
-    nothing = share(0, 0)
+    nothing = share(np.zeros(0, bool))
     assert (nothing.interval_low, nothing.interval_high, nothing.exact_interval) == (
         0.0,
         1.0,
@@ -200,8 +200,9 @@ def test_paired_success_is_mcnemars() -> None:
 def test_criteria_include_their_bounds() -> None:
     criterion = Criterion("duration_s", 1.5, 2.5)
     for value, met in ((1.5, True), (2.5, True), (1.49, False), (2.51, False), (math.nan, False)):
-        assert meets_criterion(criterion, {"duration_s": value}) is met
-    assert not meets_criterion(criterion, {})
+        assert passes_criteria([criterion], "reached", {"duration_s": value}) is met
+    assert not passes_criteria([criterion], "reached", {})
+    assert not passes_criteria([criterion], "failed", {"duration_s": 2.0})
 
 
 @pytest.mark.parametrize(

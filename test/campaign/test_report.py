@@ -26,7 +26,7 @@ from spacerobot_ros.campaign.report import (
     write_campaign_report,
     write_comparison,
 )
-from spacerobot_ros.campaign.results import PASSING, Columns, Results
+from spacerobot_ros.campaign.results import PASSING, Results
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import ParameterError
@@ -418,24 +418,15 @@ def multiply(folder: Path, copies: int) -> None:
         parquet.write_table(made, folder / "flights" / f"part-{copy:06d}.parquet")
 
 
-def test_columns_are_in_the_order_of_the_flights_and_read_where_they_are_needed(
-    tmp_path: Path,
-) -> None:
+def test_columns_are_in_the_order_of_the_flights(tmp_path: Path) -> None:
     run_campaign(campaign(disperse=DISPERSIONS, flights=7, seed=3), tmp_path)
     multiply(tmp_path, 3)
-    columns = Columns(Dataset(tmp_path))
-    assert [*columns] == ["flight"]
-    np.testing.assert_array_equal(columns["flight"], np.arange(21.0))
-    table = Dataset(tmp_path).table()
-    for name in ("draw.mass.mass_2", "duration_s", "passed"):
-        np.testing.assert_array_equal(columns[name], np.array(table[name], dtype=float))
-    for name in ("outcome", "reason", "fallback"):
-        assert columns[name] == table[name].to_pylist()
-    assert columns.get("no_column") is None
-    # Reasons are read again, not kept.
-    assert {*columns} == {"flight", "draw.mass.mass_2", "duration_s", "passed", "outcome"} | {
-        "fallback"
-    }
-    messages, forms = Results.of(tmp_path).messages
-    assert len(messages) == 21
-    assert all("…" in form for form in forms.values())
+    results, table = Results.of(tmp_path), Dataset(tmp_path).table()
+    np.testing.assert_array_equal(results.flight_numbers, np.arange(21.0))
+    for name in ("draw.mass.mass_2", "manoeuvre_time_s", "passed"):
+        np.testing.assert_array_equal(results.columns[name], np.array(table[name], dtype=float))
+    for name in ("outcome", "fallback"):
+        assert results.columns[name].tolist() == table[name].to_pylist()
+    assert {"no_column", "reason"}.isdisjoint(results.columns)
+    assert sum(count for _, count, _ in results.messages) == 21
+    assert all("…" in message for _, _, message in results.messages)
