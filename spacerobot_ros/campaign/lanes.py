@@ -48,7 +48,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_fr
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.core.goal import POSE, missed_parts, reached_message
-from spacerobot_ros.planning.execution.status import PlannerStatus, describe_remaining_error
+from spacerobot_ros.planning.execution.status import describe_remaining_error
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
@@ -108,26 +108,18 @@ _OUTCOME_OF_DECISION = {
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """A schedule from the first state, and the planner's status when it began."""
-
-    schedule: GaitSchedule
-    status: PlannerStatus
-
-
-@dataclass(frozen=True)
 class _PreparedDraw:
-    """A draw that is ready for lanes, with its plan, if any, and the planning wall time, s."""
+    """A draw that is ready for lanes, with its schedule, if any, and the planning wall time, s."""
 
     draw: Draw
     flight: DrawnFlight
-    plan: _Plan | None = None
+    planned: GaitSchedule | None = None
     plan_time: float = 0.0
 
     @property
     def schedule(self) -> GaitSchedule:
-        assert self.plan is not None
-        return self.plan.schedule
+        assert self.planned is not None
+        return self.planned
 
 
 class LanesEngine:
@@ -202,7 +194,7 @@ class LanesEngine:
                 yield ready
                 continue
             batch.append(ready)
-            ticks += 0 if ready.plan is None else ready.schedule.ticks
+            ticks += 0 if ready.planned is None else ready.schedule.ticks
             late = time.perf_counter() - began > _MAX_BATCH_PREPARATION_TIME
             most = max(lanes.max_batch_flights, self.efficient_flights)
             if late or len(batch) >= most or ticks > _MAX_BATCH_TICKS:
@@ -252,9 +244,9 @@ class _ScheduledLanes:
     max_batch_flights = 512
 
     def __init__(self) -> None:
-        self._planned_values: _PlannedValues | None = None
-        """The values that determine plans for the last scenario, common to many draws."""
-        self._last_plan: tuple[Any, _Plan | None] | None = None
+        self._last_scenario: tuple[Scenario, Any] | None = None
+        """The last scenario, common to many draws, and its :func:`_planned_values`."""
+        self._last_plan: tuple[Any, GaitSchedule | None] | None = None
         """The last plan made from a noise-free state, and the values that determine this plan."""
 
     def refusal(self, campaign: Campaign) -> str:
@@ -266,12 +258,11 @@ class _ScheduledLanes:
             return "the goal specifies end-effector poses"
         if planner.replanning or planner.output != "commands":
             return "the planner replans during the motion"
-        dispersed = [each.name for each in campaign.dispersions]
-        for name in dispersed:
+        for name in campaign.names:
             if name.startswith(_PARAMETERS_COMMON_TO_SCHEDULES):
                 return f"'{name}' is dispersed, but shared by all lanes"
         noisy = sensors.joint_noise or any(sensors.joint_bias)
-        if noisy or any(name.startswith("plant.sensors.joint") for name in dispersed):
+        if noisy or _any_begins(campaign.names, "plant.sensors.joint"):
             return "the joints are measured with errors"
         return ""
 
@@ -279,24 +270,25 @@ class _ScheduledLanes:
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | Fallback:
         began = time.perf_counter()
-        plan, goal = self._plan_first_state(flight), flight.scenario.goal
-        if plan is None:
+        schedule, goal = self._plan_first_state(flight), flight.scenario.goal
+        if schedule is None:
             return Fallback(draw, "had no schedule in its first state")
-        if plan.schedule.controls & (POSE - goal.asked):
+        if schedule.controls & (POSE - goal.asked):
             return Fallback(draw, "maintains a part of the pose that its goal does not specify")
-        return _PreparedDraw(draw, flight, plan, time.perf_counter() - began)
+        return _PreparedDraw(draw, flight, schedule, time.perf_counter() - began)
 
-    def _plan_first_state(self, flight: DrawnFlight) -> _Plan | None:
+    def _plan_first_state(self, flight: DrawnFlight) -> GaitSchedule | None:
         """Return the plan for the first state; the last plan is reused if its values are equal."""
-        values = self._planned_values
-        if values is None or values.scenario is not flight.scenario:
-            values = self._planned_values = _PlannedValues.of(flight.scenario)
-        if values.are_noisy:
+        if self._last_scenario is None or self._last_scenario[0] is not flight.scenario:
+            self._last_scenario = flight.scenario, _planned_values(flight.scenario)
+        values = self._last_scenario[1]
+        if values is None:
             return _first_plan(flight)
+        others, depends_on_masses = values
         masses = None
-        if values.depend_on_masses and flight.inertial is not None:
+        if depends_on_masses and flight.inertial is not None:
             masses = flight.inertial.vector.tolist()
-        key = values.others, masses
+        key = others, masses
         if self._last_plan is None or self._last_plan[0] != key:
             self._last_plan = key, _first_plan(flight)
         return self._last_plan[1]
@@ -362,7 +354,6 @@ class _ScheduledLanes:
             if duration > campaign.max_flight_time:
                 yield "took longer than the campaign allows"
                 continue
-            assert ready.plan is not None
             hand = _end_effector_error(flights.robot, ready.flight, q[row], pose)
             lowest, highest = extremes[id(schedule)]
             yield Measures(
@@ -378,7 +369,6 @@ class _ScheduledLanes:
                 highest=highest,
                 momentum_drift=drifts[row],
                 end_effector_distance=math.nan if hand is None else hand.distance,
-                corrections=ready.plan.status.corrections,
                 plan_time=ready.plan_time,
                 wall_time=taken + ready.plan_time,
             )
@@ -408,8 +398,7 @@ class _ControlledLanes:
             return "its controller tracks planned references; use engine 'flights'"
         if scenario.controller.tasks:
             return "its controller performs tasks before goals; use engine 'flights'"
-        for dispersion in campaign.dispersions:
-            name = dispersion.name
+        for name in campaign.names:
             own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)
             if own or name.startswith(_PARAMETERS_COMMON_TO_LANES):
                 return f"'{name}' is dispersed, but shared by all lanes"
@@ -417,10 +406,8 @@ class _ControlledLanes:
             law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
         except SpaceRobotError as error:
             return str(error)
-        if law.integrates or any(
-            each.name.startswith(_GAIN_PREFIX) and each.name.endswith(".ki")
-            for each in campaign.dispersions
-        ):
+        gains = [name for name in campaign.names if name.startswith(_GAIN_PREFIX)]
+        if law.integrates or any(name.endswith(".ki") for name in gains):
             return "its controller has integral gains; use engine 'flights'"
         if law.couples:
             return "its gains are matrices; use engine 'flights'"
@@ -451,7 +438,7 @@ class _ControlledLanes:
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
         goals = [_goals_by_frame(each.scenario) for each in drawn]
-        dispersed = any(each.name.startswith(_GAIN_PREFIX) for each in campaign.dispersions)
+        dispersed = _any_begins(campaign.names, _GAIN_PREFIX)
         gains = tuple(each.scenario.controller.gains for each in drawn) if dispersed else ()
         program = ControlledGoals(
             scenario.controller,
@@ -528,6 +515,10 @@ class _ControlledLanes:
         )
 
 
+def _any_begins(names: Iterable[str], prefixes: str | tuple[str, ...]) -> bool:
+    return any(name.startswith(prefixes) for name in names)
+
+
 def _batch_of_flights(
     drawn: Sequence[DrawnFlight],
     program: FollowedSchedule | ControlledGoals,
@@ -600,47 +591,29 @@ def _decide_goal(
     return Outcome.FAILED, f"The goal is not reached after 0 corrections: {remaining}."
 
 
-@dataclass(frozen=True)
-class _PlannedValues:
-    """The values of a scenario that determine a plan for the first state.
-
-    ``are_noisy``: the first measured state may differ from draw to draw. ``others`` are all values
-    that determine a plan without noise, except the masses of the plant's robot.
-    """
-
-    scenario: Scenario
-    are_noisy: bool
-    depend_on_masses: bool
-    others: Any
-
-    @classmethod
-    def of(cls, scenario: Scenario) -> _PlannedValues:
-        plant, goal = scenario.plant, scenario.goal
-        sensors = {name: value for name, value in vars(plant.sensors).items() if name != "seed"}
-        # Plans from rest do not depend on the masses of the plant's robot.
-        moving = any(plant.linear_momentum) or any(plant.angular_momentum)
-        shape = None if goal.joint_positions is None else goal.joint_positions.tolist()
-        return cls(
-            scenario,
-            are_noisy=any(np.any(value) for value in sensors.values()),
-            depend_on_masses=bool(moving or plant.initial_center_of_mass),
-            others=(
-                *(scenario.planner, {**vars(plant), "sensors": sensors}),
-                *(goal.position.tolist(), goal.quaternion.tolist(), shape),
-            ),
-        )
+def _planned_values(scenario: Scenario) -> tuple[Any, bool] | None:
+    """Return all values that determine a plan for the first state, except the masses of the plant's
+    robot, and whether the plan depends on these; None if the first measured state has noise."""
+    plant, goal = scenario.plant, scenario.goal
+    sensors = {name: value for name, value in vars(plant.sensors).items() if name != "seed"}
+    if any(np.any(value) for value in sensors.values()):
+        return None
+    # Plans from rest do not depend on the masses of the plant's robot.
+    moving = any(plant.linear_momentum) or any(plant.angular_momentum)
+    shape = None if goal.joint_positions is None else goal.joint_positions.tolist()
+    pose = goal.position.tolist(), goal.quaternion.tolist()
+    others = scenario.planner, {**vars(plant), "sensors": sensors}, *pose, shape
+    return others, bool(moving or plant.initial_center_of_mass)
 
 
-def _first_plan(flight: DrawnFlight) -> _Plan | None:
+def _first_plan(flight: DrawnFlight) -> GaitSchedule | None:
     """Let the executive plan for the first state; None if there is no complete schedule."""
     period = flight.scenario.plant.control_period
     first = fly_scenario(flight.seeded_scenario, robots=robots_of(flight), longest=period)
     if len(first.schedules) != 1 or first.gait is None:
         return None
     ((begins_ns, schedule),) = first.schedules
-    if begins_ns or schedule.partial or not schedule.ticks:
-        return None
-    return _Plan(schedule, first.gait)
+    return None if begins_ns or schedule.partial or not schedule.ticks else schedule
 
 
 @lru_cache(maxsize=64)

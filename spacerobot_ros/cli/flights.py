@@ -360,7 +360,7 @@ def up_command(
     parameters = {**shown, **chosen.parameters("viewer")}
     with viewer_if_requested(view, parameters, namespace, settings) as viewer:
         if viewer is not None:
-            viewer.restart_within(restarts)
+            viewer.restarts = restarts
         recorded = run_until_stopped(
             chosen,
             bag,

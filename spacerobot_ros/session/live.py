@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -71,23 +71,22 @@ def fly_by_nodes(
     SpaceRobotError
         A parameter or the robot is invalid, or the bag cannot be recorded.
     """
-    with ros():
-        stack = MultiProcessStack(scenario, bag)
-        try:
-            with graceful_shutdown() as stopped:
-                stack.start(scenario.goal, stopped)
-                began = time.perf_counter()
+    with (
+        ros(),
+        closing(MultiProcessStack(scenario, bag)) as stack,
+        graceful_shutdown() as stopped,
+    ):
+        stack.start(scenario.goal, stopped)
+        began = time.perf_counter()
 
-                def look() -> bool:
-                    progress(stack.time_ns / SECOND, stack.client.ends_at)
-                    return stopped() or stack.time_ns / SECOND >= longest
+        def look() -> bool:
+            progress(stack.time_ns / SECOND, stack.client.ends_at)
+            return stopped() or stack.time_ns / SECOND >= longest
 
-                stack.spin(look)
-                wall_time = time.perf_counter() - began
-                stack.finish()
-                return _summary(stack, wall_time)
-        finally:
-            stack.close()
+        stack.spin(look)
+        wall_time = time.perf_counter() - began
+        stack.finish()
+        return _summary(stack, wall_time)
 
 
 def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
@@ -169,26 +168,25 @@ def run_until_stopped(
     SpaceRobotError
         A node cannot start, or has ended unexpectedly.
     """
-    with ros():
-        stack = MultiProcessStack(scenario, bag, namespace, restarts=restarts, show=show)
-        try:
-            with graceful_shutdown() as stopped:
-                stack.start(None)
-                with suppress(OSError):
-                    topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
-                    show(f"{scenario.name} is up. Send goals on '{topic}'; Ctrl-C ends it.")
-                stack.client.on_message = _StatusPrinter(show)
-                stack.client.on_message(stack.client.message)
+    with (
+        ros(),
+        closing(MultiProcessStack(scenario, bag, namespace, restarts=restarts, show=show)) as stack,
+        graceful_shutdown() as stopped,
+    ):
+        stack.start(None)
+        with suppress(OSError):
+            topic = f"{stack.namespace}/goal_pose" if stack.namespace else "goal_pose"
+            show(f"{scenario.name} is up. Send goals on '{topic}'; Ctrl-C ends it.")
+        stack.client.on_message = _StatusPrinter(show)
+        stack.client.on_message(stack.client.message)
 
-                def look() -> bool:
-                    supervise()
-                    return stopped()
+        def look() -> bool:
+            supervise()
+            return stopped()
 
-                stack.spin(look)
-                stack.finish()
-                return stack.bag
-        finally:
-            stack.close()
+        stack.spin(look)
+        stack.finish()
+        return stack.bag
 
 
 def send_goal(

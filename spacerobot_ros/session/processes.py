@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import signal
-import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +13,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -41,13 +38,13 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerStatistics
 from spacerobot_ros.scenario import COMMANDERS, Kill, Scenario
+from spacerobot_ros.session.child import NodeProcess, last_error
 from spacerobot_ros.session.mission_client import MissionClient
-from spacerobot_ros.termination import end_child, start_child
+from spacerobot_ros.termination import end_child
 from spacerobot_ros.times import SECOND, stamp_to_ns
-from spacerobot_ros.topics import GLOBAL_TOPICS, TOPICS_NOT_RECORDED
+from spacerobot_ros.topics import TOPICS_NOT_RECORDED
 
 _LONGEST_START = 60.0  # wall s
-_RESTART_PERIOD = 60.0  # wall s, over which restarts are counted
 
 _LONGEST_END = 10.0
 """Wall time, s, after a signal at which a node that is still running is killed."""
@@ -79,7 +76,6 @@ _LONGEST_RECORDING_DELAY = 1.0
 
 _LONGEST_ANSWER_AFTER_INTERRUPT = 0.5  # wall s
 _CONNECTION_CHECK_PERIOD = 0.05  # wall s
-_CHILD_MODULE = "spacerobot_ros.session.child"
 
 
 def checked_namespace(name: str) -> str:
@@ -148,13 +144,13 @@ class MultiProcessStack:
         """Node names, in start order."""
         for name in self.names:
             scenario.config(name)  # Invalid parameters are refused before any node runs.
-        self._restarts, self._show = RestartLimit(restarts), show
+        self._restarts, self._show = restarts, show
         self._timeline = KillTimeline(scenario.kills)
         self.time_ns = 0
         """Last received simulated time, ns."""
         self._clock_seen = math.inf
         self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._processes: dict[str, NodeProcess] = {}
         names: Sequence[str] | None = None
         if scenario.goal.joint_positions is not None:
             robot = robot_of(scenario.plant)
@@ -211,39 +207,30 @@ class MultiProcessStack:
             overrides["plan_in_background"] = False  # Set before the plant reports lockstep.
         if name == "recorder":
             overrides |= {"bag": str(self.bag), "when_exists": self.when_exists}
-            record = Path(self._folder.name, "scenario.json")
+            record = self._path("scenario.json")
             records = self.scenario.records([other for other in self.names if other != name])
             record.write_text(json.dumps(records), "utf-8")
             overrides["describe"] = str(record)
-        elif (self.scenario.kills or self._restarts.most) and name in COMMANDERS:
-            overrides.setdefault("resume_file", str(Path(self._folder.name, f"{name}_goal.json")))
+        elif (self.scenario.kills or self._restarts) and name in COMMANDERS:
+            overrides.setdefault("resume_file", str(self._path(f"{name}_goal.json")))
         if name == self.scenario.commanders[0] and self.scenario.lockstep:
             overrides["stop_when_decided"] = True
-        overrides |= parameters
-        overrides = {k: list(v) if isinstance(v, tuple) else v for k, v in overrides.items()}
-        module, folder = NODE_TYPES[name].__module__, Path(self._folder.name)
-        words = node_arguments(name, module, overrides, folder, self.namespace)
-        with self._log_file_of(name).open("wb") as log:
-            self.processes[name] = start_child(words, self._environment(), stdout=log, stderr=log)
+        module, folder = NODE_TYPES[name].__module__, self._path()
+        process = NodeProcess(name, module, folder, self.namespace, self._restarts)
+        process = self._processes.setdefault(name, process)
+        process.start({**overrides, **parameters}, environment=self._environment())
+
+    def _path(self, name: str = "") -> Path:
+        return Path(self._folder.name, name)
 
     def _environment(self) -> dict[str, str]:
         """Return the environment of a node; variables set by the user are kept."""
         environment = {**_SETTINGS_WITHOUT_SHARED_MEMORY, **os.environ}
         if not any(name in environment for name in FASTDDS_FILE_VARIABLES):
-            file = Path(self._folder.name, "fastdds.xml")
+            file = self._path("fastdds.xml")
             file.write_text(_FASTDDS_SETTINGS, "utf-8")
             environment |= dict.fromkeys(FASTDDS_FILE_VARIABLES, str(file))
         return environment
-
-    def _log_file_of(self, name: str) -> Path:
-        return Path(self._folder.name, f"{name}.txt")
-
-    def _end_message(self, name: str) -> str:
-        code = self.processes[name].returncode
-        return end_message(name, code, self._read_log(name))
-
-    def _read_log(self, name: str) -> str:
-        return self._log_file_of(name).read_text("utf-8", errors="replace")
 
     def start(self, goal: Goal | None, stopped: Callable[[], bool] = lambda: False) -> None:
         """Activate all nodes and send the goal, if any; the plant starts last. This ends early if
@@ -304,21 +291,25 @@ class MultiProcessStack:
         self._spin_for(0.0 if interrupted else _LONGEST_RECORDING_DELAY)
         if "planner" in present:
             self._ask_statistics(_LONGEST_ANSWER_AFTER_INTERRUPT if interrupted else _LONGEST_START)
-        ended: dict[str, int] = {}
-        for group in ([name for name in present if name != "recorder"], ["recorder"]):
-            ended |= self._end_nodes([name for name in group if name in present])
-        for name, code in ended.items():
-            if code != 0:
-                raise SpaceRobotError(end_message(name, code, self._read_log(name)))
+        processes = [self._processes[name] for name in present]
+        for process in processes:
+            if process.name != "recorder":
+                process.child.send_signal(signal.SIGINT)
+        for process in processes:
+            # SIGABRT makes a hanging node print a traceback.
+            end_child(process.child, {signal.SIGINT: _LONGEST_END, signal.SIGABRT: 1.0})
+        for process in processes:
+            if process.exit_code != 0:
+                raise SpaceRobotError(process.end_message)
 
     def close(self) -> None:
         """End all node processes that are still running."""
-        left = [process for process in self.processes.values() if process.poll() is None]
+        left = [each for each in self._processes.values() if each.exit_code is None]
         for process in left:
-            process.send_signal(signal.SIGTERM)
+            process.child.send_signal(signal.SIGTERM)
         end = time.monotonic() + _LONGEST_ANSWER_AFTER_INTERRUPT
         for process in left:
-            end_child(process, {0: max(0.0, end - time.monotonic())})
+            end_child(process.child, {0: max(0.0, end - time.monotonic())})
         self.executor.shutdown()
         self.client.node.destroy_node()
         self._folder.cleanup()
@@ -337,15 +328,9 @@ class MultiProcessStack:
                 f"Node '{self._active_elsewhere}' already runs in ROS domain {domain}: end its "
                 "stack, or set ROS_DOMAIN_ID to another number."
             )
-        for name, process in self.processes.items():
-            if process.poll() is not None and name not in self._timeline.away:
-                raise SpaceRobotError(
-                    f"{self._end_message(name)}{self._restarts.count_restart(name)}"
-                )
-
-    def kill(self, name: str) -> None:
-        """Kill a node, as if it had crashed."""
-        end_child(self.processes[name], {})
+        for name, process in self._processes.items():
+            if process.exit_code is not None and name not in self._timeline.away:
+                raise SpaceRobotError(f"{process.end_message}{process.restart_note}")
 
     def _supervise(self) -> None:
         """Kill and start the nodes that the scenario names for this time; the others must run."""
@@ -354,7 +339,7 @@ class MultiProcessStack:
         since = factor * (time.monotonic() - self._clock_seen)
         killed, started = self._timeline.due(self.time_ns / SECOND + since)
         for name in killed:
-            self.kill(name)
+            end_child(self._processes[name].child, {})
         for name in started:
             again = {"resume_bag": str(self.bag or ""), "autostart": True}
             self.launch(name, **(again if name == "plant" else {}))
@@ -363,11 +348,10 @@ class MultiProcessStack:
 
     def _restart_commanders(self) -> None:
         for name in self.scenario.commanders:
-            if self.processes[name].poll() is None or name in self._timeline.away:
+            process = self._processes[name]
+            if name in self._timeline.away or not process.may_restart():
                 continue
-            if not self._restarts.allows_restart(name, time.monotonic()):
-                continue
-            message = f"{self._end_message(name)} It is restarted."
+            message = f"{process.end_message} It is restarted."
             self.launch(name, autostart=True)
             with suppress(OSError):  # A closed terminal must not stop the robot.
                 self._show(message)
@@ -377,13 +361,6 @@ class MultiProcessStack:
                 values = event.to_values(time.time())
                 record = StatusRecord(self.client.node.get_name(), event.level, message, values)
                 self._events.publish(record.encoded())
-
-    def _end_nodes(self, names: Sequence[str]) -> dict[str, int]:
-        for name in names:
-            self.processes[name].send_signal(signal.SIGINT)
-        # SIGABRT makes a hanging node print a traceback.
-        waits = {0: _LONGEST_END, signal.SIGABRT: 1.0}
-        return {name: end_child(self.processes[name], waits) for name in names}
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
         # Nodes of this stack send heartbeats once they are active, not before. A user's viewers and
@@ -398,8 +375,7 @@ class MultiProcessStack:
 
     def _connected(self) -> bool:
         """Ask every node for its connections; return whether all are matched and recorded."""
-        requests = {name: Trigger.Request() for name in self.names}
-        answers = self._call_services(self._get_connections, requests)
+        answers = self._call_services(self._get_connections, Trigger.Request())
         nodes = {
             name: MatchedEndpoints.from_json(answer.message) for name, answer in answers.items()
         }
@@ -420,41 +396,32 @@ class MultiProcessStack:
 
     def _change_states(self, transition: int, names: Sequence[str]) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        answers = self._call_services(self._change_state, dict.fromkeys(names, request))
+        services = {name: self._change_state[name] for name in names}
+        answers = self._call_services(services, request)
         for name, answer in answers.items():
             if not answer.success:
-                error = _last_error(self._read_log(name)) or _NO_ERROR_TEXT
+                error = last_error(self._processes[name].log)
                 raise SpaceRobotError(f"The {name} refuses: {error}")
 
     def _ask_statistics(self, patience: float) -> None:
-        """Request the planner's statistics; an interrupted planner may be busy."""
-        request = {"planner": Trigger.Request()}
-        try:
-            answer = self._call_services({"planner": self._get_statistics}, request, patience)[
-                "planner"
-            ]
-        except _ServiceTimeoutError:
-            if patience < _LONGEST_START:
-                return
-            raise
-        self.statistics = PlannerStatistics.from_json(answer.message)
+        """Request the planner's statistics, which stay unknown if the planner is busy."""
+        services = {"planner": self._get_statistics}
+        with suppress(_ServiceTimeoutError):
+            answer = self._call_services(services, Trigger.Request(), patience)["planner"]
+            self.statistics = PlannerStatistics.from_json(answer.message)
 
     def _call_services(
-        self,
-        services: Mapping[str, Client],
-        requests: Mapping[str, Any],
-        patience: float = _LONGEST_START,
+        self, services: Mapping[str, Client], request: Any, patience: float = _LONGEST_START
     ) -> dict[str, Any]:
         """Send a request to each node as soon as it is discovered, and return the answers."""
-        names = ", ".join(requests)
-        waiting = set(requests)
+        names = ", ".join(services)
         answers: dict[str, Any] = {}
 
         def sent() -> bool:
-            for name in [name for name in waiting if services[name].service_is_ready()]:
-                answers[name] = services[name].call_async(requests[name])
-                waiting.remove(name)
-            return not waiting
+            for name, service in services.items():
+                if name not in answers and service.service_is_ready():
+                    answers[name] = service.call_async(request)
+            return len(answers) == len(services)
 
         self._wait_for(sent, f"the {names}", patience)
         what = f"a response from the {names}"
@@ -493,89 +460,6 @@ def _require_flyable(scenario: Scenario) -> None:
 
 _ACTING_ROLES = (Role.PLANT.value, Role.COMMANDER.value, Role.REPLAY.value)
 """Roles of nodes that must not share a domain with those of another stack."""
-
-_NO_ERROR_TEXT = (
-    "it wrote no error. If another stack is running in this ROS domain, the nodes of that stack "
-    "respond instead: set ROS_DOMAIN_ID to another number."
-)
-
-_LOG_PREFIX = re.compile(r"^\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]*\]: ")
-"""Level, time and name before a message in a node's log."""
-
-
-_CRASH = re.compile(r"^Fatal Python error: .*$", re.MULTILINE)
-_CRASHED_AT = re.compile(r"^Current thread .*\n  File (.*)$", re.MULTILINE)
-
-
-def _last_error(log: str) -> str:
-    """Return the last error that a node logged, or the last line of a traceback, if any."""
-    found = ""
-    for line in log.splitlines():
-        prefix = _LOG_PREFIX.match(line)
-        if prefix is not None:
-            if prefix[1] in ("ERROR", "FATAL"):
-                found = line[prefix.end() :]
-        elif line.strip() and not line[0].isspace() and not line.startswith("Extension mod"):
-            found = line.strip()
-    return found
-
-
-def end_message(name: str, code: int, log: str) -> str:
-    """Return a sentence that explains why a node has ended: the signal and the crash, or the
-    exit code and the error."""
-    if code < 0:
-        # For a signal, Python logs only a crash; other errors in the log are not the cause.
-        how = f"Node '{name}' was ended by {signal.Signals(-code).name}"
-        crash, at = _CRASH.search(log), _CRASHED_AT.search(log)
-        if crash is None:
-            return f"{how}."
-        return f"{how}: {crash[0]} at {at[1]}." if at else f"{how}: {crash[0]}."
-    return f"Node '{name}' has ended with exit code {code}: {_last_error(log) or _NO_ERROR_TEXT}"
-
-
-class RestartLimit:
-    """Limit on the restarts of processes that have died.
-
-    Parameters
-    ----------
-    most
-        Maximum number of restarts of one process within a minute.
-    """
-
-    def __init__(self, most: int) -> None:
-        self.most = most
-        self._restarted: dict[str, list[float]] = {}
-
-    def allows_restart(self, name: str, now: float) -> bool:
-        """Return whether a process may be restarted at a wall time in s; if so, count the
-        restart.
-        """
-        recent = [each for each in self._restarted.get(name, ()) if now - each < _RESTART_PERIOD]
-        allowed = len(recent) < self.most
-        self._restarted[name] = [*recent, now] if allowed else recent
-        return allowed
-
-    def count_restart(self, name: str) -> str:
-        """Return a sentence that states how often a process was restarted, with a leading space."""
-        count = len(self._restarted.get(name, ()))
-        if not count:
-            return ""
-        times = "once" if count == 1 else f"{count} times"
-        return f" It was restarted {times} within a minute, which is the limit (--restarts)."
-
-
-def node_arguments(
-    name: str, module: str, parameters: Mapping[str, Any], folder: Path, namespace: str
-) -> list[str]:
-    """Return the Python arguments that run a node; write its parameter file to a folder."""
-    file = folder / f"{name}.yaml"
-    own = f"{namespace}/{name}" if namespace else name
-    file.write_text(yaml.safe_dump({own: {"ros__parameters": dict(parameters)}}), "utf-8")
-    ros = ["--ros-args", "-r", f"__node:={name}"]
-    if namespace:
-        moved = [word for topic in GLOBAL_TOPICS for word in ("-r", f"{topic}:={topic[1:]}")]
-        ros += ["-r", f"__ns:={namespace}", *moved]
-    return ["-m", _CHILD_MODULE, module, *ros, "--params-file", str(file)]
 
 
 class _ServiceTimeoutError(SpaceRobotError):

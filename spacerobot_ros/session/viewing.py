@@ -19,13 +19,9 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes.common.process import use_loopback_discovery
 from spacerobot_ros.nodes.viewer import node
 from spacerobot_ros.parameters import Value
-from spacerobot_ros.session.processes import (
-    RestartLimit,
-    checked_namespace,
-    end_message,
-    node_arguments,
-)
-from spacerobot_ros.termination import end_child, start_child
+from spacerobot_ros.session.child import NodeProcess
+from spacerobot_ros.session.processes import checked_namespace
+from spacerobot_ros.termination import end_child
 from spacerobot_ros.viewer.server import require_viser
 
 _LONGEST_START = 30.0  # wall s
@@ -36,7 +32,7 @@ _LONGEST_END = 1.5
 _NICENESS = 5
 
 
-class Viewer:
+class Viewer(NodeProcess):
     """A viewer process, restarted if it dies.
 
     Parameters
@@ -54,23 +50,14 @@ class Viewer:
         namespace: str,
         folder: Path,
     ) -> None:
+        super().__init__("viewer", node.__name__, folder, namespace)
         self._parameters, self._show = dict(parameters), show
-        self._namespace, self._folder = namespace, folder
-        self.log = folder / "viewer.txt"
-        self.process = self._start()
-        self._restarts = RestartLimit(0)
         self._announced = False
+        self._serve()
 
-    def _start(self) -> subprocess.Popen[bytes]:
-        with self.log.open("wb") as errors:
-            words = node_arguments(
-                "viewer", node.__name__, self._parameters, self._folder, self._namespace
-            )
-            process = start_child(
-                [*words, "--log-level", "WARN"], stdout=subprocess.PIPE, stderr=errors
-            )
-        lower_priority(process.pid)
-        return process
+    def _serve(self) -> None:
+        self.start(self._parameters, ["--log-level", "WARN"], stdout=subprocess.PIPE)
+        lower_priority(self.child.pid)
 
     def announce(self) -> None:
         """Show the page address once the page is served.
@@ -80,42 +67,49 @@ class Viewer:
         SpaceRobotError
             The page cannot be served.
         """
-        announcement = _read_announcement(self.process, self.log)
+        announcement = self._read_announcement()
         self._announced = True
-        self._show(announcement)
-        for line in _read_log_lines(self.log):
+        for line in (announcement, *self.log.strip().splitlines()):
             self._show(line)  # The viewer warns of an address that other machines can reach.
         # Open pages reconnect to a viewer at the same address.
         port = urlsplit(announcement.split()[1]).port if " " in announcement else None
         if port is not None:
             self._parameters["port"] = port
 
-    def restart_within(self, restarts: int) -> None:
-        """Set the maximum number of restarts per minute."""
-        self._restarts = RestartLimit(restarts)
+    def _read_announcement(self) -> str:
+        output = self.child.stdout
+        assert output is not None
+        text, deadline = b"", time.monotonic() + _LONGEST_START
+        while not text.endswith(b"\n"):
+            ready, _, _ = select.select([output], [], [], 0.1)
+            if ready:
+                more = os.read(output.fileno(), 4096)
+                if not more:
+                    lines = self.log.strip().splitlines()
+                    raise SpaceRobotError(lines[-1] if lines else "The viewer ended at startup.")
+                text += more
+            elif time.monotonic() > deadline:
+                raise SpaceRobotError(
+                    f"The viewer did not serve its page within {_LONGEST_START:g} s."
+                )
+        return text.decode(errors="replace").strip()
 
     def supervise(self) -> None:
         """Restart the viewer if it has died and the limit allows it."""
-        if self.process.poll() is None or not self._restarts.allows_restart(
-            "viewer", time.monotonic()
-        ):
+        if not self.may_restart():
             return
-        message = self._end_message()
-        end_child(self.process, {})
-        self.process = self._start()
+        message = self.end_message
+        end_child(self.child, {})
+        self._serve()
         with suppress(OSError):  # A closed terminal must not stop the robot.
             self._show(f"{message} It is restarted.")
 
-    def end(self) -> None:
+    def close(self) -> None:
         """End the viewer; a line reports if the viewer had already ended."""
-        if self._announced and self.process.poll() is not None:
+        if self._announced and self.exit_code is not None:
             with suppress(OSError):
-                self._show(f"{self._end_message()}{self._restarts.count_restart('viewer')}")
-        end_child(self.process, {signal.SIGINT: _LONGEST_END})
-
-    def _end_message(self) -> str:
-        text = self.log.read_text("utf-8", errors="replace")
-        return end_message("viewer", self.process.returncode, text)
+                self._show(f"{self.end_message}{self.restart_note}")
+        end_child(self.child, {signal.SIGINT: _LONGEST_END})
 
 
 @contextmanager
@@ -149,7 +143,7 @@ def viewing(
             viewer.announce()
             yield viewer
         finally:
-            viewer.end()
+            viewer.close()
 
 
 def lower_priority(pid: int) -> None:
@@ -159,23 +153,3 @@ def lower_priority(pid: int) -> None:
     # Linux may divide the processor among sessions first; niceness counts within a session only.
     with suppress(OSError):
         Path(f"/proc/{pid}/autogroup").write_text(str(_NICENESS), "ascii")
-
-
-def _read_log_lines(log: Path) -> list[str]:
-    return log.read_text("utf-8", errors="replace").strip().splitlines()
-
-
-def _read_announcement(process: subprocess.Popen[bytes], log: Path) -> str:
-    assert process.stdout is not None
-    text, deadline = b"", time.monotonic() + _LONGEST_START
-    while not text.endswith(b"\n"):
-        ready, _, _ = select.select([process.stdout], [], [], 0.1)
-        if ready:
-            more = os.read(process.stdout.fileno(), 4096)
-            if not more:
-                lines = _read_log_lines(log)
-                raise SpaceRobotError(lines[-1] if lines else "The viewer ended at startup.")
-            text += more
-        elif time.monotonic() > deadline:
-            raise SpaceRobotError(f"The viewer did not serve its page within {_LONGEST_START:g} s.")
-    return text.decode(errors="replace").strip()

@@ -63,7 +63,7 @@ def test_a_viewer_that_has_ended_by_itself_is_mentioned(
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("spacerobot_ros.session.processes._CHILD_MODULE", "short_viewer")
+    monkeypatch.setattr("spacerobot_ros.session.child._CHILD_MODULE", "short_viewer")
     said: list[str] = []
     with viewing.viewing({}, said.append):
         Path("end").touch()
