@@ -23,7 +23,7 @@ from spacerobot_ros.campaign.draws import require_module
 from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError, reason
-from spacerobot_ros.files import load_yaml, warn_once
+from spacerobot_ros.files import load_yaml, warn_once, write_whole
 from spacerobot_ros.measures import metric_names
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.resources import is_path, robot_file
@@ -144,8 +144,9 @@ class Dataset:
             return
         if not self.folder.is_dir():
             raise ParameterError(f"{self.folder} is a file: specify a folder for the campaign.")
-        own = {_FLIGHTS_FOLDER, _CAMPAIGN_FILE, _SCENARIO_FILE}
-        others = [path for path in self.folder.iterdir() if path.name.lstrip(".") not in own]
+        own = _FLIGHTS_FOLDER, _CAMPAIGN_FILE, _SCENARIO_FILE, _ABOUT_FILE
+        names = [path.name.lstrip(".") for path in self.folder.iterdir()]
+        others = [name for name in names if not name.startswith(own)]
         if others or self._row_files():
             raise ParameterError(
                 f"The folder {self.folder} is not empty and contains no campaign: use another "
@@ -164,17 +165,13 @@ class Dataset:
             "scenario": campaign.scenario.name,
         }
         content = {"campaign": section}
-        self._write_file(_SCENARIO_FILE, scenario_text(self_contained(campaign).scenario))
-        self._write_file(
-            _CAMPAIGN_FILE, yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
-        )
-        self._write_file(_ABOUT_FILE, json.dumps(facts, indent=1))
-
-    def _write_file(self, name: str, text: str) -> None:
-        """Replace a file completely or not at all: a full disk does not damage it."""
-        path, new = self.folder / name, self.folder / f".{name}"
-        new.write_text(text, encoding="utf-8")
-        os.replace(new, path)
+        texts = {
+            _SCENARIO_FILE: scenario_text(self_contained(campaign).scenario),
+            _CAMPAIGN_FILE: yaml.safe_dump(content, sort_keys=False, allow_unicode=True),
+            _ABOUT_FILE: json.dumps(facts, indent=1),
+        }
+        for name, text in texts.items():
+            write_whole(self.folder / name, text.encode(), mode=0o666)
 
     def _lock(self) -> None:
         descriptor = os.open(self.folder / _FLIGHTS_FOLDER, os.O_RDONLY | os.O_CLOEXEC)
@@ -258,9 +255,7 @@ class Dataset:
         if not self._rows:
             return
         arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
-        table = arrow.Table.from_pydict(
-            _columns_of_rows(self._rows, self._schema.names), schema=self._schema
-        )
+        table = arrow.Table.from_pylist(list(map(_record_of_row, self._rows)), self._schema)
         folder = self.folder / _FLIGHTS_FOLDER
         while (path := folder / f"part-{self._part:06d}.parquet").exists():
             self._part += 1
@@ -345,26 +340,22 @@ def _row_schema(campaign: Campaign) -> Any:
     return arrow.schema(fields)
 
 
-def _columns_of_rows(rows: Sequence[Row], names: Sequence[str]) -> dict[str, list[Any]]:
-    columns: dict[str, list[Any]] = {
-        "flight": [row.draw.number for row in rows],
-        "seed": [row.draw.seed for row in rows],
-        "passed": [row.passed for row in rows],
-        "outcome": [row.outcome for row in rows],
-        "reason": [row.reason for row in rows],
-        "wall_time_s": [row.wall_time for row in rows],
-        "plan_time_s": [row.plan_time for row in rows],
-        "engine": [row.engine for row in rows],
-        "fallback": [row.fallback for row in rows],
-        "versions": [versions_json()] * len(rows),
+def _record_of_row(row: Row) -> dict[str, Any]:
+    """Return a row as the values of its columns by name."""
+    return {
+        "flight": row.draw.number,
+        "seed": row.draw.seed,
+        "passed": row.passed,
+        "outcome": row.outcome,
+        "reason": row.reason,
+        **{f"{DRAW_PREFIX}{name}": value for name, value in row.draw.values.items()},
+        **row.metrics,
+        "wall_time_s": row.wall_time,
+        "plan_time_s": row.plan_time,
+        "engine": row.engine,
+        "fallback": row.fallback,
+        "versions": versions_json(),
     }
-    for name in names:
-        if name.startswith(DRAW_PREFIX):
-            drawn = name.removeprefix(DRAW_PREFIX)
-            columns[name] = [row.draw.values.get(drawn) for row in rows]
-        elif name not in columns:
-            columns[name] = [row.metrics.get(name) for row in rows]
-    return columns
 
 
 def _fingerprint_of(campaign: Campaign) -> str:

@@ -293,7 +293,7 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Di
         )
     match = _INDEXED_NAME_PATTERN.fullmatch(rest)
     bare, index = (match[1], match[2]) if match else (rest, "")
-    known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
+    known = _declared(node)
     if bare not in known:
         raise ParameterError(f"node '{node}' has no parameter '{bare}'.{suggestion(bare, known)}")
     declaration = known[bare]
@@ -311,6 +311,10 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Di
         return _scalar_target(name, node, declaration, value)
     assert isinstance(value, tuple)
     return _list_entry_target(name, node, declaration, index, scenario)
+
+
+def _declared(node: str) -> dict[str, Parameter]:
+    return {parameter.name: parameter for parameter in declared(CONFIGS[node])}
 
 
 def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> DispersionTarget:
@@ -341,9 +345,17 @@ def _list_entry_target(
             f"{suggestion(index, joints)}"
         )
 
+    return _entry_target(name, node, declaration, place)
+
+
+def _entry_target(
+    name: str, node: str, declaration: Parameter, place: int, *, is_offset: bool = False
+) -> DispersionTarget:
+    """Return the target that replaces an element of a list parameter, or adds to it."""
+
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         values = _list_values(name, node, declaration, flight.scenario)
-        values[place] = float(drawn)
+        values[place] = values[place] + float(drawn) if is_offset else float(drawn)
         return flight.with_overrides(node, {declaration.name: values})
 
     one = frozenset({f"{node}.{declaration.name}[{place}]"})
@@ -474,12 +486,20 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Dispers
     if kind == "end_effector_goal" and scenario.end_effector_goal is None:
         raise ParameterError(f"'{name}': the scenario has no goal for the end-effector.")
     column = AXES.index(axis)
+    if kind == "initial" and part == "position":
+        places = "initial_position", "initial_center_of_mass"
+        declaration = _declared("plant")[places[bool(scenario.plant.initial_center_of_mass)]]
+        target = _entry_target(name, "plant", declaration, column, is_offset=True)
+        both = frozenset(f"plant.{place}[{column}]" for place in places)
+        return replace(target, assigned_parameters=both)
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
         offset = np.zeros(3)
         offset[column] = float(drawn)
         if kind == "initial":
-            return _move_start(flight, part, offset)
+            attitude = np.array(flight.scenario.plant.initial_orientation or (0.0, 0.0, 0.0, 1.0))
+            turned = quaternion_multiply(attitude, quaternion_from_rotvec(offset))
+            return flight.with_overrides("plant", {"initial_orientation": turned.tolist()})
         goal: Goal = getattr(flight.scenario, kind)
         if part == "position":
             goal = replace(goal, position=goal.position + offset)
@@ -492,23 +512,8 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Dispers
         moved = flight.scenario.with_poses(*(goals | {kind: goal}).values())
         return replace(flight, scenario=moved)
 
-    sets = {name}
-    if kind == "initial" and part == "position":
-        sets = {f"plant.initial_{what}[{column}]" for what in ("position", "center_of_mass")}
-    return DispersionTarget(
-        name, apply, "m" if part == "position" else "rad", False, frozenset(sets)
-    )
-
-
-def _move_start(flight: DrawnFlight, part: str, offset: Array) -> DrawnFlight:
-    plant = flight.scenario.plant
-    if part == "position":
-        where = "initial_center_of_mass" if plant.initial_center_of_mass else "initial_position"
-        moved = np.array(getattr(plant, where) or (0.0, 0.0, 0.0)) + offset
-        return flight.with_overrides("plant", {where: moved.tolist()})
-    attitude = np.array(plant.initial_orientation or (0.0, 0.0, 0.0, 1.0))
-    turned = quaternion_multiply(attitude, quaternion_from_rotvec(offset))
-    return flight.with_overrides("plant", {"initial_orientation": turned.tolist()})
+    unit = "m" if part == "position" else "rad"
+    return DispersionTarget(name, apply, unit, False, frozenset({name}))
 
 
 def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> DispersionTarget:
@@ -518,15 +523,8 @@ def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> Dispersi
             f"'{name}': the robot has no joint '{joint}'; it has {', '.join(joints)}."
             f"{suggestion(joint, joints)}"
         )
-    index = joints.index(joint)
-
-    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        values = _start_positions(flight.scenario)
-        values[index] += float(drawn)
-        return flight.with_overrides("plant", {"initial_joint_positions": values})
-
-    one = frozenset({f"plant.initial_joint_positions[{index}]"})
-    return DispersionTarget(name, apply, "m or rad", False, one)
+    start = _declared("plant")["initial_joint_positions"]
+    return _entry_target(name, "plant", start, joints.index(joint), is_offset=True)
 
 
 def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> DispersionTarget:

@@ -292,15 +292,16 @@ class MultiProcessStack:
         if "planner" in present:
             self._ask_statistics(_LONGEST_ANSWER_AFTER_INTERRUPT if interrupted else _LONGEST_START)
         processes = [self._processes[name] for name in present]
-        for process in processes:
-            if process.name != "recorder":
-                process.child.send_signal(signal.SIGINT)
-        for process in processes:
-            # SIGABRT makes a hanging node print a traceback.
-            end_child(process.child, {signal.SIGINT: _LONGEST_END, signal.SIGABRT: 1.0})
-        for process in processes:
-            if process.exit_code != 0:
-                raise SpaceRobotError(process.end_message)
+        for last in (False, True):
+            group = [each for each in processes if (each.name == "recorder") is last]
+            for each in group:
+                each.child.send_signal(signal.SIGINT)
+            for each in group:
+                # SIGABRT makes a hanging node print a traceback.
+                end_child(each.child, {0: _LONGEST_END, signal.SIGABRT: 1.0})
+        for each in processes:
+            if each.exit_code != 0:
+                raise SpaceRobotError(each.end_message)
 
     def close(self) -> None:
         """End all node processes that are still running."""
