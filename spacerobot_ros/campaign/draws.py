@@ -9,17 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.targets import DrawnFlight
+from spacerobot_ros.campaign.targets import DrawnFlight, MassFactors
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError, counted
 from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.inertial_parameters import InertialParameters
 
 _MIN_PROBABILITY = 1e-12
 """Smallest distance of cumulative probabilities from 0 and 1, at which many quantiles are
@@ -166,30 +167,38 @@ def drawn_flights(
 
     Mass properties are computed for many draws at once.
     """
-    of_masses = [each for each in campaign.dispersions if each.target.changes_masses_only]
     has_own_seed = _SEED not in campaign.names
+    nominal = InertialParameters.of(common.nominal)
+    bodies = [body.name for body in common.nominal.bodies]
     remaining = iter(draws)
     while block := list(islice(remaining, _BLOCK_SIZE)):
-        flights = common.repeated(len(block))
-        for dispersion in of_masses:
-            drawn = np.array([draw.values[dispersion.name] for draw in block])
-            # Other values are refused below.
-            flights = dispersion.target.apply(flights, np.where(np.isfinite(drawn), drawn, 1.0))
-        seeds = [draw.seed if has_own_seed else None for draw in block]
-        try:
-            flights.require_physical()
-            suspicious = False
-        except RobotDescriptionError:
-            suspicious = True
-        for draw, flight in zip(block, flights.separate(seeds), strict=True):
+        factors = MassFactors.of(len(block), len(bodies))
+        for dispersion in campaign.dispersions:
+            if dispersion.target.weigh is not None:
+                drawn = np.array([draw.values[dispersion.name] for draw in block])
+                # Other values are refused below.
+                dispersion.target.weigh(factors, np.where(np.isfinite(drawn), drawn, 1.0))
+        parameters, differ = factors.applied_to(nominal), factors.differ.tolist()
+        suspicious = any(differ) and not _is_physical(parameters, bodies)
+        for row, draw in enumerate(block):
+            seed = draw.seed if has_own_seed else None
+            flight = replace(common, inertial=parameters[row] if differ[row] else None, seed=seed)
             try:
-                made = _with_values(campaign, draw, flight)
-                if suspicious:
-                    made.require_physical()
+                flight = _with_values(campaign, draw, flight)
+                if suspicious and flight.inertial is not None:
+                    flight.inertial.require_physical(bodies)
             except Exception as error:
                 yield draw, error
             else:
-                yield draw, made
+                yield draw, flight
+
+
+def _is_physical(parameters: InertialParameters, bodies: Sequence[str]) -> bool:
+    try:
+        parameters.require_physical(bodies)
+    except RobotDescriptionError:
+        return False
+    return True
 
 
 def _with_values(campaign: Campaign, draw: Draw, flight: DrawnFlight) -> DrawnFlight:
@@ -198,8 +207,7 @@ def _with_values(campaign: Campaign, draw: Draw, flight: DrawnFlight) -> DrawnFl
         value, target = draw.values[dispersion.name], dispersion.target
         if not target.is_text and not math.isfinite(value):
             raise ParameterError(f"The value drawn for '{dispersion.name}' is {value}.")
-        if not target.changes_masses_only:
-            flight = target.apply(flight, value)
+        flight = target.apply(flight, value)
     return flight
 
 

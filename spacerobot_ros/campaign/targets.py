@@ -41,9 +41,6 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
     *("planner.resume_file", "coordinated_control.resume_file"),
 )
 
-_FACTORS = ("mass", "inertia", "com")
-"""Attributes of :class:`DrawnFlight` with one value per flight."""
-
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
 TARGET_KINDS = (
@@ -79,9 +76,9 @@ class DispersionTarget:
         Whether the values are strings.
     assigned_parameters
         Names of the values that the target sets; targets that set the same value share a name.
-    changes_masses_only
-        Whether the target changes only the robot's mass properties, not the scenario; ``apply``
-        then also accepts N flights with drawn values (N,).
+    weigh
+        Function that applies the drawn values (N,) of N flights to their mass properties; if given,
+        the target changes nothing else.
     order
         Targets are applied in ascending order.
     """
@@ -91,15 +88,51 @@ class DispersionTarget:
     unit: str
     is_text: bool
     assigned_parameters: frozenset[str]
-    changes_masses_only: bool = False
+    weigh: Callable[[MassFactors, Array], None] | None = None
     order: int = 0
 
 
 @dataclass(frozen=True)
-class DrawnFlight:
-    """One campaign flight, or several flights that share a scenario and differ in masses.
+class MassFactors:
+    """Changes in the mass properties of N flights; targets write into the arrays.
 
-    Leading dimensions (...) index flights: none for one flight, (N,) for N flights.
+    Attributes
+    ----------
+    mass, inertia
+        (N, B) factors for each body; the inertia is multiplied by both.
+    com
+        (N, B, 3) centre of mass offsets, m.
+    """
+
+    mass: Array
+    inertia: Array
+    com: Array
+
+    @classmethod
+    def of(cls, flights: int, bodies: int) -> MassFactors:
+        """Return no changes."""
+        ones = np.ones((flights, bodies))
+        return cls(ones, ones.copy(), np.zeros((flights, bodies, 3)))
+
+    @property
+    def differ(self) -> npt.NDArray[np.bool_]:
+        """(N,) whether flights differ from the nominal robot."""
+        changed = (self.mass != 1.0) | (self.inertia != 1.0) | self.com.any(axis=-1)
+        return np.asarray(changed.any(axis=-1))
+
+    def applied_to(self, nominal: InertialParameters) -> InertialParameters:
+        """Return the mass properties of the flights, given those of the nominal robot."""
+        scaled = nominal.scaled(self.mass, self.mass * self.inertia)
+        moved = np.asarray(self.com.any(axis=(1, 2)))
+        if not moved.any():
+            return scaled
+        # Where no centre moves, zeros keep their signs.
+        return scaled.shifted(np.where(moved[:, np.newaxis, np.newaxis], self.com, -0.0))
+
+
+@dataclass(frozen=True)
+class DrawnFlight:
+    """One campaign flight.
 
     Attributes
     ----------
@@ -109,13 +142,8 @@ class DrawnFlight:
         object.
     nominal
         The robot without dispersions.
-    mass, inertia
-        (..., B) factors for each body; the inertia is multiplied by the mass factor and by the
-        inertia factor.
-    com
-        (..., B, 3) centre of mass offsets, m.
-    parameters
-        Masses, centres of mass and inertias of the nominal robot.
+    inertial
+        Body masses, centres of mass and inertias; None: those of the nominal robot.
     has_target_masses
         Whether the target's mass properties are drawn.
     seed
@@ -124,10 +152,7 @@ class DrawnFlight:
 
     scenario: Scenario
     nominal: RobotDescription
-    mass: Array
-    inertia: Array
-    com: Array
-    parameters: InertialParameters
+    inertial: InertialParameters | None = None
     has_target_masses: bool = False
     seed: int | None = None
 
@@ -136,16 +161,7 @@ class DrawnFlight:
         """Return the flight without dispersions."""
         for node in ("plant", *scenario.commanders):
             scenario.config(node)  # Cached for all flights derived from this one.
-        robot = description_of(scenario)
-        count = len(robot.bodies)
-        return cls(
-            scenario,
-            robot,
-            mass=np.ones(count),
-            inertia=np.ones(count),
-            com=np.zeros((count, 3)),
-            parameters=InertialParameters.of(robot),
-        )
+        return cls(scenario, description_of(scenario))
 
     def with_overrides(self, node: str, parameters: Mapping[str, Any]) -> DrawnFlight:
         """Return the flight with different parameters for a node."""
@@ -157,56 +173,6 @@ class DrawnFlight:
         if self.seed is None:
             return self.scenario
         return self.scenario.with_overrides("plant", {"sensors.seed": self.seed})
-
-    @cached_property
-    def inertial(self) -> InertialParameters | None:
-        """Body masses, centres of mass and inertias; by default, those of the robot."""
-        return self._scaled_parameters if self._has_other_masses.any() else None
-
-    @property
-    def _has_other_masses(self) -> npt.NDArray[np.bool_]:
-        """(...) whether flights differ from the nominal robot in mass properties."""
-        factors = (self.mass != 1.0) | (self.inertia != 1.0) | self.com.any(axis=-1)
-        return np.asarray(factors.any(axis=-1))
-
-    @property
-    def _scaled_parameters(self) -> InertialParameters:
-        scaled = self.parameters.scaled(self.mass, self.mass * self.inertia)
-        moved = np.asarray(self.com.any(axis=(-2, -1)))
-        if not moved.any():
-            return scaled
-        # Where no centre moves, zeros keep their signs.
-        return scaled.shifted(np.where(moved[..., np.newaxis, np.newaxis], self.com, -0.0))
-
-    def repeated(self, count: int) -> DrawnFlight:
-        """Return ``count`` copies of a flight."""
-        numbers: dict[str, Any] = {
-            name: np.repeat(getattr(self, name)[np.newaxis], count, axis=0) for name in _FACTORS
-        }
-        return replace(self, **numbers)
-
-    def separate(self, seeds: Sequence[int | None]) -> list[DrawnFlight]:
-        """Return the individual flights, with their seeds."""
-        flights = []
-        inertial, has_other_masses = self._scaled_parameters, self._has_other_masses.tolist()
-        for row, (seed, has_other) in enumerate(zip(seeds, has_other_masses, strict=True)):
-            factors: dict[str, Any] = {name: getattr(self, name)[row] for name in _FACTORS}
-            flight = replace(self, seed=seed, **factors)
-            # Set here: computing it for one flight takes as long as for all of them.
-            vars(flight)["inertial"] = inertial[row] if has_other else None
-            flights.append(flight)
-        return flights
-
-    def require_physical(self) -> None:
-        """Check that all drawn masses and inertias are physical.
-
-        Raises
-        ------
-        RobotDescriptionError
-            They are not.
-        """
-        if self.inertial is not None:
-            self.inertial.require_physical([body.name for body in self.nominal.bodies])
 
     def with_draws_in_scenario(self) -> DrawnFlight:
         """Return the flight with the seed included in the scenario and the masses included in the
@@ -402,19 +368,21 @@ def _find_bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
     return [(names.index(name), name)]
 
 
+def _unchanged(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+    return flight
+
+
 def _mass_property_targets(
     kind: str, dot: str, rest: str, scenario: Scenario
 ) -> list[DispersionTarget]:
     def target(bodies: Sequence[tuple[int, str]], name: str) -> DispersionTarget:
         indices = [index for index, _ in bodies]
 
-        def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-            factors = getattr(flight, kind).copy()
-            factors[..., indices] *= np.asarray(drawn, dtype=float)[..., np.newaxis]
-            return replace(flight, **{kind: factors})
+        def weigh(factors: MassFactors, drawn: Array) -> None:
+            getattr(factors, kind)[:, indices] *= drawn[:, np.newaxis]
 
         sets = frozenset(f"{kind}.{body}" for _, body in bodies)
-        return DispersionTarget(name, apply, "1", False, sets, changes_masses_only=True)
+        return DispersionTarget(name, _unchanged, "1", False, sets, weigh)
 
     if not dot:
         return [target(_find_bodies("*", scenario), kind)]
@@ -439,12 +407,10 @@ def _center_targets(rest: str, scenario: Scenario) -> list[DispersionTarget]:
 
 
 def _center_target(index: int, column: int, name: str) -> DispersionTarget:
-    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        com = flight.com.copy()
-        com[..., index, column] += np.asarray(drawn, dtype=float)
-        return replace(flight, com=com)
+    def weigh(factors: MassFactors, drawn: Array) -> None:
+        factors.com[:, index, column] += drawn
 
-    return DispersionTarget(name, apply, "m", False, frozenset({name}), changes_masses_only=True)
+    return DispersionTarget(name, _unchanged, "m", False, frozenset({name}), weigh)
 
 
 def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarget:

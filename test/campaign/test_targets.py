@@ -9,8 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.campaigns import campaign
 
+from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.targets import (
     DrawnFlight,
+    MassFactors,
     _start_positions,
     description_of,
     targets_of,
@@ -40,14 +42,14 @@ def scenario() -> Scenario:
     return campaign(set=given).scenario
 
 
-def changes(scenario: Scenario, flight: DrawnFlight) -> dict[str, Any]:
+def changes(scenario: Scenario, flight: DrawnFlight, factors: MassFactors) -> dict[str, Any]:
     """Return what differs from the scenario, by node and parameter, and the mass properties."""
     found: dict[str, Any] = {}
     for node in ("plant", *scenario.commanders):
         before, after = (values_of(each.config(node)) for each in (scenario, flight.scenario))
         found |= {f"{node}.{key}": after[key] for key in after if after[key] != before[key]}
     for name, usual in (("mass", 1.0), ("inertia", 1.0), ("com", 0.0)):
-        values = getattr(flight, name)
+        (values,) = getattr(factors, name)
         if np.any(values != usual):
             found[name] = values.tolist()
     return found
@@ -55,10 +57,13 @@ def changes(scenario: Scenario, flight: DrawnFlight) -> dict[str, Any]:
 
 def applied(name: str, scenario: Scenario, value: Any) -> tuple[list[Any], dict[str, Any]]:
     flight = DrawnFlight.of(scenario)
+    factors = MassFactors.of(1, len(flight.nominal.bodies))
     targets = targets_of(name, scenario)
     for target in targets:
         flight = target.apply(flight, value)
-    return targets, changes(scenario, flight)
+        if target.weigh is not None:
+            target.weigh(factors, np.array([value]))
+    return targets, changes(scenario, flight, factors)
 
 
 CASES: dict[str, tuple[float | str, str, dict[str, Any]]] = {
@@ -270,8 +275,9 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
     flight = DrawnFlight.of(scenario)
     assert flight.inertial is None
     assert flight.with_draws_in_scenario().scenario is scenario
-    for name, value in (("mass.mass_2", 1.5), ("inertia.mass_2", 2.0), ("com.mass_2.x", 0.25)):
-        flight = targets_of(name, scenario)[0].apply(flight, value)
+    values = {"mass.mass_2": 1.5, "inertia.mass_2": 2.0, "com.mass_2.x": 0.25}
+    drawn = campaign(disperse={name: {"choice": [value]} for name, value in values.items()})
+    flight = drawn_flight(drawn, Draws(drawn)[0])
     heavier, usual = flight.inertial, InertialParameters.of(flight.nominal)
     assert heavier is not None
     described = InertialParameters.of(description_of(flight.with_draws_in_scenario().scenario))
