@@ -245,8 +245,6 @@ static void commit(const Job &job, long long g, V *group) {
     const V size = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
     V &peak = group[row::peak_wrench + part];
     assign_where(alive, peak, fmax(peak, size));
-    V &impulse = group[row::impulse + part];
-    assign_where(alive, impulse, impulse + V(job.period) * size);
   }
 #endif
   for (const Span &span : COPIES)

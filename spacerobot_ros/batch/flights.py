@@ -146,16 +146,6 @@ class SensorErrors:
         """Return the selected rows, in any order and number."""
         return SensorErrors(*(getattr(self, each.name)[rows] for each in fields(self)))
 
-    def config(self, index: int) -> SensorConfig:
-        """Return one row as a plant sensor configuration."""
-        return SensorConfig(
-            **dict(zip(NOISES, self.noise[index].tolist(), strict=True)),
-            position_bias=tuple(self.pose_bias[index, :3].tolist()),
-            attitude_bias=tuple(self.pose_bias[index, 3:].tolist()),
-            joint_bias=tuple(self.joint_bias[index].tolist()),
-            seed=int(self.seeds[index]),
-        )
-
     def measure(
         self, normals: Array, pose: Array, twist: Array, q: Array, qdot: Array
     ) -> tuple[Array, Array, Array, Array]:
@@ -352,11 +342,6 @@ class Flights:
                 return table
         return np.zeros((1, self.command_size))
 
-    def table_of(self, index: int) -> Array:
-        """Return the table (ticks, width) of one flight."""
-        table = self.table
-        return table if table.ndim == 2 else np.asarray(table[index])
-
     def robot_of(self, index: int) -> SpaceRobot:
         """Return the robot of one flight."""
         if self.inertial is None:
@@ -447,8 +432,6 @@ class BatchResult:
     """(N, n) largest joint effort in a tick, N or N m."""
     peak_wrench: Array
     """(N, 2) largest force (N) and torque (N m) commanded on the base."""
-    impulse: Array
-    """(N, 2) time integrals of the force and torque norms, N s and N m s."""
     limited_ticks: Mapping[str, Counts]
     """(N, n) numbers of ticks in which each joint was limited, by limit type, as in the plant."""
     fallback_ticks: Counts
@@ -490,7 +473,6 @@ class BatchResult:
             peak_rate=np.zeros((N, n)),
             peak_effort=np.zeros((N, n)),
             peak_wrench=np.zeros((N, 2)),
-            impulse=np.zeros((N, 2)),
             limited_ticks={name: np.zeros((N, n), np.int64) for name in (first, "stroke")},
             fallback_ticks=np.zeros(N, np.int64),
             lowest=flights.initial_states.q.copy(),

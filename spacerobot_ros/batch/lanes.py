@@ -355,7 +355,7 @@ class LaneBlock:
         for lane, tick in self._ended.items():
             reports[lane, np.array(self._flights.report_ticks) > tick] = np.nan
         result.states[rows] = reports
-        for name in ("peak_rate", "peak_effort", "peak_wrench", "impulse", "lowest", "highest"):
+        for name in ("peak_rate", "peak_effort", "peak_wrench", "lowest", "highest"):
             getattr(result, name)[rows] = self._read_rows(name)
         limits = self._read_rows("limits").astype(np.int64)
         first = "effort" if self._flights.actuation == "effort" else "rate"

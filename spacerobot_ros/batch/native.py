@@ -186,7 +186,7 @@ class CompiledTick:
             {
                 **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
                 **{"limits": 2 * n, "peak_rate": n, "peak_effort": n, "failure": 1, "failed_at": 1},
-                **{"peak_wrench": 2, "impulse": 2, "lowest": n, "highest": n},
+                **{"peak_wrench": 2, "lowest": n, "highest": n},
                 **{"decision": 1, "decided": 1, "decided_state": 2 * n + 13},
                 **{"ended": 1, "end_state": 2 * n + 20},
                 **{"first_momenta": 6, "drift": 2},

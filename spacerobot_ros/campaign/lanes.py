@@ -11,9 +11,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,12 @@ from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.batch.targets import device_named, vector_unit
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw, drawn_flights
-from spacerobot_ros.campaign.one_by_one import FlightsEngine, nominal_robots, plant_robot, robots_of
+from spacerobot_ros.campaign.one_by_one import (
+    FirstPlans,
+    FlightsEngine,
+    nominal_robots,
+    plant_robot,
+)
 from spacerobot_ros.campaign.rows import LANES, Fallback, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller, controlled_outputs
@@ -40,7 +44,6 @@ from spacerobot_ros.control.outputs import OutputDistance, controlled_parts
 from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Measures, Outcome, momentum_drift
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
@@ -75,23 +78,25 @@ _EXTERNAL_LOAD_PREFIXES = "plant.disturbances", "plant.orbit.", "plant.table."
 _GAIN_PREFIX = "coordinated_control.gains."
 """Prefix of controller parameters that may differ between lanes."""
 
-_PARAMETERS_COMMON_TO_LANES = (
+_COMMON_PARAMETERS = (
     "plant.tick_rate",
     "plant.integration_step",
+    "plant.actuation",
+    "plant.engine",
+)
+"""Prefixes of parameters that are the same in all lanes."""
+
+_PARAMETERS_COMMON_TO_CONTROLLERS = (
+    *_COMMON_PARAMETERS,
     "plant.thrusters",
     "plant.end_effector_frame",
     "plant.beyond_limits",
     "plant.latched_faults",
-    "plant.actuation",
-    "plant.engine",
     "plant.robot",
 )
 
 _PARAMETERS_COMMON_TO_SCHEDULES = (
-    "plant.tick_rate",
-    "plant.integration_step",
-    "plant.actuation",
-    "plant.engine",
+    *_COMMON_PARAMETERS,
     "planner.tick_rate",
     "planner.averaging",
     "planner.drift",
@@ -135,26 +140,22 @@ class LanesEngine:
         self.name = name
         self._target = vector_unit() if name == LANES else device_named(name)
         self.efficient_flights = _DEVICE_FLIGHTS if self._target.threads else 64
-        self._flights = FlightsEngine()
         self._scheduled, self._controlled = _ScheduledLanes(), _ControlledLanes()
 
     def refusal(self, campaign: Campaign) -> str:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
-        reason = self._flights.refusal(campaign)
-        if reason:
+        if reason := FlightsEngine().refusal(campaign):
             return reason
         scenario = campaign.scenario
         plant = scenario.plant
-        if plant.faults or any(each.name.startswith("faults") for each in campaign.dispersions):
+        if plant.faults or _any_begins(campaign.names, "faults"):
             return "it has faults"
         if plant.target.given:
             return "it has a target"
         if plant.engine != "exact":
             return f"its plant uses the engine '{plant.engine}'; use engine 'flights'"
         loads = plant.disturbances, plant.orbit, plant.table
-        dispersed = any(
-            each.name.startswith(_EXTERNAL_LOAD_PREFIXES) for each in campaign.dispersions
-        )
+        dispersed = _any_begins(campaign.names, _EXTERNAL_LOAD_PREFIXES)
         if dispersed or loads != ((), OrbitConfig(), TableConfig()):
             return "it has disturbances, an orbit or a table; use engine 'flights'"
         if campaign.measures_clearance:
@@ -228,13 +229,13 @@ class LanesEngine:
             return
         taken = (time.perf_counter() - began) / len(batch)
         flown: list[tuple[Draw, Measures]] = []
-        for ready, measures in zip(
-            batch, lanes.measures(campaign, result, batch, flights, taken), strict=True
-        ):
+        each_measures = lanes.measures(campaign, result, batch, flights)
+        for ready, measures in zip(batch, each_measures, strict=True):
             if isinstance(measures, str):
                 yield Fallback(ready.draw, measures)
             else:
-                flown.append((ready.draw, measures))
+                wall_time = taken + ready.plan_time
+                flown.append((ready.draw, replace(measures, wall_time=wall_time)))
         yield from Row.of_each(campaign, flown, self.name)
 
 
@@ -244,10 +245,7 @@ class _ScheduledLanes:
     max_batch_flights = 512
 
     def __init__(self) -> None:
-        self._last_scenario: tuple[Scenario, Any] | None = None
-        """The last scenario, common to many draws, and its :func:`_planned_values`."""
-        self._last_plan: tuple[Any, GaitSchedule | None] | None = None
-        """The last plan made from a noise-free state, and the values that determine this plan."""
+        self._plans = FirstPlans()
 
     def refusal(self, campaign: Campaign) -> str:
         """Return the reason why lanes cannot fly a campaign, as a clause; empty if they can."""
@@ -270,28 +268,12 @@ class _ScheduledLanes:
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | Fallback:
         began = time.perf_counter()
-        schedule, goal = self._plan_first_state(flight), flight.scenario.goal
+        schedule, goal = self._plans.schedule(flight), flight.scenario.goal
         if schedule is None:
             return Fallback(draw, "had no schedule in its first state")
         if schedule.controls & (POSE - goal.asked):
             return Fallback(draw, "maintains a part of the pose that its goal does not specify")
         return _PreparedDraw(draw, flight, schedule, time.perf_counter() - began)
-
-    def _plan_first_state(self, flight: DrawnFlight) -> GaitSchedule | None:
-        """Return the plan for the first state; the last plan is reused if its values are equal."""
-        if self._last_scenario is None or self._last_scenario[0] is not flight.scenario:
-            self._last_scenario = flight.scenario, _planned_values(flight.scenario)
-        values = self._last_scenario[1]
-        if values is None:
-            return _first_plan(flight)
-        others, depends_on_masses = values
-        masses = None
-        if depends_on_masses and flight.inertial is not None:
-            masses = flight.inertial.vector.tolist()
-        key = others, masses
-        if self._last_plan is None or self._last_plan[0] != key:
-            self._last_plan = key, _first_plan(flight)
-        return self._last_plan[1]
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
         planner = batch[0].flight.scenario.planner
@@ -300,7 +282,10 @@ class _ScheduledLanes:
         if all(each.schedule is first for each in batch):
             positions = first.positions
         else:
-            positions = np.array([_pad_positions(each.schedule.positions, most) for each in batch])
+            schedules = [each.schedule for each in batch]
+            padding = [((0, most - each.ticks), (0, 0)) for each in schedules]
+            shapes = zip((each.positions for each in schedules), padding, strict=True)
+            positions = np.array([np.pad(each, rows, "edge") for each, rows in shapes])
         instants = np.unique(np.concatenate([_evaluated_ticks(each) for each in set(ticks)]))
         return _batch_of_flights(
             [each.flight for each in batch],
@@ -315,11 +300,9 @@ class _ScheduledLanes:
         result: BatchResult,
         batch: Sequence[_PreparedDraw],
         flights: Flights,
-        taken: float,
     ) -> Iterator[Measures | str]:
         """Yield the measures of each flight whose outcome is known at the end of its schedule, or
-        the reason for a fallback; ``taken`` is the wall time per flight in the batch, s.
-        """
+        the reason for a fallback."""
         rows = np.arange(len(batch))
         instants = {tick: place for place, tick in enumerate(flights.report_ticks)}
         ends = np.array([instants[each.schedule.ticks] for each in batch])
@@ -370,7 +353,6 @@ class _ScheduledLanes:
                 momentum_drift=drifts[row],
                 end_effector_distance=math.nan if hand is None else hand.distance,
                 plan_time=ready.plan_time,
-                wall_time=taken + ready.plan_time,
             )
 
 
@@ -400,10 +382,10 @@ class _ControlledLanes:
             return "its controller performs tasks before goals; use engine 'flights'"
         for name in campaign.names:
             own = name.startswith("coordinated_control.") and not name.startswith(_GAIN_PREFIX)
-            if own or name.startswith(_PARAMETERS_COMMON_TO_LANES):
+            if own or name.startswith(_PARAMETERS_COMMON_TO_CONTROLLERS):
                 return f"'{name}' is dispersed, but shared by all lanes"
         try:
-            law = build_controller(nominal_robots(scenario).controller, scenario.controller).law
+            law = build_controller(robots.controller, scenario.controller).law
         except SpaceRobotError as error:
             return str(error)
         gains = [name for name in campaign.names if name.startswith(_GAIN_PREFIX)]
@@ -460,19 +442,16 @@ class _ControlledLanes:
         result: BatchResult,
         batch: Sequence[_PreparedDraw],
         flights: Flights,
-        taken: float,
     ) -> Iterator[Measures | str]:
-        """Yield the measures of each flight, or the reason for a fallback; ``taken`` is the wall
-        time per flight in the batch, s.
-        """
+        """Yield the measures of each flight, or the reason for a fallback."""
         for row, ready in enumerate(batch):
             if row in result.failures:
                 yield "was refused by the plant"
             else:
-                yield self._measures_of(result, row, ready, flights, taken)
+                yield self._measures_of(result, row, ready, flights)
 
     def _measures_of(
-        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights, taken: float
+        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights
     ) -> Measures | str:
         decision, period_ns = Decision(result.decision[row]), ready.flight.scenario.plant.period_ns
         decided = int(result.decision_tick[row])
@@ -511,7 +490,6 @@ class _ControlledLanes:
             end_effector_distance=distance,
             end_effector_angle=angle,
             plan_time=0.0,
-            wall_time=taken + ready.plan_time,
         )
 
 
@@ -570,9 +548,6 @@ def _turns_end_effector(flights: Flights) -> bool:
     return any(axis.startswith("r") for axis in outputs.end_effector)
 
 
-# -- schedules --------------------------------------------------------------------------------
-
-
 def _decide_goal(
     scenario: Scenario, schedule: GaitSchedule, pose: Array, q: Array
 ) -> tuple[Outcome, str] | str:
@@ -591,31 +566,6 @@ def _decide_goal(
     return Outcome.FAILED, f"The goal is not reached after 0 corrections: {remaining}."
 
 
-def _planned_values(scenario: Scenario) -> tuple[Any, bool] | None:
-    """Return all values that determine a plan for the first state, except the masses of the plant's
-    robot, and whether the plan depends on these; None if the first measured state has noise."""
-    plant, goal = scenario.plant, scenario.goal
-    sensors = {name: value for name, value in vars(plant.sensors).items() if name != "seed"}
-    if any(np.any(value) for value in sensors.values()):
-        return None
-    # Plans from rest do not depend on the masses of the plant's robot.
-    moving = any(plant.linear_momentum) or any(plant.angular_momentum)
-    shape = None if goal.joint_positions is None else goal.joint_positions.tolist()
-    pose = goal.position.tolist(), goal.quaternion.tolist()
-    others = scenario.planner, {**vars(plant), "sensors": sensors}, *pose, shape
-    return others, bool(moving or plant.initial_center_of_mass)
-
-
-def _first_plan(flight: DrawnFlight) -> GaitSchedule | None:
-    """Let the executive plan for the first state; None if there is no complete schedule."""
-    period = flight.scenario.plant.control_period
-    first = fly_scenario(flight.seeded_scenario, robots=robots_of(flight), longest=period)
-    if len(first.schedules) != 1 or first.gait is None:
-        return None
-    ((begins_ns, schedule),) = first.schedules
-    return None if begins_ns or schedule.partial or not schedule.ticks else schedule
-
-
 @lru_cache(maxsize=64)
 def _evaluated_ticks(ticks: int) -> Array:
     """Return the ticks at which a flight along a schedule with this many ticks is evaluated.
@@ -625,14 +575,6 @@ def _evaluated_ticks(ticks: int) -> Array:
     """
     spacing = 1 << max(0, math.ceil(math.log2(ticks / _STATES_PER_FLIGHT)))
     return np.append(np.arange(0, ticks, spacing), ticks)
-
-
-def _pad_positions(positions: Array, ticks: int) -> Array:
-    missing = ticks + 1 - len(positions)
-    return np.vstack([positions, np.repeat(positions[-1:], missing, axis=0)])
-
-
-# -- control ----------------------------------------------------------------------------------
 
 
 def _goals_by_frame(scenario: Scenario) -> dict[str, Goal | None]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
+
+import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
@@ -16,6 +19,7 @@ from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.shared_parameters import AssumedRobotConfig, RobotConfig, robot_of
+from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -135,3 +139,57 @@ def _build_robot(
     if error:
         return robot_of(AssumedRobotConfig(text, name, world, error, seed))
     return robot_of(RobotConfig(text, name, world))
+
+
+class FirstPlans:
+    """The planner's schedules for the first states of draws.
+
+    A schedule is reused for the next draw if all values that determine it are equal.
+    """
+
+    def __init__(self) -> None:
+        self._last_scenario: tuple[Scenario, Any] | None = None
+        """The last scenario, common to many draws, and its :func:`_planned_values`."""
+        self._last_plan: tuple[Any, GaitSchedule | None] | None = None
+        """The last plan made from a noise-free state, and the values that determine this plan."""
+
+    def schedule(self, flight: DrawnFlight) -> GaitSchedule | None:
+        """Return the schedule from the first state; None if no complete one begins there."""
+        if self._last_scenario is None or self._last_scenario[0] is not flight.scenario:
+            self._last_scenario = flight.scenario, _planned_values(flight.scenario)
+        values = self._last_scenario[1]
+        if values is None:
+            return _first_plan(flight)
+        others, depends_on_masses = values
+        masses = None
+        if depends_on_masses and flight.inertial is not None:
+            masses = flight.inertial.vector.tolist()
+        key = others, masses
+        if self._last_plan is None or self._last_plan[0] != key:
+            self._last_plan = key, _first_plan(flight)
+        return self._last_plan[1]
+
+
+def _planned_values(scenario: Scenario) -> tuple[Any, bool] | None:
+    """Return all values that determine a plan for the first state, except the masses of the plant's
+    robot, and whether the plan depends on these; None if the first measured state has noise."""
+    plant, goal = scenario.plant, scenario.goal
+    sensors = {name: value for name, value in vars(plant.sensors).items() if name != "seed"}
+    if any(np.any(value) for value in sensors.values()):
+        return None
+    # Plans from rest do not depend on the masses of the plant's robot.
+    moving = any(plant.linear_momentum) or any(plant.angular_momentum)
+    shape = None if goal.joint_positions is None else goal.joint_positions.tolist()
+    pose = goal.position.tolist(), goal.quaternion.tolist()
+    others = scenario.planner, {**vars(plant), "sensors": sensors}, *pose, shape
+    return others, bool(moving or plant.initial_center_of_mass)
+
+
+def _first_plan(flight: DrawnFlight) -> GaitSchedule | None:
+    """Let the executive plan for the first state; None if there is no complete schedule."""
+    period = flight.scenario.plant.control_period
+    first = fly_scenario(flight.seeded_scenario, robots=robots_of(flight), longest=period)
+    if len(first.schedules) != 1 or first.gait is None:
+        return None
+    ((begins_ns, schedule),) = first.schedules
+    return None if begins_ns or schedule.partial or not schedule.ticks else schedule

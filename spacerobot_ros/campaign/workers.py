@@ -13,7 +13,7 @@ import pickle
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -25,7 +25,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
@@ -47,8 +46,6 @@ TARGET_TASK_TIME = 2.0
 
 _MIN_FIRST_TASK_FLIGHTS, _MAX_TASK_FLIGHTS = 4, 2000
 """Smallest number of flights in the first tasks, and largest number in any task."""
-
-_PACKAGE_NAME = "spacerobot_ros"
 
 _POLL_PERIOD = 0.2
 """Longest wall time between checks of tasks, signals and the dataset, s."""
@@ -104,7 +101,7 @@ def fly_task(
     """
     if code != this_code():
         raise SpaceRobotError(
-            f"A worker has {_PACKAGE_NAME} {this_code()}, and this process has {code}: all "
+            f"A worker has spacerobot_ros {this_code()}, and this process has {code}: all "
             "processes must run the same code."
         )
     flying, campaign = engine_by_name(engine), _deserialise_campaign(packed)
@@ -218,7 +215,6 @@ class DaskWorkers:
     def __init__(self, client: Any) -> None:
         self._client = client
         self._executor = client.get_executor(pure=False, retries=0)
-        self._checked: set[str] = set()
         self._empty_since = math.inf
         """Monotonic time at which the scheduler lost its last worker; infinite if it has a
         worker."""
@@ -229,13 +225,12 @@ class DaskWorkers:
         Raises
         ------
         SpaceRobotError
-            The scheduler is no longer available, or a worker does not have this package.
+            The scheduler is no longer available.
         """
         try:
             if self._client.status != "running":
                 raise _lost_scheduler_error()
             threads = self._client.nthreads()
-            self._require_package(threads)
         except (OSError, AttributeError) as error:  # The client has not noticed it yet.
             raise _lost_scheduler_error() from error
         workers = sum(threads.values())
@@ -275,23 +270,8 @@ class DaskWorkers:
             raise SpaceRobotError(
                 "The scheduler or a worker cannot load the task "
                 f"({str(error).splitlines()[0]}): the scheduler and all workers require "
-                f"{_PACKAGE_NAME}[campaign] {__version__}."
+                f"spacerobot_ros[campaign] {__version__}."
             ) from error
-
-    def _require_package(self, workers: Iterable[str]) -> None:
-        """Refuse workers without this package, which would fail at every task."""
-        joined = [address for address in workers if address not in self._checked]
-        if not joined:
-            return
-        # A function of the standard library, which every worker can load.
-        found = self._client.run(find_spec, _PACKAGE_NAME, workers=joined, on_error="return")
-        for address, spec in found.items():
-            if spec is None:
-                raise SpaceRobotError(
-                    f"The worker at {address} does not have {_PACKAGE_NAME}: install it there."
-                )
-            if not isinstance(spec, Exception):  # The worker may have left again.
-                self._checked.add(address)
 
 
 def _lost_scheduler_error() -> SpaceRobotError:

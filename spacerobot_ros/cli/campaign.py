@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
-from spacerobot_ros.cli.options import PATH, DefaultGroup, bag_option, out_option, report_option
+from spacerobot_ros.cli.options import PATH, bag_option, out_option, report_option
 from spacerobot_ros.cli.terminal import exit_if_terminated, fail, say
 from spacerobot_ros.errors import ParameterError
 
@@ -34,8 +35,17 @@ def _checked_engine(context: click.Context, parameter: click.Parameter, name: st
     return name
 
 
-class _CampaignGroup(DefaultGroup):
-    default = "fly"
+class _CampaignGroup(click.Group):
+    """Command group whose default command is ``fly``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args and args[0] not in (*self.commands, *ctx.help_option_names):
+            args = ["fly", *args]
+        return super().parse_args(ctx, args)
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        file = fly.params[0]
+        return [*file.shell_complete(ctx, incomplete), *super().shell_complete(ctx, incomplete)]
 
 
 @click.group("campaign", cls=_CampaignGroup)

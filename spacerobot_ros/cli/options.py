@@ -58,23 +58,6 @@ class NumberRange(click.FloatRange):
         return number
 
 
-class DefaultGroup(click.Group):
-    """Command group with a default command."""
-
-    default = ""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Insert the default command's name if the first argument is not a command."""
-        if args and args[0] not in (*self.commands, *ctx.help_option_names):
-            args = [self.default, *args]
-        return super().parse_args(ctx, args)
-
-    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Return the commands, and the completions of the default command's first argument."""
-        first = next(p for p in self.commands[self.default].params if isinstance(p, click.Argument))
-        return [*first.shell_complete(ctx, incomplete), *super().shell_complete(ctx, incomplete)]
-
-
 def _path_option(*names: str) -> Callable[[str], Any]:
     return lambda help: click.option(*names, type=PATH, help=help)
 
@@ -173,19 +156,6 @@ def topic_option(help: str) -> Any:
     """Return the option ``--topic`` as the argument ``topics``."""
     return click.option(
         "--topic", "topics", multiple=True, metavar="TOPIC", help=f"{help} May be repeated."
-    )
-
-
-def within_option(default: tuple[float, float], help_prefix: str) -> Any:
-    """Return the option ``--within``: bounds of random goals, m and deg."""
-    return click.option(
-        "--within",
-        nargs=2,
-        type=float,
-        default=default,
-        metavar="M DEG",
-        show_default=True,
-        help=f"{help_prefix} distance (m) and angle (deg) of the goals from the start.",
     )
 
 

@@ -23,7 +23,6 @@ from spacerobot_ros.cli.options import (
     picture_option,
     registered_option,
     settings_option,
-    within_option,
     write_json,
 )
 from spacerobot_ros.cli.terminal import display, fail, say
@@ -53,7 +52,15 @@ if TYPE_CHECKING:
     metavar="N",
     help="Plan for N random goals instead of one goal, and print statistics.",
 )
-@within_option((0.3, 180.0), "With --random: largest")
+@click.option(
+    "--within",
+    nargs=2,
+    type=float,
+    default=(0.3, 180.0),
+    metavar="M DEG",
+    show_default=True,
+    help="With --random: largest distance (m) and angle (deg) of the goals from the start.",
+)
 @registered_option(
     "--beside",
     registries=(METHODS,),

@@ -477,18 +477,15 @@ class KillTimeline:
     """
 
     def __init__(self, kills: Sequence[Kill]) -> None:
-        self._waiting = list(kills)
-        self._away: list[Kill] = []
+        self._kills, self._time = kills, -math.inf
 
     def due(self, time: float) -> tuple[list[str], list[str]]:
         """Return the nodes to be killed and the nodes to be started by a simulated time, s."""
-        killed = [kill for kill in self._waiting if kill.at <= time]
-        started = [kill for kill in self._away if kill.until <= time]
-        self._waiting = [kill for kill in self._waiting if kill.at > time]
-        self._away = [kill for kill in self._away if kill.until > time] + killed
-        return [kill.node for kill in killed], [kill.node for kill in started]
+        before, self._time = self._time, time
+        killed = [kill.node for kill in self._kills if before < kill.at <= time]
+        return killed, [kill.node for kill in self._kills if before < kill.until <= time]
 
     @property
     def away(self) -> set[str]:
         """Names of the nodes that were killed and have not been restarted yet."""
-        return {kill.node for kill in self._away}
+        return {kill.node for kill in self._kills if kill.at <= self._time < kill.until}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.plant_flights import fly_one_by_one
+from support.plant_flights import fly_one_by_one, sensor_config
 from support.targets import needs_compiler, on_targets, target_named
 
 from spacerobot_ros.batch import (
@@ -173,7 +173,7 @@ def test_sensors_are_rows_of_configurations(sliders: SpaceRobot) -> None:
     assert errors.pose_bias.tolist() == [[0.0] * 6, [1, 2, 3, 4, 5, 6]]
     assert errors.joint_bias.tolist() == [[0.0] * 3, [7, 8, 9]]
     assert (errors.seeds.tolist(), len(errors)) == ([3, 17], 2)
-    assert errors.config(1) == one
+    assert sensor_config(errors, 1) == one
     assert errors.is_active.tolist() == [False, True]
     none = SensorErrors.of(sliders, [SensorConfig()] * 4)
     assert (len(none), none.noise.shape, none.pose_bias.shape) == (4, (4, 6), (4, 6))
@@ -195,7 +195,7 @@ def test_results_begin_empty(sliders: SpaceRobot) -> None:
     for name, width in {**shapes, "measured_q": 3}.items():
         assert getattr(result, name).shape == (2, 3, width)
         assert np.isnan(getattr(result, name)).all()
-    shapes = {"peak_rate": 3, "peak_effort": 3, "peak_wrench": 2, "impulse": 2}
+    shapes = {"peak_rate": 3, "peak_effort": 3, "peak_wrench": 2}
     for name, width in shapes.items():
         assert getattr(result, name).tolist() == [[0.0] * width] * 2
     for name, width in {"decision_distance": 3, "end_state": 26, "momentum_drift": 2}.items():

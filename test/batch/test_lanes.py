@@ -60,7 +60,7 @@ pytestmark = pytest.mark.usefixtures("compiled")
 
 NUMBERS = (
     *("pose", "twist", "q", "qdot", "momentum", "measured_pose", "measured_q"),
-    *("peak_rate", "peak_effort", "peak_wrench", "impulse"),
+    *("peak_rate", "peak_effort", "peak_wrench"),
 )
 
 
@@ -258,7 +258,6 @@ CONTROLLED_NUMBERS = (
         "peak_rate",
         "peak_effort",
         "peak_wrench",
-        "impulse",
         "lowest",
         "highest",
     ),

@@ -393,8 +393,10 @@ def test_the_attitude_of_a_goal_that_is_sent_is_given_in_degrees(
 class _Viewer:
     """A viewer that is not started; its supervision returns the limit of its restarts."""
 
-    def restart_within(self, restarts: int) -> None:
-        self.supervise = lambda: restarts
+    restarts = 0
+
+    def supervise(self) -> int:
+        return self.restarts
 
 
 @pytest.fixture

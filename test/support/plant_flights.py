@@ -9,11 +9,13 @@ import numpy as np
 
 from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import (
+    NOISES,
     BatchResult,
     ControlledGoals,
     Flights,
     FollowedSchedule,
     HeldCommands,
+    SensorErrors,
     plant_of,
     split_command,
     state_of,
@@ -54,7 +56,7 @@ def _fly_row(
     flights: Flights, row: int, result: BatchResult, controller: BatchController | None
 ) -> None:
     plant, period = plant_of(flights, row), flights.control_period
-    config = SensorConfig() if flights.sensors is None else flights.sensors.config(row)
+    config = SensorConfig() if flights.sensors is None else sensor_config(flights.sensors, row)
     faulty = PlantWithFaults(plant, (), period, wrench=flights.actuation == "effort")
     sensors = Sensors(faulty, config, period)
     ends = False  # Whether the flight ends at the tick of the decision about its goal.
@@ -84,7 +86,7 @@ def _fly_row(
                 break
             commands = command(tick, measured)
             plant.step(*commands)
-            _update_peaks(plant, commands, period, result, row)
+            _update_peaks(plant, commands, result, row)
             if controller is not None:
                 now = plant.momentum[:6] - plant.expected_momenta
                 drift = np.maximum(drift, momentum_change(now, momenta))
@@ -96,9 +98,25 @@ def _fly_row(
             result.limited_ticks[name][row] = counts
 
 
+def sensor_config(errors: SensorErrors, row: int) -> SensorConfig:
+    """Return the errors of one flight as the configuration of a plant's sensors."""
+    return SensorConfig(
+        **dict(zip(NOISES, errors.noise[row].tolist(), strict=True)),
+        position_bias=tuple(errors.pose_bias[row, :3].tolist()),
+        attitude_bias=tuple(errors.pose_bias[row, 3:].tolist()),
+        joint_bias=tuple(errors.joint_bias[row].tolist()),
+        seed=int(errors.seeds[row]),
+    )
+
+
+def _table_of(flights: Flights, row: int) -> Array:
+    table = flights.table
+    return table if table.ndim == 2 else np.asarray(table[row])
+
+
 def _held_commands(flights: Flights, row: int) -> _Commands:
     """Return the commands of a table, zero after its end."""
-    table = flights.table_of(row)
+    table = _table_of(flights, row)
 
     def command(tick: int, measured: Plant | Sensors) -> Sequence[Array]:
         held = table[tick] if tick < len(table) else np.zeros(table.shape[1])
@@ -111,7 +129,7 @@ def _schedule_commands(flights: Flights, program: FollowedSchedule, row: int) ->
     goal = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
     path = BasePath(np.zeros(1), goal.position[None], goal.quaternion[None])
     names, period = flights.robot.joint_names, flights.control_period
-    schedule = GaitSchedule("", names, period, flights.table_of(row), path, goal)
+    schedule = GaitSchedule("", names, period, _table_of(flights, row), path, goal)
     follower = ScheduleFollower(schedule, 0, program.shape_gain, program.deadband)
     period_ns = round(period * SECOND)
     position, velocity = np.zeros(flights.robot.n), np.zeros(flights.robot.n)
@@ -171,9 +189,7 @@ def decide(
     return Decision(int(found))
 
 
-def _update_peaks(
-    plant: Plant, commands: Sequence[Array], control_period: float, result: BatchResult, row: int
-) -> None:
+def _update_peaks(plant: Plant, commands: Sequence[Array], result: BatchResult, row: int) -> None:
     for name, value in (("peak_rate", plant.qdot), ("peak_effort", plant.effort)):
         peak = getattr(result, name)[row]
         np.maximum(peak, np.abs(value), out=peak)
@@ -182,4 +198,3 @@ def _update_peaks(
     if len(commands) > 1:
         sizes = np.linalg.norm(commands[1].reshape(2, 3), axis=1)
         np.maximum(result.peak_wrench[row], sizes, out=result.peak_wrench[row])
-        result.impulse[row] += control_period * sizes
