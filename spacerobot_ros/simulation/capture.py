@@ -43,7 +43,7 @@ from spacerobot_ros.model.urdf import parse_robot, with_held_joints
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.config import PlantConfig, TargetConfig
 from spacerobot_ros.simulation.loads import PlantLoads
-from spacerobot_ros.simulation.plant import Counts, Flags, InitialState, Plant, WrappedPlant
+from spacerobot_ros.simulation.plant import Flags, InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
 _GENERIC_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9])), np.ones(3))
@@ -332,13 +332,12 @@ class CapturePlant(WrappedPlant):
         self.q, self.qdot = self.q.copy(), self.qdot.copy()
         self.effort, self.momentum = self.effort.copy(), self.momentum.copy()
         self.link_R, self.link_r = self.link_R.copy(), self.link_r.copy()
-        self._momenta = self.plant.expected_momenta.copy()
+        self.expected_momenta = self.expected_momenta.copy()
         self.target_pose, self.target_twist = target.pose.copy(), target.twist.copy()
         self.payload: Payload | None = None
         self.reports: list[CaptureReport | ReleaseReport] = []
         self._held_joints: Flags = np.zeros(robot.n, dtype=np.bool_)
         self._loads: PlantLoads | None = None
-        self._counts: dict[str, Counts] = {}
         self._changed: RobotMotion | None = None
         """Motion after a capture or release, until the next tick."""
         self._ready = True
@@ -354,17 +353,6 @@ class CapturePlant(WrappedPlant):
         self._build(joined, InitialState(joint_positions=initial.shape(robot)))
 
     # -- the plant ----------------------------------------------------------------------------
-
-    @property
-    def limit_counts(self) -> Mapping[str, Counts]:
-        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
-        counts = self.plant.limit_counts
-        return {kind: each + self._counts.get(kind, 0) for kind, each in counts.items()}
-
-    @property
-    def expected_momenta(self) -> Array:
-        """Linear and angular momentum (6,) in W: the initial value plus all impulses."""
-        return self._momenta
 
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all others."""
@@ -553,14 +541,9 @@ class CapturePlant(WrappedPlant):
         self._changed = motion
 
     def _use(self, plant: Plant) -> None:
-        self._counts = dict(self.limit_counts)
-        if plant is self._alone:
-            self._counts = {
-                kind: total - self._alone.limit_counts[kind] for kind, total in self._counts.items()
-            }
-        elif self._loads is not None:
+        if plant is not self._alone and self._loads is not None:
             plant.load(self._loads)
-        self.plant = plant
+        self.plant, plant.limit_counts = plant, self.limit_counts
         plant.hold(self._held_joints)
 
     def _motion(self) -> RobotMotion:
@@ -583,7 +566,7 @@ class CapturePlant(WrappedPlant):
         plant = self.plant
         self.pose[:], self.twist[:] = plant.pose, plant.twist
         self.q[:], self.qdot[:], self.effort[:] = plant.q, plant.qdot, plant.effort
-        self.momentum[:], self._momenta[:] = plant.momentum, plant.expected_momenta
+        self.momentum[:], self.expected_momenta[:] = plant.momentum, plant.expected_momenta
         self.link_R[:], self.link_r[:] = plant.link_R, plant.link_r
         if self.payload is None:
             self.target_pose[:], self.target_twist[:] = self.target.pose, self.target.twist

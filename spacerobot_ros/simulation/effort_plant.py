@@ -31,14 +31,13 @@ import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.external_loads import LoadLayout
-from spacerobot_ros.model.integration import count_steps, repeat_step
+from spacerobot_ros.model.integration import repeat_step
 from spacerobot_ros.model.model_functions import Composition
-from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
-from spacerobot_ros.simulation.plant import Flags, InitialState
+from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.plant import CompiledPlant, Flags, InitialState, body_outputs
 
 BISECTIONS = 40
 """Number of bisection steps for the arrival time: the error is 1e-12 of an integration step."""
@@ -230,7 +229,7 @@ _MAX_FINITE_STATE = 1e100
 """Magnitude (SI units) beyond which a state is considered diverged."""
 
 
-class EffortPlant:
+class EffortPlant(CompiledPlant):
     """A free-flying robot whose joint efforts and base wrench are constant during each tick.
 
     After :meth:`step`, the attributes are those of :class:`Plant`, where ``effort`` is the last
@@ -265,40 +264,23 @@ class EffortPlant:
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        substeps = count_steps(control_period, integration_step)
-        self.robot = robot
-        self.control_period = control_period
-        self.initial = initial or InitialState()
-        n = robot.n
-        self._substeps = substeps
-        self._stops = JointStops(robot, control_period / substeps)
-        self._advance = robot.composed(
-            f"effort_tick_{substeps}", lambda model: tick_function(robot, model, substeps)
+        limits = "effort", "stroke"
+        super().__init__(
+            "effort", tick_function, limits, robot, control_period, initial, integration_step
         )
-        self._tick: BufferedFunction | LoadedTick = self._advance
+        n = robot.n
+        self._stops = JointStops(robot, control_period / self._substeps)
         self._loads: PlantLoads | None = None
         self._state, self._command, self._h = self._advance.inputs
         self._next_state, self.pose, self.twist, self._realised = self._advance.outputs[:4]
         self.momentum, self.link_R, self.link_r, self._limited = self._advance.outputs[4:]
-        shape, _, rates, *_ = state_slices(n)
+        shape, _, rates, p_W, L_W, _ = state_slices(n)
         self.q, self.qdot = self._next_state[shape], self._next_state[rates]
+        self.expected_momenta = self._next_state[p_W.start : L_W.stop]
         self.effort, self.wrench = self._realised[:n], self._realised[n:]
-        self.effort_limited = np.zeros(n, dtype=np.int64)
-        self.stroke_limited = np.zeros(n, dtype=np.int64)
         self._held = np.zeros(n, dtype=np.bool_)
         self._holding = False
         self.reset()
-
-    @property
-    def limit_counts(self) -> dict[str, npt.NDArray[np.int64]]:
-        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
-        return {"effort": self.effort_limited, "stroke": self.stroke_limited}
-
-    @property
-    def expected_momenta(self) -> Array:
-        """Linear and angular momentum (6,) in W: the initial value plus thrust and loads."""
-        _, _, _, p_W, L_W, _ = state_slices(self.robot.n)
-        return self._next_state[p_W.start : L_W.stop]
 
     def reset(self) -> None:
         """Return to the initial state, with zero efforts; the limit counters are kept."""
@@ -332,13 +314,9 @@ class EffortPlant:
 
     def load(self, loads: PlantLoads) -> None:
         """Apply external loads; their values may change before each step."""
-        robot, substeps = self.robot, self._substeps
-        loaded = robot.composed(
-            f"loaded_effort_tick_{substeps}",
-            lambda model: tick_function(robot, model, substeps, loaded=True),
-        )
-        self._loads, self._tick = loads, LoadedTick(self._advance, loaded, loads)
-        self._stops = JointStops(robot, self.control_period / substeps, loaded=True)
+        self._loads = loads
+        self._use_loads(loads)
+        self._stops = JointStops(self.robot, self.control_period / self._substeps, loaded=True)
 
     def step(self, effort: npt.ArrayLike, wrench: npt.ArrayLike = 0.0) -> bool:
         """Advance one tick under joint efforts (n,), clipped to their limits, and under a base
@@ -347,7 +325,7 @@ class EffortPlant:
         ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, in the base frame;
         it rotates with the base during the tick. A joint that reaches its limit stops there without
         rebound and is held while something pushes it outwards. Returns whether any joint was
-        limited; ``effort_limited`` and ``stroke_limited`` count these ticks for each joint.
+        limited.
 
         Raises
         ------
@@ -387,15 +365,9 @@ class EffortPlant:
             self._command[:] = 0.0
             self._update_outputs()
             raise
-        self.effort_limited += clipped
-        self.stroke_limited += stopped
+        self.limit_counts["effort"] += clipped
+        self.limit_counts["stroke"] += stopped
         return bool(clipped.any() or stopped.any())
-
-    def _update_outputs(self) -> None:
-        """Compute all outputs at ``_state``, by a tick of zero duration."""
-        self._h[:] = 0.0
-        self._advance.evaluate()
-        self._h[:] = self.control_period
 
 
 def tick_function(
@@ -421,11 +393,7 @@ def tick_function(
     next_state = marched[: parts[-1].stop]
 
     q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
-    v, omega = model("base_twist", quaternion, q, qdot, p_W, L_W)
-    center = model("center_of_mass", q)
-    r_WB_W = r_WC_W - model("rotate", quaternion, center)
-    momentum = model("momentum", quaternion, q, v, omega, qdot)
-    link_R, link_r = model("link_poses", q)
+    pose, twist, bodies = body_outputs(model, q, quaternion, qdot, (p_W, L_W), r_WC_W)
     clipped = command[:n] != effort
     # A comparison with NaN is false.
     diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _MAX_FINITE_STATE)
@@ -435,12 +403,10 @@ def tick_function(
         [state, command, h, *loads],
         [
             next_state,
-            ca.vertcat(r_WB_W, quaternion),
-            ca.vertcat(v, omega),
+            pose,
+            twist,
             realised,
-            ca.vertcat(*momentum),
-            link_R,
-            link_r,
+            *bodies,
             ca.densify(ca.vertcat(ca.sum1(clipped) + touched, clipped, touched)),
         ],
     )

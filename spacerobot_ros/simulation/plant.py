@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
+import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import count_steps
+from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
 
 Counts = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -35,8 +39,12 @@ class Plant(Protocol):
     ``momentum``
         (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
         (kg m^2/s), both in W, and kinetic energy (J), summed over the bodies.
+    ``expected_momenta``
+        (6,) linear and angular momentum in W: the initial value plus thrust and loads.
     ``link_R``, ``link_r``
         (3, 3 L) and (3, L): pose of each link in B, in the order of ``robot.link_names``.
+    ``limit_counts``
+        Number of ticks in which each joint (n,) was limited, by kind of limit.
 
     The arrays belong to the plant and change in place: copy any values you keep.
     """
@@ -49,11 +57,13 @@ class Plant(Protocol):
     qdot: Array
     effort: Array
     momentum: Array
+    expected_momenta: Array
     link_R: Array
     link_r: Array
+    limit_counts: dict[str, Counts]
 
     def reset(self) -> None:
-        """Return to the initial state."""
+        """Return to the initial state; the limit counts are kept."""
 
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all others."""
@@ -65,14 +75,6 @@ class Plant(Protocol):
     def step(self) -> Callable[..., bool]:
         """Advance one tick under the plant's commands; return whether a joint was limited."""
 
-    @property
-    def limit_counts(self) -> Mapping[str, Counts]:
-        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
-
-    @property
-    def expected_momenta(self) -> Array:
-        """Linear and angular momentum (6,) in W: the initial value plus thrust and loads."""
-
 
 class WrappedPlant:
     """Base class of plants that wrap another and share its state arrays; subclasses implement
@@ -81,19 +83,11 @@ class WrappedPlant:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.robot, self.initial = plant.robot, plant.initial
-        self.pose, self.twist, self.momentum = plant.pose, plant.twist, plant.momentum
+        self.pose, self.twist = plant.pose, plant.twist
+        self.momentum, self.expected_momenta = plant.momentum, plant.expected_momenta
         self.q, self.qdot, self.effort = plant.q, plant.qdot, plant.effort
         self.link_R, self.link_r = plant.link_R, plant.link_r
-
-    @property
-    def limit_counts(self) -> Mapping[str, Counts]:
-        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
-        return self.plant.limit_counts
-
-    @property
-    def expected_momenta(self) -> Array:
-        """Linear and angular momentum (6,) in W: the initial value plus thrust and loads."""
-        return self.plant.expected_momenta
+        self.limit_counts = plant.limit_counts
 
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all others."""
@@ -106,6 +100,72 @@ class WrappedPlant:
     def reset(self) -> None:
         """Return to the initial state."""
         self.plant.reset()
+
+
+class CompiledPlant:
+    """Base class of plants that compute each tick by one compiled function.
+
+    ``tick(robot, model, substeps, loaded=...)`` composes this function; with loads, their vector is
+    its last input. ``kind`` names the plant in the names of functions, ``limits`` are the kinds of
+    limits that it counts; for the other parameters, see the subclasses.
+    """
+
+    _h: Array
+    """Input of the tick: its duration, s."""
+
+    def __init__(
+        self,
+        kind: str,
+        tick: Callable[..., ca.Function],
+        limits: tuple[str, str],
+        robot: SpaceRobot,
+        control_period: float,
+        initial: InitialState | None,
+        integration_step: float,
+    ) -> None:
+        substeps = count_steps(control_period, integration_step)
+        self.robot, self.control_period, self._substeps = robot, control_period, substeps
+        self.initial = initial or InitialState()
+
+        def composed(prefix: str = "") -> BufferedFunction:
+            return robot.composed(
+                f"{prefix}{kind}_tick_{substeps}",
+                lambda model: tick(robot, model, substeps, loaded=bool(prefix)),
+            )
+
+        self._advance, self._composed = composed(), composed
+        self._tick: BufferedFunction | LoadedTick = self._advance
+        self.limit_counts = {each: np.zeros(robot.n, dtype=np.int64) for each in limits}
+
+    def _use_loads(self, loads: PlantLoads, *further: Array) -> None:
+        """Apply loads from now on; ``further`` are arrays for additional outputs of the tick."""
+        self._tick = LoadedTick(self._advance, self._composed("loaded_"), loads, further)
+
+    def _update_outputs(self) -> None:
+        """Compute all outputs of the current state, by a tick of zero duration."""
+        self._h[:] = 0.0
+        self._advance.evaluate()
+        self._h[:] = self.control_period
+
+
+def body_outputs(
+    model: Composition,
+    q: ca.MX,
+    quaternion: ca.MX,
+    qdot: ca.MX,
+    momenta: tuple[ca.MX, ca.MX],
+    r_WC_W: ca.MX,
+) -> tuple[ca.MX, ca.MX, list[Any]]:
+    """Return the outputs of a state that all ticks compute: ``pose``, ``twist``, and a list of
+    ``momentum``, ``link_R`` and ``link_r`` of a :class:`Plant`.
+
+    The linear and angular ``momenta`` and the centre of mass ``r_WC_W`` (3,), m, are in W.
+    """
+    v, omega = model("base_twist", quaternion, q, qdot, *momenta)
+    center = model("center_of_mass", q)
+    pose = ca.vertcat(r_WC_W - model("rotate", quaternion, center), quaternion)
+    momentum = model("momentum", quaternion, q, v, omega, qdot)
+    return pose, ca.vertcat(v, omega), [ca.vertcat(*momentum), *model("link_poses", q)]
 
 
 @dataclass(frozen=True)

@@ -9,24 +9,22 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.external_loads import LoadLayout
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, count_steps
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.model_functions import Composition
-from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
-from spacerobot_ros.simulation.plant import Flags, InitialState
+from spacerobot_ros.simulation.loads import PlantLoads
+from spacerobot_ros.simulation.plant import CompiledPlant, Flags, InitialState, body_outputs
 
 _ROUNDING = 1e-9
 """Largest excess over a limit that is attributed to rounding: a fraction of a rate, and a motion in
 a tick (m or rad)."""
 
 
-class VelocityPlant:
+class VelocityPlant(CompiledPlant):
     """A free-floating robot whose servos hold the commanded joint velocities.
 
     After :meth:`step`, the attributes are those of :class:`Plant`: ``qdot`` holds the velocities of
@@ -59,35 +57,19 @@ class VelocityPlant:
         initial: InitialState | None = None,
         integration_step: float = DEFAULT_INTEGRATION_STEP,
     ) -> None:
-        substeps = count_steps(control_period, integration_step)
-        self.robot = robot
-        self.control_period = control_period
-        self.initial = initial or InitialState()
-        self._substeps = substeps
-        self._advance = robot.composed(
-            f"velocity_tick_{substeps}", lambda model: tick_function(robot, model, substeps)
+        limits = "rate", "stroke"
+        super().__init__(
+            "velocity", tick_function, limits, robot, control_period, initial, integration_step
         )
-        self._tick: BufferedFunction | LoadedTick = self._advance
         inputs, outputs = self._advance.inputs, self._advance.outputs
-        self._state, self._command, self._before, self._momenta, self._r_cm, self._h = inputs
+        self._state, self._command, self._before = inputs[:3]
+        self.expected_momenta, self._r_cm, self._h = inputs[3:]
         self._next_state, self.pose, self.twist, self.qdot = outputs[:4]
         self.effort, self.momentum, self.link_R, self.link_r = outputs[4:8]
         self._limited, self._next_r_cm = outputs[8:]
         self.q = self._next_state[: robot.n]
-        self.velocity_limited = np.zeros(robot.n, dtype=np.int64)
-        self.stroke_limited = np.zeros(robot.n, dtype=np.int64)
         self._held: Flags | None = None
         self.reset()
-
-    @property
-    def limit_counts(self) -> dict[str, npt.NDArray[np.int64]]:
-        """Number of ticks in which each joint (n,) was limited, by kind of limit."""
-        return {"rate": self.velocity_limited, "stroke": self.stroke_limited}
-
-    @property
-    def expected_momenta(self) -> Array:
-        """Linear and angular momentum (6,) in W: the initial value plus external loads."""
-        return self._momenta
 
     def reset(self) -> None:
         """Return to the initial state, at rest; the limit counters are kept."""
@@ -99,13 +81,10 @@ class VelocityPlant:
             )
         self._state[: robot.n] = start.shape(robot)
         self._state[robot.n :] = start.attitude()
-        self._momenta[:] = start.momenta()
+        self.expected_momenta[:] = start.momenta()
         self._r_cm[:] = start.system_position(robot)
-        # A step of zero duration computes all outputs of the current state.
         self._command[:] = self._before[:] = 0.0
-        self._h[:] = 0.0
-        self._advance.evaluate()
-        self._h[:] = self.control_period
+        self._update_outputs()
 
     def hold(self, joints: Flags) -> None:
         """Lock the marked joints (n,) at their positions, and release all others."""
@@ -113,19 +92,13 @@ class VelocityPlant:
 
     def load(self, loads: PlantLoads) -> None:
         """Apply external loads; their values may change before each step."""
-        robot, substeps = self.robot, self._substeps
-        loaded = robot.composed(
-            f"loaded_velocity_tick_{substeps}",
-            lambda model: tick_function(robot, model, substeps, loaded=True),
-        )
-        self._tick = LoadedTick(self._advance, loaded, loads, [self._momenta])
+        self._use_loads(loads, self.expected_momenta)
 
     def step(self, command: Array) -> bool:
         """Advance one tick under the joint velocities ``command`` (n,), clipped to their limits.
 
         If a joint would pass its limit within the tick, its rate is reduced so that it ends at the
-        limit. Returns whether any joint was limited; ``velocity_limited`` and ``stroke_limited``
-        count these ticks for each joint.
+        limit. Returns whether any joint was limited.
         """
         self._state[:] = self._next_state
         self._before[:] = self.qdot
@@ -136,8 +109,9 @@ class VelocityPlant:
         self._r_cm[:] = self._next_r_cm
         if self._limited[0] == 0.0:
             return False
-        self.velocity_limited += (self._limited[1 : 1 + self.robot.n] != 0.0).astype(np.int64)
-        self.stroke_limited += (self._limited[1 + self.robot.n :] != 0.0).astype(np.int64)
+        by_rate, by_stroke = self._limited[1:].reshape(2, -1) != 0.0
+        self.limit_counts["rate"] += by_rate
+        self.limit_counts["stroke"] += by_stroke
         return True
 
 
@@ -185,23 +159,17 @@ def tick_function(
         next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
         r_cm_next = r_cm + p_W * (h / model.total_mass)
     q_next, quaternion = next_state[:n], next_state[n:]
-    v, omega = model("base_twist", quaternion, q_next, qdot, p_W, L_W)
-    center = model("center_of_mass", q_next)
-    r_WB = r_cm_next - model("rotate", quaternion, center)
-    momentum = model("momentum", quaternion, q_next, v, omega, qdot)
-    link_R, link_r = model("link_poses", q_next)
+    pose, twist, bodies = body_outputs(model, q_next, quaternion, qdot, (p_W, L_W), r_cm_next)
     return model.function(
         f"loaded_velocity_tick_{substeps}" if loaded else f"velocity_tick_{substeps}",
         [state, command, before, momenta, r_cm, h, *loads],
         [
             next_state,
-            ca.vertcat(r_WB, quaternion),
-            ca.vertcat(v, omega),
+            pose,
+            twist,
             qdot,
             effort,
-            ca.vertcat(*momentum),
-            link_R,
-            link_r,
+            *bodies,
             ca.densify(limited),
             r_cm_next,
             *([ca.vertcat(p_W, L_W)] if loaded else []),

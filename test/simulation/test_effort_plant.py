@@ -261,9 +261,9 @@ def test_efforts_are_clipped_and_counted() -> None:
     assert limited.qdot.tolist() == plant.qdot.tolist()
     assert limited.step([0.0, -2.0, 0.0]) is True
     assert limited.wrench.tolist() == [0.0] * 6
-    assert limited.effort_limited.tolist() == [0, 2, 1]
-    assert plant.effort_limited.tolist() == [0, 0, 0]
-    assert limited.stroke_limited.tolist() == [0, 0, 0]
+    assert limited.limit_counts["effort"].tolist() == [0, 2, 1]
+    assert plant.limit_counts["effort"].tolist() == [0, 0, 0]
+    assert limited.limit_counts["stroke"].tolist() == [0, 0, 0]
 
 
 def test_no_limit_is_none() -> None:
@@ -312,7 +312,7 @@ def test_commands_that_are_not_finite_are_refused(bad: float) -> None:
         assert plant.effort.tolist() == [0.0] * 3
     plant.step([0.1, 0.2, -0.1])
     assert np.all(np.isfinite(plant.pose))
-    assert plant.effort_limited.tolist() == [0, 0, 0]
+    assert plant.limit_counts["effort"].tolist() == [0, 0, 0]
 
 
 def test_commands_of_the_wrong_length_are_refused() -> None:
@@ -373,13 +373,13 @@ def plant() -> EffortPlant:
 @pytest.mark.slow
 def test_a_wheel_at_its_largest_rate_gets_no_faster(plant: EffortPlant) -> None:
     plant.reset()
-    counted = plant.effort_limited.copy()
+    counted = plant.limit_counts["effort"].copy()
     assert plant.step([0.3, -0.2, 0.0, 0.0])
     np.testing.assert_allclose(plant.effort, [0.3, 0.0, 0.0, 0.0])
     assert plant.qdot[0] > 200.0, "the torque of a tick is held"
     assert plant.step([0.3, -0.2, 0.0, -0.5])
     np.testing.assert_allclose(plant.effort, [0.0, 0.0, 0.0, -0.3])
-    assert (plant.effort_limited - counted).tolist() == [1, 2, 0, 1]
+    assert (plant.limit_counts["effort"] - counted).tolist() == [1, 2, 0, 1]
 
 
 @pytest.mark.slow

@@ -73,14 +73,14 @@ def test_slider_arrives_stays_and_leaves(side: float) -> None:
             reaction = -side * STROKE * SLIDER / (MASS + SLIDER)
             assert plant.pose[0] == pytest.approx(reaction, rel=1e-12)
     ticks = 79 - math.floor(arrival / TICK)
-    assert plant.stroke_limited.tolist() == [ticks]
+    assert plant.limit_counts["stroke"].tolist() == [ticks]
     assert plant.effort.tolist() == [side * force]
 
     for tick in range(1, 20):
         assert plant.step([-side * force]) is False
         way = force / REDUCED * (tick * TICK) ** 2 / 2
         assert plant.q[0] == pytest.approx(side * (STROKE - way), rel=1e-12)
-    assert plant.stroke_limited.tolist() == [ticks]
+    assert plant.limit_counts["stroke"].tolist() == [ticks]
 
 
 def test_arrival_within_a_step_is_found_to_rounding() -> None:
@@ -104,7 +104,7 @@ def test_start_on_the_stop() -> None:
     assert plant.step([0.0]) is False  # nothing pushes it
     assert plant.step([1.0]) is True
     assert plant.step([-1.0]) is False
-    assert plant.stroke_limited.tolist() == [1]
+    assert plant.limit_counts["stroke"].tolist() == [1]
     moving = InitialState(joint_positions=np.array([STROKE]), joint_velocities=np.array([0.2]))
     plant = EffortPlant(robot_of(SLEDGE), TICK, moving)
     assert plant.momentum[6] == pytest.approx(REDUCED * 0.2**2 / 2)
@@ -178,7 +178,7 @@ def test_energy_of_an_arrival_is_carnots(seed: int) -> None:
     before = plant.momentum.copy()
     assert plant.step(np.zeros(robot.n)) is True
     assert abs(plant.qdot[joint]) < 1e-8
-    assert plant.stroke_limited.tolist() == np.eye(robot.n, dtype=int)[joint].tolist()
+    assert plant.limit_counts["stroke"].tolist() == np.eye(robot.n, dtype=int)[joint].tolist()
     jump, K = plant.qdot - qdot, shape_inertia(robot, q)
     # Only the stop of that joint gave an impulse.
     impulse = K @ jump
@@ -203,7 +203,7 @@ def test_a_held_joint_feels_no_work_and_the_others_move_as_if_welded() -> None:
     for _ in range(40):
         assert plant.step(effort) is True
         assert welded.step(effort[1:]) is False
-    assert plant.stroke_limited.tolist() == [40, 0, 0, 0, 0, 0]
+    assert plant.limit_counts["stroke"].tolist() == [40, 0, 0, 0, 0, 0]
     np.testing.assert_allclose(plant.q[1:], welded.q, atol=1e-12)
     np.testing.assert_allclose(plant.pose, welded.pose, atol=1e-12)
 
@@ -251,7 +251,7 @@ def test_robots_on_their_stops_fly_the_same_every_time() -> None:
         flights.append([plant.step(command) or plant.pose.tolist() for command in commands])
         flights[-1].append(plant.pose.tolist() + plant.qdot.tolist())
     assert flights[0] == flights[1]
-    assert plant.stroke_limited.sum() > 0
+    assert plant.limit_counts["stroke"].sum() > 0
 
 
 # -- the projection ---------------------------------------------------------------------------

@@ -54,8 +54,8 @@ def test_momentum_is_conserved_and_the_centre_of_mass_goes_straight(
         watched.append(np.concatenate([linear.sum(axis=0), angular.sum(axis=0)]))
         expected = r_cm + tick * TICK * start.linear_momentum / case.robot.total_mass
         np.testing.assert_allclose(case.oracle.center_of_mass_W(), expected, atol=1e-12)
-    assert plant.velocity_limited.sum() > 0
-    assert plant.stroke_limited.sum() > 0
+    assert plant.limit_counts["rate"].sum() > 0
+    assert plant.limit_counts["stroke"].sum() > 0
     for series in (np.array(ledger), np.array(watched)):
         drift_p = np.linalg.norm(series[:, :3] - start.linear_momentum, axis=1)
         drift_L = np.linalg.norm(series[:, 3:6] - start.angular_momentum, axis=1)
@@ -236,13 +236,13 @@ def test_a_reset_is_a_new_start_to_the_last_bit(momentum: bool) -> None:
     for command in commands:
         plant.step(command)
         first.append(plant.pose.copy())
-    counted = plant.velocity_limited.copy()
+    counted = plant.limit_counts["rate"].copy()
     plant.reset()
     for now, then in zip(
         (plant.pose, plant.twist, plant.q, plant.qdot, plant.momentum), begin, strict=True
     ):
         np.testing.assert_array_equal(now, then)
-    np.testing.assert_array_equal(plant.velocity_limited, counted)
+    np.testing.assert_array_equal(plant.limit_counts["rate"], counted)
     for command, pose in zip(commands, first, strict=True):
         plant.step(command)
         np.testing.assert_array_equal(plant.pose, pose)
@@ -291,8 +291,8 @@ def test_a_rate_is_clipped_and_counted_once_a_tick() -> None:
     np.testing.assert_allclose(plant.q, [0.035, -0.035, 0.035])
     assert not plant.step(np.array([0.7, 0.0, -0.7]))
     assert plant.step(np.array([0.0, 0.0, -np.inf]))
-    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 2])
-    np.testing.assert_array_equal(plant.stroke_limited, [0, 0, 0])
+    np.testing.assert_array_equal(plant.limit_counts["rate"], [1, 0, 2])
+    np.testing.assert_array_equal(plant.limit_counts["stroke"], [0, 0, 0])
 
 
 def test_a_joint_stops_at_the_end_of_its_stroke_and_comes_back() -> None:
@@ -300,12 +300,12 @@ def test_a_joint_stops_at_the_end_of_its_stroke_and_comes_back() -> None:
     assert plant.step(np.array([0.7, -0.3, 0.7]))
     np.testing.assert_allclose(plant.qdot, [0.2, 0.0, 0.7], atol=1e-12)
     np.testing.assert_allclose(plant.q, [2.5, -2.5, 0.035], rtol=1e-15)
-    np.testing.assert_array_equal(plant.stroke_limited, [1, 1, 0])
-    np.testing.assert_array_equal(plant.velocity_limited, [0, 0, 0])
+    np.testing.assert_array_equal(plant.limit_counts["stroke"], [1, 1, 0])
+    np.testing.assert_array_equal(plant.limit_counts["rate"], [0, 0, 0])
     # Too fast and too far at once counts as both.
     assert plant.step(np.array([1.0, 0.3, 0.0]))
-    np.testing.assert_array_equal(plant.stroke_limited, [2, 1, 0])
-    np.testing.assert_array_equal(plant.velocity_limited, [1, 0, 0])
+    np.testing.assert_array_equal(plant.limit_counts["stroke"], [2, 1, 0])
+    np.testing.assert_array_equal(plant.limit_counts["rate"], [1, 0, 0])
     assert plant.qdot[0] == pytest.approx(0.0, abs=1e-12)
     assert not plant.step(np.array([-0.7, 0.3, 0.0]))
     np.testing.assert_allclose(plant.q, [2.465, -2.47, 0.035], rtol=1e-14)
@@ -326,9 +326,9 @@ def test_no_joint_ever_leaves_its_limits(seed: int) -> None:
         np.testing.assert_allclose(plant.q, before + TICK * plant.qdot, atol=1e-12)
     np.testing.assert_allclose(plant.q[~free], (STROKE * np.sign(push))[~free], atol=1e-12)
     assert np.all(np.abs(plant.q[free]) > STROKE)
-    np.testing.assert_array_equal(plant.velocity_limited, 100)
-    assert np.all(plant.stroke_limited[~free] > 0)
-    assert np.all(plant.stroke_limited[free] == 0)
+    np.testing.assert_array_equal(plant.limit_counts["rate"], 100)
+    assert np.all(plant.limit_counts["stroke"][~free] > 0)
+    assert np.all(plant.limit_counts["stroke"][free] == 0)
 
 
 # -- refusals ---------------------------------------------------------------------------------
