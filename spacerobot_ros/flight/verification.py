@@ -454,7 +454,7 @@ def _resimulate(
         raise RecordingError(
             f"The bag {flight.path} starts mid-flight, so it is unknown whether the target is held."
         )
-    plant.tick = first
+    plant.start_at(first)
     if flight.config.actuation == "velocity":
         # Servo efforts follow from velocity changes.
         plant.qdot[:] = rates

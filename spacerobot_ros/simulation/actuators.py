@@ -149,8 +149,7 @@ class PlantWithFaults(WrappedPlant):
     """A :class:`Plant` with scheduled actuator faults and disturbances.
 
     This plant shares the wrapped plant's state arrays. A reset preserves the time, the faults and
-    the disturbances. A tick without faults requires only one additional comparison. Until the first
-    disturbance begins, the plant steps without external loads.
+    the disturbances. Until the first disturbance is known, the plant steps without external loads.
 
     Bias and noise are added to a joint command, which is then scaled if the joint is slow; a
     stuck joint is held in place (:meth:`Plant.hold`). Wrench faults act on the commanded wrench, or
@@ -203,7 +202,6 @@ class PlantWithFaults(WrappedPlant):
         """Whether a step accepts a base wrench in addition to the joint commands."""
         self.tick = 0
         """Ticks since the beginning."""
-        self.step: Callable[..., bool] = self._step
         self._control_period = control_period
         # The random stream differs from the sensors' stream, which has the seed itself.
         self._rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
@@ -224,13 +222,17 @@ class PlantWithFaults(WrappedPlant):
             disturbances, lambda line, now: parse_disturbance(line, plant.robot.link_names, now)
         )
         self._surroundings = surroundings or Surroundings()
-        self.apply_active_faults()
-        self._apply_active_disturbances()
+        self._update_active()
 
     @property
     def time(self) -> float:
         """Simulated time, s."""
         return self.tick * self._control_period
+
+    def start_at(self, tick: int) -> None:
+        """Continue from another time, given as the number of ticks since the beginning."""
+        self.tick = tick
+        self._update_active()
 
     def inject(self, text: str) -> None:
         """Add faults, one per line, while the plant runs; ``clear`` removes all faults.
@@ -241,7 +243,7 @@ class PlantWithFaults(WrappedPlant):
             A line is not a valid fault for this robot; none of the lines is added.
         """
         self.timeline.inject(text, self.time)
-        self.apply_active_faults()
+        self._update_active()
 
     def disturb(self, text: str) -> None:
         """Add disturbances, one per line, while the plant runs; ``clear`` removes them all.
@@ -252,23 +254,49 @@ class PlantWithFaults(WrappedPlant):
             A line is not a valid disturbance for this robot; none of the lines is added.
         """
         self._disturbances.inject(text, self.time)
-        self._apply_active_disturbances()
+        self._update_active()
 
     def succeed(self, before: PlantWithFaults) -> None:
         """Take over the time, faults and disturbances of the robot's previous plant."""
-        self.tick = before.tick
         self.timeline.copy_from(before.timeline)
         self._disturbances.copy_from(before._disturbances)
-        self.apply_active_faults()
-        self._apply_active_disturbances()
+        self.start_at(before.tick)
 
-    def apply_active_faults(self) -> None:
-        """Apply the faults that are active at the current time."""
-        active = self.timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
-        self._next_tick = self.timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
-        if active is self.active:
-            return
-        self.active, self.injected = active, (*active, *self.disturbances)
+    def step(self, *commands: Any) -> bool:
+        """Advance one tick under commands as for the wrapped plant; return whether a joint was
+        limited."""
+        if self.loads is not None:
+            self.loads.time = self.time
+            self.loads.last[:] = self.loads.vector
+        if self._actuators_sound:
+            limited = self.plant.step(*commands)
+        else:
+            limited = self.plant.step(*self._faulty_commands(*commands))
+        self.tick += 1
+        if self.tick >= self._next_tick:
+            self._update_active()
+        return limited
+
+    def _update_active(self) -> None:
+        """Apply the faults and disturbances that are active at the current time."""
+        period, timelines = self._control_period, (self.timeline, self._disturbances)
+        now = self.time + _FAULT_TIME_ROUNDING * period
+        faults, disturbances = self.timeline.at(now), self._disturbances.at(now)
+        next_change = min(each.next_change for each in timelines)
+        self._next_tick = next_change / period - _FAULT_TIME_ROUNDING
+        if self.loads is None and (self._disturbances.entries or self._surroundings.has_loads):
+            self.loads = PlantLoads(self.robot, self._surroundings)
+            self.plant.load(self.loads)
+        if faults is not self.active:
+            self.active = faults
+            self._apply_faults(faults)
+        if disturbances is not self.disturbances and self.loads is not None:
+            self.disturbances = disturbances
+            self._apply_disturbances(disturbances, self.loads)
+        if self.injected != (*faults, *disturbances):
+            self.injected = (*faults, *disturbances)
+
+    def _apply_faults(self, active: tuple[Fault, ...]) -> None:
         self._bias[:], self._noise[:], self._factor[:] = 0.0, 0.0, 1.0
         self._wrench_factor[:], self._wrench_held[:] = 1.0, 0.0
         wrench_faulty = False
@@ -301,29 +329,7 @@ class PlantWithFaults(WrappedPlant):
             self._apply_nozzle_faults(self.thrusters, active)
         self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
 
-    def _loaded_step(self, *commands: Any) -> bool:
-        assert self.loads is not None
-        if self.tick >= self._next_disturbance:
-            self._apply_active_disturbances()  # The owner may have set the tick.
-        self.loads.time = self.time
-        self.loads.last[:] = self.loads.vector
-        limited = self._step(*commands)
-        if self.tick >= self._next_disturbance:
-            self._apply_active_disturbances()
-        return limited
-
-    def _apply_active_disturbances(self) -> None:
-        timeline = self._disturbances
-        if self.loads is None and (timeline.entries or self._surroundings.has_loads):
-            self.loads = PlantLoads(self.robot, self._surroundings)
-            self.plant.load(self.loads)
-            self.step = self._loaded_step
-        loads = self.loads
-        active = timeline.at(self.time + _FAULT_TIME_ROUNDING * self._control_period)
-        self._next_disturbance = timeline.next_change / self._control_period - _FAULT_TIME_ROUNDING
-        if active is self.disturbances or loads is None:
-            return
-        self.disturbances, self.injected = active, (*self.active, *active)
+    def _apply_disturbances(self, active: tuple[Disturbance, ...], loads: PlantLoads) -> None:
         loads.in_link[:] = loads.in_world[:] = 0.0
         for each in active:
             wrenches = loads.in_link if each.in_link else loads.in_world
@@ -339,16 +345,6 @@ class PlantWithFaults(WrappedPlant):
                     thrusters.stuck_on[nozzle] = True
                 else:
                     thrusters.thruster_health[nozzle] *= fault.value
-
-    def _step(self, *commands: Any) -> bool:
-        if self._actuators_sound:
-            limited = self.plant.step(*commands)
-        else:
-            limited = self.plant.step(*self._faulty_commands(*commands))
-        self.tick += 1
-        if self.tick >= self._next_tick:
-            self.apply_active_faults()
-        return limited
 
     def _faulty_commands(self, joints: Array, *wrench: Array) -> list[Array]:
         """Return the commands as the faulty actuators realise them (new arrays)."""
@@ -409,6 +405,10 @@ def build_plant(
     ParameterError
         The integration step is too short, or the initial state, the target, a thruster, a fault or
         a disturbance is invalid.
+    RobotDescriptionError
+        MuJoCo rejects the robot or the target.
+    SpaceRobotError
+        MuJoCo is not installed.
     """
     config = config.decided()
     kind, step = PLANTS[config.actuation], config.integration_step
@@ -440,7 +440,12 @@ def build_plant(
         from spacerobot_ros.simulation import mujoco_plant
 
         step = step or mujoco_plant.DEFAULT_INTEGRATION_STEP
-        plant = mujoco_plant.build_mujoco_plant(robot, config, start, step, description)
+        if description is None:
+            plant = mujoco_plant.MujocoPlant(
+                robot, control_period, start, step, actuation=config.actuation
+            )
+        else:
+            plant = mujoco_plant.MujocoCapturePlant(robot, start, step, description, config)
     else:
         step = step or kind.integration_step
 

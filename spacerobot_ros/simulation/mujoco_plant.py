@@ -466,14 +466,25 @@ class MujocoCapturePlant(CapturePlant):
 
     def __init__(
         self,
-        plant: MujocoPlant,
-        target: MujocoTarget,
+        robot: SpaceRobot,
+        initial: InitialState,
+        integration_step: float,
+        description: RobotDescription,
         config: PlantConfig,
     ) -> None:
-        self._engine = plant
+        target = MujocoTarget(description, config.target, robot)
+        link = capturing_link(robot.description, config)
+        self._engine = plant = MujocoPlant(
+            robot,
+            config.control_period,
+            initial,
+            integration_step,
+            actuation=config.actuation,
+            target=(target, link),
+        )
         target.plant = plant
         target.step()
-        super().__init__(lambda *_: plant, plant.robot, plant.initial, target, config)
+        super().__init__(lambda *_: plant, robot, initial, target, config)
 
     def _continue(self, robot: SpaceRobot, motion: RobotMotion, momenta: Array) -> None:
         engine = self._engine
@@ -490,43 +501,3 @@ class MujocoCapturePlant(CapturePlant):
 
     def _body(self) -> BodyMotion:
         return self._engine.target_motion
-
-
-def build_mujoco_plant(
-    robot: SpaceRobot,
-    config: PlantConfig,
-    initial: InitialState,
-    step: float,
-    target: RobotDescription | None,
-) -> MujocoPlant | MujocoCapturePlant:
-    """Return the configured plant, without thrusters and faults.
-
-    Parameters
-    ----------
-    robot
-        The model.
-    config
-        The plant parameters.
-    initial
-        Initial state.
-    step
-        Longest Runge-Kutta step, s.
-    target
-        The target; None if there is no target.
-
-    Raises
-    ------
-    ParameterError
-        The robot has no end-effector for capturing the target, or the initial state is invalid.
-    RobotDescriptionError
-        MuJoCo rejects the robot or the target.
-    SpaceRobotError
-        MuJoCo is not installed.
-    """
-    period, actuation = config.control_period, config.actuation
-    if target is None:
-        return MujocoPlant(robot, period, initial, step, actuation=actuation)
-    body = MujocoTarget(target, config.target, robot)
-    link = capturing_link(robot.description, config)
-    plant = MujocoPlant(robot, period, initial, step, actuation=actuation, target=(body, link))
-    return MujocoCapturePlant(plant, body, config)

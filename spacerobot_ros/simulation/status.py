@@ -18,7 +18,6 @@ from spacerobot_ros.events import (
     number_format,
 )
 from spacerobot_ros.simulation.actuators import PlantWithFaults
-from spacerobot_ros.simulation.capture import CaptureReport, ReleaseReport
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import with_seconds
@@ -170,13 +169,8 @@ class PlantMonitor:
         self.observe(commands, plant, config)
         self.rearms = self.resets = 0
         """Numbers of rearms and resets, set by the caller."""
-        # Commanders learn these before they see a robot or a state.
-        self.status = replace(
-            PlantStatus(PlantState.INACTIVE, "The plant is inactive."),
-            actuation=config.actuation,
-            tick_rate_hz=config.tick_rate,
-            time_mode=config.time_mode,
-        )
+        # Commanders learn the configuration before they see a robot or a state.
+        self.status = self._configured(PlantState.INACTIVE, "The plant is inactive.")
         """Status of the last update."""
         self.contacts: tuple[str, ...] = ()
         """Links in contact, set by the caller."""
@@ -204,56 +198,53 @@ class PlantMonitor:
         list[Event]
             Events since the last update; empty if the status is unchanged.
         """
-        before, reports = self.status, self._take_reports()
+        before, commands, capturing = self.status, self._commands, self._plant.capturing
+        captures, payload = [], ""
+        if capturing is not None:
+            captures = [report.event(time_s) for report in capturing.reports]
+            capturing.reports.clear()
+            payload = "" if capturing.payload is None else capturing.payload.to_text()
         now = replace(
             self._status(activity),
             time_s=before.time_s,
             rearms=self.rearms,
             resets=self.resets,
-            timeouts=self._commands.timeouts,
-            last_command_s=(
-                self._commands.last_stamp_ns / SECOND if self._commands.timeouts else None
-            ),
+            timeouts=commands.timeouts,
+            last_command_s=commands.last_stamp_ns / SECOND if commands.timeouts else None,
             faults=tuple(str(fault) for fault in self._plant.active),
             disturbances=tuple(str(each) for each in self._plant.disturbances),
-            payload=self._payload(),
+            payload=payload,
             contacts=self.contacts,
-            actuation=self._config.actuation,
-            tick_rate_hz=self._config.tick_rate,
-            time_mode=self._config.time_mode,
         )
-        captures = [report.event(time_s) for report in reports]
         if now == before:
             return captures
         self.status = replace(now, time_s=time_s)
         return [*captures, *_events_between(before, self.status)]
 
-    def _take_reports(self) -> list[CaptureReport | ReleaseReport]:
-        capturing = self._plant.capturing
-        if capturing is None:
-            return []
-        reports, capturing.reports = capturing.reports, []
-        return reports
-
-    def _payload(self) -> str:
-        capturing = self._plant.capturing
-        payload = None if capturing is None else capturing.payload
-        return "" if payload is None else payload.to_text()
+    def _configured(
+        self, state: PlantState, message: str, reason: str = "", fault: str = ""
+    ) -> PlantStatus:
+        config = self._config
+        return PlantStatus(
+            state,
+            message,
+            reason,
+            fault,
+            actuation=config.actuation,
+            tick_rate_hz=config.tick_rate,
+            time_mode=config.time_mode,
+        )
 
     def _status(self, activity: PlantState) -> PlantStatus:
         commands, fault = self._commands, self._commands.fault
+        reason, latched = commands.fault_reason, f", and a fault is latched: {fault}"
         match activity:
             case PlantState.INACTIVE:
-                message = "The plant is inactive"
-                if fault:
-                    message += f", and a fault is latched: {fault}"
+                message = f"The plant is inactive{latched * bool(fault)}"
             case PlantState.FAILED:
-                reason, message = self.failure
-                return PlantStatus(activity, message, reason, fault)
+                return self._configured(activity, self.failure[1], self.failure[0], fault)
             case PlantState.PAUSED:
-                message = "Time is stopped until it is resumed"
-                if fault:
-                    message += f", and a fault is latched: {fault}"
+                message = f"Time is stopped until it is resumed{latched * bool(fault)}"
             case _ if fault:
                 activity = PlantState.LATCHED
                 message = latched_text(fault)
@@ -261,16 +252,15 @@ class PlantMonitor:
                 message = "Each tick uses the command for its state"
             case _ if commands.in_force:
                 message = "A command is active"
+            case _ if commands.timed_out:
+                activity, reason = PlantState.RESTING, "timeout"
+                message = "The joints are brought to rest: the last command is too old"
             case _:
-                activity = PlantState.RESTING
-                if commands.timed_out:
-                    message = "The joints are brought to rest: the last command is too old"
-                    return PlantStatus(activity, f"{message}.", "timeout")
+                activity, reason = PlantState.RESTING, "no_command"
                 message = "The joints rest until a command arrives"
                 if not any(source.commanders for source in commands.sources):
                     message += f"; no node publishes '{commands.sources[0].topic}'"
-                return PlantStatus(activity, f"{message}.", "no_command")
-        return PlantStatus(activity, f"{message}.", commands.fault_reason, fault)
+        return self._configured(activity, f"{message}.", reason, fault)
 
 
 def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
@@ -286,36 +276,32 @@ def _events_between(before: PlantStatus, now: PlantStatus) -> list[Event]:
     if now.latched_fault and now.latched_fault != before.latched_fault:
         message = f"A fault is latched: {now.latched_fault}."
         add(EventKind.LATCHED, message, 2, reason=now.reason)
-    for fault in now.faults:
-        if fault not in before.faults:
-            add(EventKind.FAULT_INJECTED, f"A fault begins: {with_seconds(fault)}.", 1, fault=fault)
-    ended = [fault for fault in before.faults if fault not in now.faults]
+    for fault in _new(now.faults, before.faults):
+        add(EventKind.FAULT_INJECTED, f"A fault begins: {with_seconds(fault)}.", 1, fault=fault)
+    ended = _new(before.faults, now.faults)
     for fault in ended:
         add(EventKind.FAULT_ENDED, f"A fault has ended: {with_seconds(fault)}.", fault=fault)
     if ended and not now.faults:
         add(EventKind.FAULTS_CLEARED, "No fault is active any more.")
-    for each in now.disturbances:
-        if each not in before.disturbances:
-            message = f"A disturbance begins: {with_seconds(each)}."
-            add(EventKind.DISTURBANCE, message, 1, disturbance=each)
-    for each in before.disturbances:
-        if each not in now.disturbances:
-            message = f"A disturbance has ended: {with_seconds(each)}."
-            add(EventKind.DISTURBANCE_ENDED, message, disturbance=each)
-    if now.state is not before.state:
-        if before.state is PlantState.PAUSED and now.state is not PlantState.INACTIVE:
-            add(EventKind.RESUMED, "Time goes on.")
-        match now.state:
-            case PlantState.RUNNING:
-                add(EventKind.RUNNING, now.message)
-            case PlantState.RESTING:
-                level = 1 if now.reason == "timeout" else 0
-                add(EventKind.RESTING, now.message, level, reason=now.reason)
-            case PlantState.PAUSED:
-                add(EventKind.PAUSED, now.message)
-            case _:
-                pass  # The other changes have their own events.
-    elif now.reason != before.reason and now.state is PlantState.RESTING:
+    for each in _new(now.disturbances, before.disturbances):
+        message = f"A disturbance begins: {with_seconds(each)}."
+        add(EventKind.DISTURBANCE, message, 1, disturbance=each)
+    for each in _new(before.disturbances, now.disturbances):
+        message = f"A disturbance has ended: {with_seconds(each)}."
+        add(EventKind.DISTURBANCE_ENDED, message, disturbance=each)
+    changed = now.state is not before.state
+    if changed and before.state is PlantState.PAUSED and now.state is not PlantState.INACTIVE:
+        add(EventKind.RESUMED, "Time goes on.")
+    # Other changes of the state have their own events.
+    if changed and now.state is PlantState.RUNNING:
+        add(EventKind.RUNNING, now.message)
+    elif changed and now.state is PlantState.PAUSED:
+        add(EventKind.PAUSED, now.message)
+    elif now.state is PlantState.RESTING and (changed or now.reason != before.reason):
         level = 1 if now.reason == "timeout" else 0
         add(EventKind.RESTING, now.message, level, reason=now.reason)
     return events
+
+
+def _new(lines: tuple[str, ...], others: tuple[str, ...]) -> list[str]:
+    return [line for line in lines if line not in others]

@@ -180,7 +180,7 @@ def test_a_plant_that_is_disturbed_later_goes_on_as_it_was() -> None:
 
 def test_a_tick_that_the_owner_sets_is_the_time_of_disturbances() -> None:
     plant = plant_with(f"{LINK} force 1 0 0 at 10 until 20")
-    plant.tick = 20 * 15
+    plant.start_at(20 * 15)
     plant.step(np.zeros(3))
     assert plant.momentum[0] == pytest.approx(0.05)
     assert plant.loads is not None

@@ -206,7 +206,8 @@ class PlantNode(FlightNode):
         self._publish_status(self._monitor.status)
 
     def _use_plant(self, plant: PlantWithFaults, config: PlantConfig) -> None:
-        self.plant, plant.tick = plant, self.tick
+        self.plant = plant
+        plant.start_at(self.tick)
         self.reported = ReportedState(plant, config)
         self.commands = CommandValidator(plant, config)
         self._readers = {
