@@ -10,6 +10,7 @@ from enum import Enum
 
 import casadi as ca
 import numpy as np
+from typing_extensions import Unpack
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.detumbling import Detumbling
@@ -23,6 +24,7 @@ from spacerobot_ros.control.limits import (
 )
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
 from spacerobot_ros.control.planned_reference import (
+    Aims,
     GoalMotion,
     GrappleReference,
     PlannedReference,
@@ -93,16 +95,11 @@ class CoordinatedController:
         The control law, with its outputs.
     limits
         Thruster and joint effort limits; commands that exceed them are reported.
-    rates
-        Joint rate limits; commands that exceed them are also reported.
-    profile, motion
-        Reference profile and limits; the available thrust may lower accelerations further.
-    control_period
-        Time between commands, s.
-    estimation_time
-        Longest time, s, for which the base state is estimated by integration after base
-        measurements have stopped (paper 4, section IV). After that, the thrusters are off and the
-        joints are brought to rest.
+    config
+        Control period, joint rate limits, and reference profile and limits; the available thrust
+        may lower accelerations further. ``estimation_time`` is the longest time, s, for which the
+        base state is estimated by integration after base measurements have stopped (paper 4,
+        section IV). After that, the thrusters are off and the joints are brought to rest.
     wheels
         The reaction wheels, if the robot has any; the law then controls the robot's gyrostat.
     planner
@@ -113,21 +110,18 @@ class CoordinatedController:
         self,
         law: ControlLaw,
         limits: ActuatorLimits,
-        rates: JointRateLimits,
-        profile: type[ReferenceProfile],
-        motion: MotionLimits,
-        control_period: float,
-        estimation_time: float,
-        wheels: WheelControl | None = None,
-        planner: ReferencePlanner | None = None,
+        config: ControllerConfig,
+        wheels: WheelControl | None,
+        planner: ReferencePlanner | None,
     ) -> None:
-        self.wheels = wheels
-        self.planner = planner
-        self.law, selection = law, law.outputs.selection
-        self._distances = selection.distances
-        self._limits, self.joint_rate_limits = limits, rates
-        self._profile_type, self._motion = profile, motion
-        self._control_period, self._estimation_time = control_period, estimation_time
+        self.law, self.wheels, self.planner = law, wheels, planner
+        self._distances = law.outputs.selection.distances
+        self._limits, self._motion = limits, config.motion
+        rates = config.joint_rates * law.robot.velocity_limit
+        self.joint_rate_limits = JointRateLimits(law.robot, rates, config.control_period)
+        self._profile_type = PROFILES.get(config.profile, QuinticReference)
+        self._control_period = config.control_period
+        self._estimation_time = config.estimation_time
         self.mode = Mode.MEASURED
         self.profile: ReferenceProfile | None = None
         """Profile of the current goals; None before the first state."""
@@ -165,36 +159,20 @@ class CoordinatedController:
         self.law.set_gains(gains)
         self.gains_checked = False
 
-    def set_goals(
-        self,
-        time: float,
-        state: ControlState,
-        *,
-        base: PoseReference | None = None,
-        end_effector: PoseReference | None = None,
-        joints: Array | None = None,
-    ) -> None:
+    def set_goals(self, time: float, state: ControlState, **aims: Unpack[Aims]) -> None:
         """Start towards new goals; a group without a new goal keeps its previous one.
 
         If the end-effector has had no goal since the robot was held or brought to rest, the base
         carries the end-effector along and the arm keeps its shape. The error integral is reset. The
         reference follows the profile; it is not planned.
         """
-        motion = self.motion_to(time, state, base=base, end_effector=end_effector, joints=joints)
-        self._begin_motion(time, state, motion)
+        self._begin_motion(time, state, self.motion_to(time, state, **aims))
 
-    def motion_to(
-        self,
-        time: float,
-        state: ControlState,
-        *,
-        base: PoseReference | None = None,
-        waypoints: tuple[Array, ...] = (),
-        end_effector: PoseReference | None = None,
-        joints: Array | None = None,
-    ) -> GoalMotion:
-        """Return the motion from the reference at a given time to the goals of
-        :meth:`set_goals`, with base poses (7,) where it rests on the way."""
+    def motion_to(self, time: float, state: ControlState, **aims: Unpack[Aims]) -> GoalMotion:
+        """Return the motion from the reference at a given time to goals as in
+        :meth:`set_goals`, with the base poses (7,) where it rests on the way."""
+        base, end_effector = aims.get("base"), aims.get("end_effector")
+        joints = aims.get("joints")
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
         start = self.reference_at(time, state)
@@ -208,7 +186,7 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        return GoalMotion(start, goal, self._motion, carries, waypoints)
+        return GoalMotion(start, goal, self._motion, carries, aims.get("waypoints", ()))
 
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
@@ -288,12 +266,8 @@ class CoordinatedController:
             turned = matrix_from_quaternion(base.quaternion)
             present = matrix_from_quaternion(carrier.quaternion)
             position = carrier.position + (present - turned) @ c_B
-        poses = (
-            np.concatenate([position, base.quaternion]),
-            np.concatenate([carrier.position, carrier.quaternion]),
-            np.concatenate([carried.position, carried.quaternion]),
-        )
-        pose = compose_poses(poses[0], relative_pose(*poses[1:]))
+        begins = np.concatenate([position, base.quaternion])
+        pose = compose_poses(begins, relative_pose(carrier.values, carried.values))
         return PoseReference(pose[:3], pose[3:])
 
     def restart_motion(self, time: float, state: ControlState) -> None:
@@ -614,18 +588,12 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
             f"The control law '{config.law}' cannot be built: {describe_exception(error)}."
         ) from error
     limits = ActuatorLimits(force, torque, robot.effort_limit)
-    planned = config.profile == PlannedReference.name
-    return CoordinatedController(
-        law,
-        limits,
-        JointRateLimits(robot, config.joint_rates * robot.velocity_limit, config.control_period),
-        QuinticReference if planned else PROFILES[config.profile],
-        config.motion,
-        config.control_period,
-        config.estimation_time,
-        wheels,
-        ReferencePlanner(robot, outputs, limits, config.plan) if planned else None,
-    )
+    planner = None
+    if config.profile == PlannedReference.name:
+        planner = ReferencePlanner(
+            robot, outputs, limits, config.plan, in_background=config.plan_in_background
+        )
+    return CoordinatedController(law, limits, config, wheels, planner)
 
 
 def controlled_outputs(

@@ -11,10 +11,8 @@ from enum import IntEnum
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController, Mode
 from spacerobot_ros.control.goals import (
-    END_EFFECTOR,
     GoalPlanning,
     GoalWatch,
-    PlannedGoals,
     aims_of,
     config_with,
     goal_parts,
@@ -31,9 +29,8 @@ from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.planning.core.goal import (
-    Tolerance,
-)
+from spacerobot_ros.planning.core.cancellation import PlanningJob
+from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     IdentifiedGoal,
@@ -90,8 +87,8 @@ class ControlExecutive:
         """Outputs to publish, in order; the owner removes published outputs. A status is added when
         the state changes, when commands start or stop being limited, and every ``status_period``.
         """
-        self.servicing = Servicing(config)
-        self._planning = GoalPlanning(in_background=config.plan_in_background)
+        self.servicing = Servicing(config, self._report_task)
+        self._planning = GoalPlanning()
         self.reset()
 
     def reset(self) -> None:
@@ -132,7 +129,8 @@ class ControlExecutive:
     def plan_at_once(self) -> None:
         """Compute later plans synchronously, because the plant is in lockstep and states wait for
         them."""
-        self._planning.in_background = False
+        if self.controller.planner is not None:
+            self.controller.planner.in_background = False
 
     @property
     def plan_time(self) -> float:
@@ -283,7 +281,7 @@ class ControlExecutive:
             self._plan_next(_Next.BEGIN_ANEW)
         elif left < math.inf:
             # Until the plan takes over, the robot continues.
-            self._plan_anew(self._time + PLANNING_TIME * self._planning.in_background)
+            self._plan_anew(self._time + PLANNING_TIME * planner.in_background)
 
     def _plan_anew(self, time: float) -> None:
         """Plan the rest of the motion to the pursued goals again."""
@@ -495,12 +493,7 @@ class ControlExecutive:
             self._wait_for_tasks()
         if servicing.task is None:
             return
-        progress = servicing.step(
-            time, state, self.controller, in_background=self._planning.in_background
-        )
-        for event in servicing.events():
-            self.outputs.append(replace(event, goal_id=self._goal_id))
-            self._next_report = time
+        progress = servicing.step(time, state, self.controller)
         match progress.state:
             case TaskState.ACTIVE:
                 pass
@@ -564,41 +557,37 @@ class ControlExecutive:
 
     def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
         """Start towards the pending goals, after tasks from the measured pose."""
-        planned = None
-        if self.controller.planner is not None:
-            planned = self._planned(time, state, carried=carried)
-            if planned is None:
+        pending, controller = self._pending, self.controller
+        if carried and not self._planning.active:
+            # The tasks have moved the robot away from the earlier reference.
+            controller.hold_here(time, state)
+        job = None
+        if controller.planner is not None:
+            job = self._planned(time, state)
+            if job is None:
                 return
-            poses, asked = planned.aims, planned.asked
-        else:
-            poses, asked = aims_of(self.controller, self._pending, state)
         pursued = self._goals if self._pursues else {}
         again = self._goal_id == self._latest_id() and bool(pursued)
         self._goal_id = self._latest_id()
-        self._goals = with_later_goals(pursued, self._pending)
-        self._after_tasks = dict(self._pending) if carried else {}
-        resumes = all(pending.resumes for pending in self._pending.values())
-        self._take_tolerance(next(reversed(self._pending.values())).tolerance)
-        if BASE_GOAL_KEY in self._pending or BASE_GOAL_KEY not in pursued:
-            self._watch.asked[BASE_GOAL_KEY] = asked
-        if END_EFFECTOR in self._pending:
-            self._watch.asked[END_EFFECTOR] = self._pending[END_EFFECTOR].goal.asked
-        self._pending.clear()
-        if planned is not None:
-            self.controller.begin(max(planned.job.begins, time), planned.job.result())
+        self._goals = with_later_goals(pursued, pending)
+        self._after_tasks = dict(pending) if carried else {}
+        self._take_tolerance(next(reversed(pending.values())).tolerance)
+        if BASE_GOAL_KEY not in pursued:
+            self._watch.asked[BASE_GOAL_KEY] = frozenset()
+        self._watch.asked |= {part: each.goal.asked for part, each in pending.items()}
+        resumes = all(each.resumes for each in pending.values())
+        if job is not None:
+            controller.begin(max(job.begins, time), job.result())
         else:
-            if carried:
-                # The tasks have moved the robot away from the earlier reference.
-                self.controller.hold_here(time, state)
-            base, hand, joints = poses["base"], poses["end_effector"], poses["joints"]
-            self.controller.set_goals(time, state, base=base, end_effector=hand, joints=joints)
+            controller.set_goals(time, state, **aims_of(controller, pending, state))
+        self._pending = {}
         if not (carried or again):
-            self._report_acceptance(None if planned is None else planned.job.result())
+            self._report_acceptance(None if job is None else job.result())
             self._watch.forget_touch(time)
         self._begin_tracking(time)
         of_base = self._goals.get(BASE_GOAL_KEY)
         saved = goals_to_save(
-            self.controller,
+            controller,
             self._watch.asked,
             self._goal_id,
             waypoints=None if of_base is None else of_base.goal.waypoints,
@@ -606,29 +595,21 @@ class ControlExecutive:
         )
         self.outputs.append(PursuedGoals(saved))
 
-    def _planned(self, time: float, state: ControlState, *, carried: bool) -> PlannedGoals | None:
-        """Return the planned reference of the pending goals.
+    def _planned(self, time: float, state: ControlState) -> PlanningJob[PlannedReference] | None:
+        """Return the job that has planned the reference of the pending goals.
 
         None: it is still being planned, or the goals have been rejected.
         """
-        if carried and not self._planning.active:
-            self.controller.hold_here(time, state)
         pending = self._pending
         try:
-            return self._planning.planned(
-                time,
-                state,
-                self.controller,
-                pending,
-                lambda: aims_of(self.controller, pending, state),
-            )
+            return self._planning.planned(time, state, self.controller, pending)
         except PlanningError as error:
             goal_id = self._latest_id()
             if all(goal is self._goals.get(part) for part, goal in pending.items()):
                 self._give_up(f"Aborted: {error}")
                 self._hold_pose(time, state, aborted=True)
             else:
-                self._pending.clear()
+                pending.clear()
                 self.refuse(str(error), goal_id)
             return None
 
@@ -666,6 +647,11 @@ class ControlExecutive:
     def _publish_decision(self, state: ControllerState, message: str, goal_id: str) -> None:
         self._publish(state, message, goal_id)
         self._report_decision(state, message, goal_id)
+
+    def _report_task(self, event: Event) -> None:
+        """Report an event of a task, and the state of the controller after it."""
+        self.outputs.append(replace(event, goal_id=self._goal_id))
+        self._next_report = -math.inf
 
     def _report_decision(self, state: ControllerState, message: str, goal_id: str) -> None:
         kind = EventKind(f"goal_{state.value}")

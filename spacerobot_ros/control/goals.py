@@ -5,9 +5,8 @@ planning of their references, in parallel with the control loop.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypedDict
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor, StallMonitor
 from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.control.outputs import OutputDistance, controlled_parts
-from spacerobot_ros.control.planned_reference import PLANNING_TIME, PlannedReference
+from spacerobot_ros.control.planned_reference import PLANNING_TIME, Aims, PlannedReference
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import PlanningError
@@ -54,17 +53,6 @@ _NO_ROTATION = np.array([0.0, 0.0, 0.0, 1.0])
 
 _PLACE: frozenset[Controlled] = frozenset({"position"})
 """Components requested by an end-effector goal with free attitude."""
-
-
-class Aims(TypedDict):
-    """Poses and joint positions requested by goals; None: not requested. The base rests at each of
-    the ``waypoints``, poses (7,), before its goal.
-    """
-
-    base: PoseReference | None
-    waypoints: tuple[Array, ...]
-    end_effector: PoseReference | None
-    joints: Array | None
 
 
 def goal_parts(
@@ -215,29 +203,25 @@ def require_controlled_axes(
 
 def aims_of(
     controller: CoordinatedController, goals: Mapping[str, IdentifiedGoal], state: ControlState
-) -> tuple[Aims, frozenset[Controlled]]:
-    """Return the goal poses and the goal shape in a state, and the base pose components that the
-    goals request.
-    """
-    asked: frozenset[Controlled] = frozenset()
+) -> Aims:
+    """Return the goal poses and the goal shape in a state."""
     poses, shapes, waypoints = {}, [], ()
     for key, identified in goals.items():
         goal = identified.goal
         if key == BASE_GOAL_KEY:
             goal = goal.kept_at(state.r_WB, state.quaternion_WB)
-            asked, waypoints = goal.asked, tuple(goal.path_values[:-1])
+            waypoints = tuple(goal.path_values[:-1])
         poses[key] = PoseReference(goal.position, goal.quaternion)
         if goal.joint_positions is not None:
             shapes.append(goal.joint_positions)
     if controller.wheels is not None:
         shapes = [shape[controller.wheels.wheels.other] for shape in shapes]
-    aims = Aims(
+    return Aims(
         base=poses.get(BASE_GOAL_KEY),
         waypoints=waypoints,
         end_effector=poses.get(END_EFFECTOR),
         joints=shapes[0] if shapes else None,
     )
-    return aims, asked
 
 
 def goals_to_save(
@@ -442,27 +426,17 @@ def decided_message(
 
 @dataclass(frozen=True)
 class PlannedGoals:
-    """Pending goals, their poses and joints, the requested base pose components, and the job that
-    plans their reference.
-    """
+    """Pending goals, their poses and joints, and the job that plans their reference."""
 
     pending: Mapping[str, IdentifiedGoal]
     aims: Aims
-    asked: frozenset[Controlled]
     job: PlanningJob[PlannedReference]
 
 
 class GoalPlanning:
-    """Plans references for pending goals, one at a time.
+    """Plans references for pending goals, one at a time."""
 
-    Parameters
-    ----------
-    in_background
-        Whether to plan in a thread while states are handled.
-    """
-
-    def __init__(self, *, in_background: bool) -> None:
-        self.in_background = in_background
+    def __init__(self) -> None:
         self.time = 0.0
         """Total wall time spent planning references, s."""
         self._plan: PlannedGoals | None = None
@@ -487,26 +461,25 @@ class GoalPlanning:
         state: ControlState,
         controller: CoordinatedController,
         pending: Mapping[str, IdentifiedGoal],
-        aims: Callable[[], tuple[Aims, frozenset[Controlled]]],
-    ) -> PlannedGoals | None:
-        """Return pending goals with their planned reference; None while the reference is being
-        planned, and before planning begins.
-
-        ``aims`` returns the goal poses and joints, and the requested components.
+    ) -> PlanningJob[PlannedReference] | None:
+        """Return the completed job for pending goals; None while their reference is being planned,
+        and before its motion begins.
 
         Raises
         ------
         PlanningError
             No motion is found.
         """
+        planner = controller.planner
+        assert planner is not None
         if not self.is_for(pending):
             self.cancel()
             if self._plan is None:
                 self._lead = PLANNING_TIME
-            self._begin(time, state, controller, pending, *aims())
+            self._begin(time, state, controller, pending, aims_of(controller, pending, state))
         plan = self._plan
         assert plan is not None
-        job, waits = plan.job, self.in_background and plan.job.begins > time
+        job, waits = plan.job, planner.in_background and plan.job.begins > time
         if not job.done:
             return None
         try:
@@ -520,12 +493,12 @@ class GoalPlanning:
                 self._plan = None
         if waits:
             return None
-        if self.in_background and -math.inf < job.begins < time:
+        if planner.in_background and -math.inf < job.begins < time:
             # The reference has moved on: plan from its state after twice the time.
             self._lead *= 2
-            self._begin(time, state, controller, pending, plan.aims, plan.asked)
+            self._begin(time, state, controller, pending, plan.aims)
             return None
-        return plan
+        return job
 
     def _begin(
         self,
@@ -534,13 +507,12 @@ class GoalPlanning:
         controller: CoordinatedController,
         pending: Mapping[str, IdentifiedGoal],
         aims: Aims,
-        asked: frozenset[Controlled],
     ) -> None:
         planner = controller.planner
         assert planner is not None
         seen, begins = state.copied(), -math.inf
         if controller.reference_moves(time):
-            begins = time + (self._lead if self.in_background else 0.0)
+            begins = time + self._lead * planner.in_background
         motion = controller.motion_to(max(begins, time), seen, **aims)
 
         def work(cancellation: Cancellation) -> PlannedReference:
@@ -548,8 +520,8 @@ class GoalPlanning:
 
         last, self._job = self._job, PlanningJob(work, begins)
         # Set before the work begins, so that it can be cancelled.
-        self._plan = PlannedGoals(dict(pending), aims, asked, self._job)
-        self._job.start(in_background=self.in_background, after=last)
+        self._plan = PlannedGoals(dict(pending), aims, self._job)
+        self._job.start(in_background=planner.in_background, after=last)
 
     def cancel(self) -> None:
         """Cancel the job; any thread may call this."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -194,6 +194,17 @@ class GrappleReference(PlannedReference):
         return Reference(base, PoseReference.of_motion(frame), self.goal.joints)
 
 
+class Aims(TypedDict, total=False):
+    """Poses and joint positions (n,) requested by goals; None: not requested. The base rests at
+    each of the ``waypoints``, poses (7,), before its goal.
+    """
+
+    base: PoseReference | None
+    waypoints: tuple[Array, ...]
+    end_effector: PoseReference | None
+    joints: Array | None
+
+
 class GoalMotion(NamedTuple):
     """Start and goal of a motion, and its limits; ``carries``: whether the arm keeps its shape;
     ``waypoints``: base poses (7,) on the way.
@@ -219,6 +230,8 @@ class ReferencePlanner:
         Thruster limits, used if there is no thruster table.
     options
         Plan options.
+    in_background
+        Whether plans are made in a thread while states are handled.
 
     Raises
     ------
@@ -233,8 +246,10 @@ class ReferencePlanner:
         outputs: OutputSelection,
         limits: ActuatorLimits,
         options: PlannedOptions,
+        *,
+        in_background: bool,
     ) -> None:
-        self._outputs = outputs
+        self._outputs, self.in_background = outputs, in_background
         if options.thrusters:
             table = find_thrusters(options.thrusters, robot.description)
             propulsion = Propulsion.of_table(table, options.reserve)
@@ -286,9 +301,9 @@ class ReferencePlanner:
         elif carries or not self._outputs.end_effector:
             shape = q
         elif goal.end_effector is not None:
-            hand = _numbers(goal.end_effector)
+            hand = goal.end_effector.values
         ends = [ThrustGoal(pose, None, q, keeps_shape=carries) for pose in waypoints]
-        ends.append(ThrustGoal(_numbers(goal.base), hand, shape, keeps_shape=carries))
+        ends.append(ThrustGoal(goal.base.values, hand, shape, keeps_shape=carries))
         if carries:
             begin = replace(begin, qdot=np.zeros(len(q)))
         legs = []
@@ -328,8 +343,4 @@ class ReferencePlanner:
         R_BW = matrix_from_quaternion(base.quaternion).T
         twist = np.concatenate([R_BW @ base.velocity, R_BW @ base.angular_velocity])
         q, qdot = (state.q, state.qdot) if joints is None else (joints.q, joints.qdot)
-        return RobotMotion(_numbers(base), twist, q.copy(), qdot * bool(twist.any()))
-
-
-def _numbers(pose: PoseReference) -> Array:
-    return np.concatenate([pose.position, pose.quaternion])
+        return RobotMotion(base.values, twist, q.copy(), qdot * bool(twist.any()))

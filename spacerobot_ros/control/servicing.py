@@ -8,7 +8,7 @@ sets the end-effector reference; detumbling replaces the law until the robot is 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -23,7 +23,11 @@ from spacerobot_ros.control.approach import (
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
-from spacerobot_ros.control.planned_reference import PLANNING_TIME, GrappleReference
+from spacerobot_ros.control.planned_reference import (
+    PLANNING_TIME,
+    GrappleReference,
+    ReferencePlanner,
+)
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.errors import ParameterError, PlanningError, RobotDescriptionError, quantity
 from spacerobot_ros.events import Event, EventKind
@@ -171,9 +175,10 @@ class ApproachTask:
     predicted motion.
     """
 
-    def __init__(self, target: MeasuredTarget, config: ControllerConfig) -> None:
-        self.target, self.config = target, config
-        self.events: list[Event] = []
+    def __init__(
+        self, target: MeasuredTarget, config: ControllerConfig, report: Callable[[Event], None]
+    ) -> None:
+        self.target, self.config, self._report_event = target, config, report
         self._plan: ApproachPlan | GrappleReference | None = None
         self._start = self._contact = 0.0
         """Times, in s after planning, at which the end-effector sets out and meets the target."""
@@ -192,12 +197,7 @@ class ApproachTask:
         """Whether deviations at contact count: not after planning for one has failed."""
 
     def step(
-        self,
-        time: float,
-        state: ControlState,
-        controller: CoordinatedController,
-        *,
-        in_background: bool,
+        self, time: float, state: ControlState, controller: CoordinatedController
     ) -> TaskProgress:
         """Set the controller's reference for a state."""
         options = self.config.target
@@ -224,8 +224,8 @@ class ApproachTask:
                     self._make_plan(time, state, controller, target.body)
             else:
                 if deviation is not _Deviation.NONE:
-                    self._start_job(time, state, controller, in_background=in_background)
-                self._take_plan(time, controller, in_background=in_background)
+                    self._start_job(time, state, controller, controller.planner)
+                self._take_plan(time, controller, controller.planner)
         except PlanningError as error:
             if self._reason is not _Deviation.AT_CONTACT:
                 why = str(error).rstrip(".")
@@ -306,8 +306,7 @@ class ApproachTask:
         time: float,
         state: ControlState,
         controller: CoordinatedController,
-        *,
-        in_background: bool,
+        planner: ReferencePlanner,
     ) -> None:
         """Start planning the base and the arm together."""
         options, target = self.config.target, self.target
@@ -321,12 +320,12 @@ class ApproachTask:
             options.corridor_angle,
             options.corridor_length,
         )
-        lead = self._lead if in_background else 0.0
+        lead = self._lead * planner.in_background
         self._job = controller.plan_grapple(time, state.copied(), grapple, lead)
-        self._job.start(in_background=in_background)
+        self._job.start(in_background=planner.in_background)
 
     def _take_plan(
-        self, time: float, controller: CoordinatedController, *, in_background: bool
+        self, time: float, controller: CoordinatedController, planner: ReferencePlanner
     ) -> None:
         """Begin with a completed plan for base and arm; until then, the robot continues with an
         earlier one.
@@ -337,7 +336,7 @@ class ApproachTask:
         self._job = None
         planned = job.result()
         self._looks_ahead = True
-        if time - job.begins > _LATEST_BEGIN and in_background:
+        if time - job.begins > _LATEST_BEGIN and planner.in_background:
             # The robot and the target have moved on.
             self._lead *= 2
             return
@@ -398,7 +397,7 @@ class ApproachTask:
     ) -> None:
         names = ("starts_s", "closes_s", "contact_s")
         about = {name: f"{time:.9g}" for name, time in zip(names, times, strict=True)}
-        self.events.append(Event(EventKind.APPROACH_STARTED, message, about=about | (more or {})))
+        self._report_event(Event(EventKind.APPROACH_STARTED, message, about=about | (more or {})))
 
 
 def _is_off(expected: BodyMotion, found: BodyMotion) -> bool:
@@ -409,23 +408,18 @@ def _is_off(expected: BodyMotion, found: BodyMotion) -> bool:
 class DetumblingTask:
     """Detumbling until the robot, with the body that it holds, has been at rest for a while."""
 
-    def __init__(self, payload: Payload | None, config: ControllerConfig) -> None:
-        self.payload, self.config = payload, config
-        self.events: list[Event] = []
+    def __init__(
+        self, payload: Payload | None, config: ControllerConfig, report: Callable[[Event], None]
+    ) -> None:
+        self.payload, self.config, self._report_event = payload, config, report
         self._law: Detumbling | None = None
         self._began = self._momentum = self._fastest = 0.0
         self._at_rest_since: float | None = None
 
     def step(
-        self,
-        time: float,
-        state: ControlState,
-        controller: CoordinatedController,
-        *,
-        in_background: bool,
+        self, time: float, state: ControlState, controller: CoordinatedController
     ) -> TaskProgress:
         """Make the controller bring the robot to rest."""
-        del in_background
         options = self.config.detumble
         if self._law is None:
             self._begin(time, state, controller)
@@ -470,7 +464,7 @@ class DetumblingTask:
             f"The robot is brought to rest: removing an angular momentum of {self._momentum:.4g} "
             f"N m s takes at least {bound:.4g} s."
         )
-        self.events.append(Event(EventKind.DETUMBLE_STARTED, message))
+        self._report_event(Event(EventKind.DETUMBLE_STARTED, message))
 
     def _end(self, at_rest: float) -> None:
         law = self._law
@@ -488,23 +482,23 @@ class DetumblingTask:
             "largest_torque_Nm": f"{law.torque:.9g}",
             "grasp_torque_Nm": f"{law.largest_grasp_torque:.9g}",
         }
-        self.events.append(Event(EventKind.DETUMBLED, message, about=about))
+        self._report_event(Event(EventKind.DETUMBLED, message, about=about))
 
 
 class Servicing:
-    """The tasks of a controller: tasks that precede its goals, and tasks on request."""
+    """The tasks of a controller: tasks that precede its goals, and tasks on request; ``report`` is
+    called with their events."""
 
-    def __init__(self, config: ControllerConfig) -> None:
+    def __init__(self, config: ControllerConfig, report: Callable[[Event], None]) -> None:
         tasks = Task.parsed(config.tasks)
         without = config.target.detumble == "none"
         self.before_goals = tuple(t for t in tasks if not (without and t is Task.DETUMBLE))
-        self._config = config
+        self._config, self._report_event = config, report
         self.target = MeasuredTarget()
         self.payload: Payload | None = None
         """The held body."""
         self._remaining_tasks: list[Task] = []
         self._present: ApproachTask | DetumblingTask | None = None
-        self._events: list[Event] = []
 
     def configure(self, config: ControllerConfig) -> None:
         """Use other time settings from the next task on."""
@@ -550,23 +544,17 @@ class Servicing:
             self.restart()
 
     def step(
-        self,
-        time: float,
-        state: ControlState,
-        controller: CoordinatedController,
-        *,
-        in_background: bool = False,
+        self, time: float, state: ControlState, controller: CoordinatedController
     ) -> TaskProgress:
-        """Advance the current task; DONE after the last task. ``in_background``: a thread plans."""
+        """Advance the current task; DONE after the last task."""
+        config, report = self._config, self._report_event
         while self._remaining_tasks:
             if self.task is not Task.APPROACH or self.payload is None:
                 if self._present is None and self.task is Task.APPROACH:
-                    self._present = ApproachTask(self.target, self._config)
+                    self._present = ApproachTask(self.target, config, report)
                 elif self._present is None:
-                    self._present = DetumblingTask(self.payload, self._config)
-                progress = self._present.step(time, state, controller, in_background=in_background)
-                self._events += self._present.events
-                self._present.events.clear()
+                    self._present = DetumblingTask(self.payload, config, report)
+                progress = self._present.step(time, state, controller)
                 if progress.state is not TaskState.DONE:
                     return progress
             self.restart()
@@ -574,8 +562,3 @@ class Servicing:
             controller.follow(Reference())
             controller.hold_here(time, state)
         return _DONE
-
-    def events(self) -> list[Event]:
-        """Return the events since the last call."""
-        events, self._events = self._events, []
-        return events

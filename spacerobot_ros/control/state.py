@@ -109,6 +109,11 @@ class PoseReference:
         return cls(motion.r[0], quaternion, *(each[0] for each in numbers))
 
     @property
+    def values(self) -> Array:
+        """The pose (7,): position, m, and quaternion."""
+        return np.concatenate([self.position, self.quaternion])
+
+    @property
     def motion(self) -> FrameMotion:
         """The reference as the motion of a frame at a single time."""
         R = matrix_from_quaternion(self.quaternion)
