@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes import NODE_TYPES, FlightNode
-from spacerobot_ros.nodes.common.node import MatchedEndpoints, topics_without_all_matches
+from spacerobot_ros.nodes.common.node import endpoints_of, topics_without_all_matches
 from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.scenario import COMMANDERS, scenario_or_robot
@@ -147,7 +147,11 @@ class Stack:
         everyone = [*self.nodes.values(), client.node]
         try:
             self.spin_until(
-                lambda: not topics_without_all_matches(map(MatchedEndpoints.of, everyone))
+                lambda: (
+                    not topics_without_all_matches(
+                        [end for node in everyone for end in endpoints_of(node)]
+                    )
+                )
             )
             # Messages published by one callback are delivered in order: the goal comes first.
             clock = Clock(clock_type=ClockType.STEADY_TIME)

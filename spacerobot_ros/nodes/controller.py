@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -85,7 +84,13 @@ class CoordinatedControlNode(CommanderNode):
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
-        self.create_subscription(Odometry, TARGET_ODOMETRY, self._on_target, STREAM, raw=True)
+        self.create_subscription(
+            Odometry,
+            TARGET_ODOMETRY,
+            lambda raw: commander.receive_target(first_time_ns(raw), raw),
+            STREAM,
+            raw=True,
+        )
         if self.config.profile == PlannedReference.name:
             self.listen_to_obstacles()
             self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
@@ -95,7 +100,10 @@ class CoordinatedControlNode(CommanderNode):
         if self.config.watchdog_timeout:
             self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
         for kind, topic in ((JointState, JOINT_REFERENCE), (Odometry, BASE_REFERENCE)):
-            take = partial(self._on_reference, topic)
+
+            def take(raw: bytes, topic: str = topic) -> None:
+                self.commander.receive_reference(topic, first_time_ns(raw), raw)
+
             self.inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
 
     def start_message(self) -> str:
@@ -105,10 +113,6 @@ class CoordinatedControlNode(CommanderNode):
             f"Controls {described_robot(self.commander.robot)} with law '{config.law}'; goals on "
             f"'{topic}' in '{config.world_frame}'."
         )
-
-    def parameters_changed(self) -> None:
-        """Use the new gains, tolerances and times."""
-        self.commander.reconfigure(self.config)
 
     def use(self, robot: SpaceRobot) -> None:
         """Set the robot to control."""
@@ -138,12 +142,6 @@ class CoordinatedControlNode(CommanderNode):
                 self._busy.add(message.name)
             else:
                 self._busy.discard(message.name)
-
-    def _on_reference(self, topic: str, raw: bytes) -> None:
-        self.commander.receive_reference(topic, first_time_ns(raw), raw)
-
-    def _on_target(self, raw: bytes) -> None:
-        self.commander.receive_target(first_time_ns(raw), raw)
 
     def _on_target_description(self, message: String) -> None:
         try:

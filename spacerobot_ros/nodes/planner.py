@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from threading import Thread
 from typing import Any, ClassVar
 
@@ -95,12 +96,18 @@ class PlannerNode(CommanderNode):
         self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
         self.listen("planner/status")
         if self.config.output == "trajectory":
-            self._follow_trajectories()
+            self._trajectories = self._trajectories or _TrajectoryClients(self)
+            self.commander.trajectories = self._trajectories.connect(
+                self.config.trajectory_action, self.commander.end_schedule
+            )
         self.subscribe_to_goals("goal_pose")
         for name in self.config.goal_links:
             self.subscribe_to_goals(goal_topic(name), name)
-            self._take_twists(name)
-            self._take_paths(name)
+            for kind, topic, take in (
+                (TwistStamped, twist_topic(name), self._on_twist),
+                (Path, path_topic(name), self._on_path),
+            ):
+                self.create_subscription(kind, topic, partial(take, name), STREAM)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.listen_to_obstacles()
         self.offer("~/statistics", lambda: self.statistics.to_json())
@@ -129,17 +136,6 @@ class PlannerNode(CommanderNode):
             self._trajectories.destroy()
         super().destroy_node()
 
-    def _follow_trajectories(self) -> None:
-        if self._trajectories is None:
-            self._trajectories = _TrajectoryClients(self)
-        self.commander.trajectories = self._trajectories.connect(
-            self.config.trajectory_action, self.commander.end_schedule
-        )
-
-    def parameters_changed(self) -> None:
-        """Plan and evaluate with the new tolerances."""
-        self.commander.reconfigure(self.config)
-
     def use(self, robot: SpaceRobot) -> None:
         """Set the robot for planning."""
         self.goal_shape = None
@@ -150,21 +146,13 @@ class PlannerNode(CommanderNode):
 
     # -- inputs -------------------------------------------------------------------------------
 
-    def _take_twists(self, link: str) -> None:
-        def on_twist(message: TwistStamped) -> None:
-            twist, commander = message.twist, self.commander
-            linear, angular = (
-                np.array([each.x, each.y, each.z]) for each in (twist.linear, twist.angular)
-            )
-            commander.receive_twist(link, message.header.frame_id, linear, angular)
+    def _on_twist(self, link: str, message: TwistStamped) -> None:
+        twist, frame = message.twist, message.header.frame_id
+        linear, angular = (np.array([v.x, v.y, v.z]) for v in (twist.linear, twist.angular))
+        self.commander.receive_twist(link, frame, linear, angular)
 
-        self.create_subscription(TwistStamped, twist_topic(link), on_twist, STREAM)
-
-    def _take_paths(self, link: str) -> None:
-        def on_path(message: Path) -> None:
-            self.receive(link, message, lambda: self._read_path(link, message))
-
-        self.create_subscription(Path, path_topic(link), on_path, STREAM)
+    def _on_path(self, link: str, message: Path) -> None:
+        self.receive(link, message, lambda: self._read_path(link, message))
 
     def _read_path(self, link: str, message: Path) -> Goal:
         what, frame = f"The path of the end-effector '{link}'", self.config.world_frame

@@ -31,7 +31,12 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
-from spacerobot_ros.nodes.common.node import STREAM, MatchedEndpoints, topics_without_all_matches
+from spacerobot_ros.nodes.common.node import (
+    STREAM,
+    Endpoint,
+    endpoints_of,
+    topics_without_all_matches,
+)
 from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, TOPIC, HeartbeatState, Role
 from spacerobot_ros.planning import Goal
@@ -378,22 +383,23 @@ class MultiProcessStack:
         """Ask every node for its connections; return whether all are matched and recorded."""
         answers = self._call_services(self._get_connections, Trigger.Request())
         nodes = {
-            name: MatchedEndpoints.from_json(answer.message) for name, answer in answers.items()
+            name: [Endpoint(*each) for each in json.loads(answer.message)]
+            for name, answer in answers.items()
         }
         self._spin_for(_CONNECTION_CHECK_PERIOD)
-        client = MatchedEndpoints.of(self.client.node)
-        if topics_without_all_matches([*nodes.values(), client]):
+        nodes["client"] = endpoints_of(self.client.node)
+        if topics_without_all_matches([end for node in nodes.values() for end in node]):
             return False
         recorder = nodes.pop("recorder", None)
         if recorder is None:
             return True
-        published = {topic for each in (client, *nodes.values()) for topic, _ in each.publishers}
+        published = {end.topic for node in nodes.values() for end in node if end.publishes}
         chosen = self.scenario.config("recorder").topics.split()
         if chosen:
             published &= {self.client.node.resolve_topic_name(topic) for topic in chosen}
         else:
             published = {topic for topic in published if not topic.endswith(TOPICS_NOT_RECORDED)}
-        return published <= dict(recorder.subscriptions).keys()
+        return published <= {end.topic for end in recorder if not end.publishes}
 
     def _change_states(self, transition: int, names: Sequence[str]) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))

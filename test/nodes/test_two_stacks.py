@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from spacerobot_ros.bag import RecordedRobot, read_bag
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.node import (
-    MatchedEndpoints,
+    Endpoint,
+    endpoints_of,
     topics_without_all_matches,
 )
 
@@ -177,29 +179,35 @@ def test_two_clocks_on_one_topic_are_reported(
     assert "More than one clock is published on '/clock'" in capfd.readouterr().err
 
 
-PLANT = MatchedEndpoints((("/odom", 2), ("/clock", 1)), (("/joint_commands", 1),))
-PLANNER = MatchedEndpoints((("/joint_commands", 2),), (("/odom", 1),))
-RECORDER = MatchedEndpoints((), (("/odom", 1), ("/clock", 1), ("/joint_commands", 1)))
+def endpoints(published: dict[str, int], read: Iterable[tuple[str, int]]) -> list[Endpoint]:
+    """A node's endpoints: matches by the topics that it publishes, and of each subscription."""
+    writers = [Endpoint(topic, True, met) for topic, met in published.items()]
+    return writers + [Endpoint(topic, False, met) for topic, met in read]
+
+
+PLANT = endpoints({"/odom": 2, "/clock": 1}, [("/joint_commands", 1)])
+PLANNER = endpoints({"/joint_commands": 2}, [("/odom", 1)])
+RECORDER = endpoints({}, [("/odom", 1), ("/clock", 1), ("/joint_commands", 1)])
 
 
 def test_all_have_met_or_the_topics_say_who_has_not() -> None:
-    assert topics_without_all_matches([PLANT, PLANNER, RECORDER]) == set()
-    early = MatchedEndpoints((("/odom", 1), ("/clock", 1)), PLANT.subscriptions)
-    assert topics_without_all_matches([early, PLANNER, RECORDER]) == {"/odom"}, (
+    assert topics_without_all_matches([*PLANT, *PLANNER, *RECORDER]) == set()
+    early = endpoints({"/odom": 1, "/clock": 1}, [("/joint_commands", 1)])
+    assert topics_without_all_matches([*early, *PLANNER, *RECORDER]) == {"/odom"}, (
         "a publisher knows one reader"
     )
-    deaf = MatchedEndpoints((), (("/odom", 1), ("/clock", 0), ("/joint_commands", 1)))
-    assert topics_without_all_matches([PLANT, PLANNER, deaf]) == {"/clock"}, (
+    deaf = endpoints({}, [("/odom", 1), ("/clock", 0), ("/joint_commands", 1)])
+    assert topics_without_all_matches([*PLANT, *PLANNER, *deaf]) == {"/clock"}, (
         "a reader knows no publisher"
     )
     # Readers from elsewhere are no matter.
-    more = MatchedEndpoints((("/odom", 7), ("/clock", 7)), PLANT.subscriptions)
-    assert topics_without_all_matches([more, PLANNER, RECORDER]) == set()
+    more = endpoints({"/odom": 7, "/clock": 7}, [("/joint_commands", 1)])
+    assert topics_without_all_matches([*more, *PLANNER, *RECORDER]) == set()
 
 
 def test_two_readers_of_one_node_are_two() -> None:
-    twice = MatchedEndpoints((), (("/clock", 1), ("/clock", 1)))
-    assert topics_without_all_matches([PLANT, PLANNER, RECORDER, twice]) == {"/clock"}
+    twice = endpoints({}, [("/clock", 1), ("/clock", 1)])
+    assert topics_without_all_matches([*PLANT, *PLANNER, *RECORDER, *twice]) == {"/clock"}
 
 
 @pytest.fixture
@@ -212,14 +220,15 @@ def test_a_node_answers_with_its_endpoints(harness: Harness, plant: PlantNode) -
     probe = harness.probe({"odom": Odometry})
     harness.connect()
     client = probe.create_client(Trigger, "plant/connections")
-    found = MatchedEndpoints.from_json(harness.call(client, Trigger.Request()).message)
-    assert found == MatchedEndpoints.of(plant)
-    assert ("/odom", 1) in found.publishers
-    assert ("/joint_commands", 0) in found.subscriptions
-    assert not {"/rosout", "/parameter_events"} & {topic for topic, _ in found.publishers}
+    answer = json.loads(harness.call(client, Trigger.Request()).message)
+    found = [Endpoint(*each) for each in answer]
+    assert found == endpoints_of(plant)
+    assert Endpoint("/odom", True, 1) in found
+    assert Endpoint("/joint_commands", False, 0) in found
+    assert not {"/rosout", "/parameter_events"} & {each.topic for each in found}
     probe.create_publisher(String, "fault_injection", 10)
     harness.connect()
-    both = [MatchedEndpoints.of(plant), MatchedEndpoints.of(probe)]
+    both = [*endpoints_of(plant), *endpoints_of(probe)]
     assert topics_without_all_matches(both) == set()
 
 

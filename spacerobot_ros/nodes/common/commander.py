@@ -32,7 +32,7 @@ from spacerobot_ros.messages.statuses import StatusRecord, read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
-from spacerobot_ros.nodes.common.fly_to import GoalActions, Surroundings
+from spacerobot_ros.nodes.common.fly_to import GoalActions
 from spacerobot_ros.nodes.common.messages import (
     KnownFrames,
     end_effector_goal,
@@ -166,6 +166,10 @@ class CommanderNode(FlightNode):
         """Drop all goals and stop sending commands."""
         self.commander.deactivate(self._failure)
 
+    def parameters_changed(self) -> None:
+        """Use the new tolerances, times and gains."""
+        self.commander.reconfigure(self.config)
+
     def interrupt(self) -> None:
         """Cancel the plan in progress."""
         self.commander.interrupt()
@@ -175,12 +179,6 @@ class CommanderNode(FlightNode):
         if self._goal_actions is not None:
             self._goal_actions.destroy()
         super().destroy_node()
-
-    def surroundings(self) -> Surroundings:
-        """Return the frames and joints needed to read action goals."""
-        robot = self.commander.robot
-        names = None if robot is None else robot.joint_names
-        return Surroundings(self.config.world_frame, names, self.pose_of)
 
     @property
     def simulated_time_s(self) -> float | None:

@@ -7,9 +7,9 @@ and ``nav2_msgs/action/NavigateToPose``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -20,7 +20,6 @@ from rclpy.serialization import deserialize_message
 from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
 from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.messages.builders import goal_message
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.nodes.common.messages import (
     end_effector_goal,
     goal_of,
@@ -29,6 +28,9 @@ from spacerobot_ros.nodes.common.messages import (
 )
 from spacerobot_ros.planning.core.goal import Goal, Tolerance
 from spacerobot_ros.times import SECOND
+
+if TYPE_CHECKING:
+    from spacerobot_ros.nodes.common.commander import CommanderNode
 
 _RESULT_TIMEOUT = 60
 """Time, s, for which a server keeps the result of a completed goal.
@@ -43,17 +45,6 @@ _BASE_GOAL_NAME = "The goal of the base"
 
 
 @dataclass(frozen=True)
-class Surroundings:
-    """Data from the node that are needed to read goals."""
-
-    world_frame: str
-    joint_names: Sequence[str] | None
-    """Joints of the robot; None if there is no robot yet."""
-    pose_of: Callable[[str], Array | None]
-    """Returns the pose (7,) of another frame in the frame of goals; None if unknown."""
-
-
-@dataclass(frozen=True)
 class FlyToAction:
     """``spacerobot_msgs/action/FlyTo``: goals of any kind."""
 
@@ -64,7 +55,7 @@ class FlyToAction:
     type_name: ClassVar = "FlyTo"
     name: ClassVar = "~/fly_to"
 
-    def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
+    def read(self, request: Any, node: CommanderNode) -> FlyTo:
         """Return the goal in a request; raise PlanningError if the goal is rejected."""
         links, poses = list(request.end_effectors), list(request.end_effector_poses)
         if len(links) != len(poses):
@@ -84,19 +75,19 @@ class FlyToAction:
             raise PlanningError(f"The goal {alone}: add a base pose or end-effector poses.")
         shape = None
         if joints.name:
-            if surroundings.joint_names is None:
+            if node.commander.robot is None:
                 raise PlanningError(
                     "The goal has joint positions, but no robot_description has been received yet."
                 )
-            shape = shape_of(joints, surroundings.joint_names)
-        goal, frame, pose_of = None, surroundings.world_frame, surroundings.pose_of
+            shape = shape_of(joints, node.commander.robot.joint_names)
+        goal, frame = None, node.config.world_frame
         if request.base_pose:
-            goal = goal_of(request.base_pose[0], frame, _BASE_GOAL_NAME, shape, pose_of)
+            goal = goal_of(request.base_pose[0], frame, _BASE_GOAL_NAME, shape, node.pose_of)
         if links:
             goal = Goal.of_end_effectors(
                 [
                     end_effector_goal(
-                        link, pose, frame, f"The goal of the end-effector '{link}'", pose_of
+                        link, pose, frame, f"The goal of the end-effector '{link}'", node.pose_of
                     )
                     for link, pose in zip(links, poses, strict=True)
                 ],
@@ -136,21 +127,15 @@ class NavigateToPoseAction:
     type_name: ClassVar = "NavigateToPose"
     name: ClassVar = "~/navigate_to_pose"
 
-    def read(self, request: Any, surroundings: Surroundings) -> FlyTo:
+    def read(self, request: Any, node: CommanderNode) -> FlyTo:
         """Return the goal in a request; raise PlanningError if the goal is rejected."""
         if request.behavior_tree:
             raise PlanningError(
                 f"The goal names the behavior tree '{request.behavior_tree}': behavior trees are "
                 f"not supported, so leave it empty."
             )
-        return FlyTo(
-            goal_of(
-                request.pose,
-                surroundings.world_frame,
-                _BASE_GOAL_NAME,
-                pose_of=surroundings.pose_of,
-            )
-        )
+        frame = node.config.world_frame
+        return FlyTo(goal_of(request.pose, frame, _BASE_GOAL_NAME, pose_of=node.pose_of))
 
     def feedback(self, progress: Progress, world_frame: str) -> Any:
         """Return a goal's progress as a message."""
@@ -224,8 +209,8 @@ class GoalActions:
     node is not configured, goals are rejected.
     """
 
-    def __init__(self, node: Any) -> None:
-        self._node: Any = node
+    def __init__(self, node: CommanderNode) -> None:
+        self._node = node
         self._servers: list[_Server] = []
         for kind in (FlyToAction, NavigateToPoseAction):
             found = action_class(kind.package, kind.type_name)
@@ -245,11 +230,10 @@ class GoalActions:
 
         def on_goal(handle: ServerGoalHandle) -> None:
             handle.execute()
-            surroundings = node.surroundings()
             node.commander.receive_fly_to(
                 _goal_id(handle),
-                lambda: action.read(handle.request, surroundings),
-                GoalClient(server, handle, action, surroundings.world_frame),
+                lambda: action.read(handle.request, node),
+                GoalClient(server, handle, action, node.config.world_frame),
             )
 
         def on_cancel(handle: ServerGoalHandle) -> CancelResponse:

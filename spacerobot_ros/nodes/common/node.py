@@ -6,10 +6,10 @@ import json
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
@@ -74,60 +74,30 @@ _STATES_THAT_CAN_SHUT_DOWN = (
 
 _MIDDLEWARE_TOPICS = ("/rosout", "/parameter_events")
 
-Matches = tuple[tuple[str, int], ...]
-"""Topic of each endpoint, and the number of endpoints matched with it."""
+
+class Endpoint(NamedTuple):
+    """A publisher or subscription of a node, and the number of endpoints matched with it."""
+
+    topic: str
+    publishes: bool
+    matched: int
 
 
-@dataclass(frozen=True)
-class MatchedEndpoints:
-    """The endpoints of one node, except those of the middleware.
-
-    Attributes
-    ----------
-    publishers, subscriptions
-        Topic of each endpoint, and the number of endpoints matched with it.
-    """
-
-    publishers: Matches
-    subscriptions: Matches
-
-    @classmethod
-    def of(cls, node: Node) -> MatchedEndpoints:
-        """Return the endpoints of a node in this process."""
-        readers = [(each.topic_name, each.get_subscription_count()) for each in node.publishers]
-        writers = [(each.topic_name, each.get_publisher_count()) for each in node.subscriptions]
-        return cls(_without_middleware(readers), _without_middleware(writers))
-
-    def to_json(self) -> str:
-        """Return the endpoints as a JSON string."""
-        return json.dumps([self.publishers, self.subscriptions])
-
-    @classmethod
-    def from_json(cls, text: str) -> MatchedEndpoints:
-        """Return the endpoints from a string returned by :meth:`to_json`."""
-        publishers, subscriptions = json.loads(text)
-        return cls(_without_middleware(publishers), _without_middleware(subscriptions))
+def endpoints_of(node: Node) -> list[Endpoint]:
+    """Return the endpoints of a node in this process, except those of the middleware."""
+    writers = [
+        Endpoint(each.topic_name, True, each.get_subscription_count()) for each in node.publishers
+    ]
+    readers = [
+        Endpoint(each.topic_name, False, each.get_publisher_count()) for each in node.subscriptions
+    ]
+    return [each for each in (*writers, *readers) if each.topic not in _MIDDLEWARE_TOPICS]
 
 
-def topics_without_all_matches(nodes: Iterable[MatchedEndpoints]) -> set[str]:
+def topics_without_all_matches(endpoints: Sequence[Endpoint]) -> set[str]:
     """Return the topics on which some endpoints of these nodes have not been matched yet."""
-    nodes = list(nodes)
-    writers = Counter(topic for node in nodes for topic, _ in node.publishers)
-    readers = Counter(topic for node in nodes for topic, _ in node.subscriptions)
-    return {
-        topic
-        for node in nodes
-        for matches, partners in ((node.publishers, readers), (node.subscriptions, writers))
-        for topic, met in matches
-        if met < partners[topic]
-    }
-
-
-def _without_middleware(matches: Iterable[Iterable[object]]) -> Matches:
-    pairs = (tuple(pair) for pair in matches)
-    return tuple(
-        (str(topic), int(str(met))) for topic, met in pairs if topic not in _MIDDLEWARE_TOPICS
-    )
+    counts = Counter((topic, publishes) for topic, publishes, _ in endpoints)
+    return {topic for topic, publishes, met in endpoints if met < counts[topic, not publishes]}
 
 
 class FlightNode(LifecycleNode):
@@ -183,7 +153,7 @@ class FlightNode(LifecycleNode):
             self.config = configured(self.Config, values)
             self.add_on_set_parameters_callback(self._on_set_parameters)
             # A supervisor starts time once all nodes have met.
-            self.offer("~/connections", lambda: MatchedEndpoints.of(self).to_json())
+            self.offer("~/connections", lambda: json.dumps(endpoints_of(self)))
             self.prepare()
             self._permanent = set(self._entities())
             if values[AUTOSTART.name] if autostart is None else autostart:

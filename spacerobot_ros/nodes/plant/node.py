@@ -182,9 +182,7 @@ class PlantNode(FlightNode):
         )
         self._clearance = None
         if self._clearance_ticks:
-            self._clearance = ClearancePublisher.of(
-                self, robot.description, has_contact_forces=config.engine == "mujoco"
-            )
+            self._clearance = ClearancePublisher(self, has_contact_forces=config.engine == "mujoco")
         self._obstacles: str | None = None
         """The last URDF on the topic obstacles; None if the robot's own obstacles are used."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
@@ -567,13 +565,12 @@ class PlantNode(FlightNode):
             return
         self._obstacles = message.data
         self._markers.use_obstacles(world)
-        if self._clearance_ticks:
+        if self._clearance is not None:
             described = with_world(self.plant.robot.description, world)
             with self.long_work():
                 # The plant in MuJoCo has only the initial obstacles.
-                self._clearance = ClearancePublisher.of(self, described, self._clearance)
-            if self._clearance is None and self._monitor is not None and self._monitor.contacts:
-                # No remaining pair of bodies could touch.
+                links_could_touch = self._clearance.use(described)
+            if not links_could_touch and self._monitor is not None and self._monitor.contacts:
                 self._monitor.contacts = ()
                 self._publish_changed_status()
 

@@ -269,45 +269,35 @@ class TransformPublisher:
 
 
 class ClearancePublisher:
-    """Publishes the smallest distance between links, and reports their contacts."""
+    """Publishes the smallest distance between links, and reports their contacts.
 
-    def __init__(
-        self,
-        node: PlantNode,
-        monitor: ClearanceMonitor,
-        stream: Publisher | None = None,
-    ) -> None:
-        self._node, self._monitor = node, monitor
-        self._name = node.get_fully_qualified_name()
-        self._stream = stream or node.create_publisher(DiagnosticStatus, "clearance", STREAM)
+    For ``has_contact_forces``, see :class:`.ClearanceMonitor`.
+    """
 
-    @classmethod
-    def of(
-        cls,
-        node: PlantNode,
-        described: RobotDescription,
-        before: ClearancePublisher | None = None,
-        *,
-        has_contact_forces: bool = False,
-    ) -> ClearancePublisher | None:
-        """Return the publisher for a plant with obstacles; None if no links could touch.
+    def __init__(self, node: PlantNode, *, has_contact_forces: bool) -> None:
+        self._node = node
+        self._monitor: ClearanceMonitor | None = None
+        self._stream: Publisher | None = None
+        """Created once links could touch."""
+        self.use(node.plant.robot.description, has_contact_forces=has_contact_forces)
 
-        ``before`` is the publisher for the previous obstacles; its topic is reused. For
-        ``has_contact_forces``, see :class:`.ClearanceMonitor`.
-        """
+    def use(self, described: RobotDescription, *, has_contact_forces: bool = False) -> bool:
+        """Measure distances of a robot and its obstacles from now on; return whether links could
+        touch."""
         # Not every plant measures distances.
         from spacerobot_ros.simulation.clearance import ClearanceMonitor
 
-        monitor = ClearanceMonitor.of(
+        plant = self._node.plant
+        self._monitor = ClearanceMonitor.of(
             described,
-            tuple(node.plant.robot.link_names),
-            None if before is None else before._monitor,
-            capturing=node.plant.capturing,
+            tuple(plant.robot.link_names),
+            self._monitor,
+            capturing=plant.capturing,
             has_contact_forces=has_contact_forces,
         )
-        if monitor is None:
-            return None
-        return cls(node, monitor, None if before is None else before._stream)
+        if self._monitor is not None and self._stream is None:
+            self._stream = self._node.create_publisher(DiagnosticStatus, "clearance", STREAM)
+        return self._monitor is not None
 
     def look(self, time_ns: int, *, publishes: bool) -> tuple[str, ...] | None:
         """Report contacts that have begun or ended; return the current contacts, or None if they
@@ -315,19 +305,22 @@ class ClearancePublisher:
 
         If ``publishes`` is true, also publish the current clearance.
         """
-        plant = self._node.plant
+        if self._monitor is None or self._stream is None:
+            return None
+        node, plant = self._node, self._node.plant
         status, events = self._monitor.measure(
             plant.link_R, plant.link_r, plant.pose, time_ns / SECOND
         )
         if publishes:
-            record = StatusRecord(self._name, status.level, status.message, status.to_values())
+            name = node.get_fully_qualified_name()
+            record = StatusRecord(name, status.level, status.message, status.to_values())
             self._stream.publish(record.encoded())
         for event in events:
-            self._node.report_event(event)
+            node.report_event(event)
             if event.level:
-                self._node.get_logger().error(event.message)
+                node.get_logger().error(event.message)
             else:
-                self._node.get_logger().info(event.message)
+                node.get_logger().info(event.message)
         return self._monitor.contacts if events else None
 
 
