@@ -14,8 +14,8 @@ from spacerobot_ros.control.controller import CoordinatedController, build_contr
 from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.goals import require_controlled_axes
 from spacerobot_ros.control.laws.law import Gains
+from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.reference import (
-    OutputErrors,
     ReferenceProfile,
     profile_expression,
     profile_numbers,
@@ -97,7 +97,7 @@ class BatchController:
         profile = controller.profile
         assert profile is not None
         controller.law.command(state, profile.at(0.0))
-        return profile, controller.error_bounds(self._config.error_margin.as_errors())
+        return profile, controller.error_bounds(self._config.error_margin.as_distances())
 
     def time_of_tick(self, tick: int) -> float:
         """Return the time of a tick, s, as computed by controllers."""
@@ -191,7 +191,7 @@ class BatchController:
         omega, q, qdot = measured[10:13], measured[13 : 13 + n], measured[13 + n :]
         actuation, lowered = self.controller.limits_expression(omega, q, qdot, results["actuation"])
         exact = ca.logic_or(lowered, ca.logic_not(law.is_complete(results)))
-        largest = dict.fromkeys(("position", "attitude", "joints"), ca.SX(0))
+        largest = dict.fromkeys(OutputDistance._fields, ca.SX(0))
         for kind, places in law.outputs.selection.distances:
             largest[kind] = ca.fmax(largest[kind], ca.norm_2(results["error"][list(places)]))
         error_share, rate_share = ca.SX(0), ca.SX(0)
@@ -205,7 +205,7 @@ class BatchController:
             time,
             time >= profile[0],
             profile[0],
-            OutputErrors(**largest),
+            OutputDistance(**largest),
             rate_share,
             error_share,
             self._config,

@@ -388,4 +388,4 @@ class LaneBlock:
         for lane in np.flatnonzero(result.decision[rows] != Decision.NONE).tolist():
             goal, state = self._profiles[lane].goal, ControlState.unstack(states[lane])
             distance = controller.controller.distance_between(state, goal)
-            result.decision_distance[rows[lane]] = astuple(distance)
+            result.decision_distance[rows[lane]] = distance

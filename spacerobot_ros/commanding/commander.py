@@ -182,7 +182,7 @@ class Commander(ABC):
                 f"commands follow the plant. Set it to {rate:g}, or omit it.",
             )
         if self.robot is not None and self.executive is not None:
-            self._change_rate(self.robot)
+            self._rebuild(self.robot, rate_changed=True)
         self.answer_latest()
 
     def drop_robot(self, why: str) -> None:
@@ -578,7 +578,7 @@ class Commander(ABC):
             self._payload = self.plant.status.payload
             if self._described is not None:
                 self.robot = self._with_payload(self._described)
-                self._change_masses(self.robot)
+                self._rebuild(self.robot, rate_changed=False)
 
     def receive_obstacles(self, text: str) -> None:
         """Plan around the obstacles in a URDF string from now on, if valid; empty: no obstacles."""
@@ -598,14 +598,13 @@ class Commander(ABC):
 
     def _with_payload(self, robot: SpaceRobot) -> SpaceRobot:
         self._held = None
-        try:
-            if self._payload:
+        if self._payload:
+            try:
                 held = Payload.from_text(self._payload)
                 robot, self._held = held.attached_to(robot), held
-            return robot
-        except RobotDescriptionError as error:
-            self.host.log("error", f"plant/status: {error}")
-            return robot
+            except RobotDescriptionError as error:
+                self.host.log("error", f"plant/status: {error}")
+        return robot
 
     def give_up_goals(self, stopped: PlantStopped) -> None:
         """Abort the goals, because the plant ignores commands or is silent."""
@@ -634,8 +633,9 @@ class Commander(ABC):
         """Build the executive."""
 
     @abstractmethod
-    def _change_masses(self, robot: SpaceRobot) -> None:
-        """Make the executive command a robot with the same joints but other masses."""
+    def _rebuild(self, robot: SpaceRobot, *, rate_changed: bool) -> None:
+        """Make the executive command a robot with the same joints but other masses, or at the
+        changed rate in the current configuration."""
 
     def reconfigure(self, config: Any) -> None:
         """Copy the parameters that may change at run time from another configuration."""
@@ -649,10 +649,6 @@ class Commander(ABC):
         background = config.plan_in_background and not self.plant.in_lockstep
         config = replace(config, tick_rate=self.config.tick_rate, plan_in_background=background)
         return config if self._described is None else config.for_robot(self._described.description)
-
-    @abstractmethod
-    def _change_rate(self, robot: SpaceRobot) -> None:
-        """Make the executive command at the rate in the current configuration."""
 
     @property
     def _pursued_goal_id(self) -> str:

@@ -260,9 +260,13 @@ class ControllerCommander(Commander):
         self.effort = np.zeros(robot.n)
         self._held_velocities = HeldVelocityReference(self.config.control_period)
 
-    def _change_masses(self, robot: SpaceRobot) -> None:
+    def _rebuild(self, robot: SpaceRobot, *, rate_changed: bool) -> None:
         assert self.executive is not None
         self.executive.use_controller(self._built_controller(robot), self._held)
+        if rate_changed:
+            self.executive.configure(self.config)
+            self.rehearse()
+            self._held_velocities = HeldVelocityReference(self.config.control_period)
 
     def _built_controller(self, robot: SpaceRobot) -> CoordinatedController:
         controller = build_controller(robot, self.config)
@@ -273,13 +277,6 @@ class ControllerCommander(Commander):
     def _use_obstacles(self) -> None:
         if self.executive is not None:
             self.executive.use_obstacles(self._world)
-
-    def _change_rate(self, robot: SpaceRobot) -> None:
-        assert self.executive is not None
-        self._change_masses(robot)
-        self.executive.configure(self.config)
-        self.rehearse()
-        self._held_velocities = HeldVelocityReference(self.config.control_period)
 
     @property
     def _actuation_refusal(self) -> str:

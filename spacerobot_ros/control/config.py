@@ -12,8 +12,9 @@ from spacerobot_ros.control.detumbling import DetumbleOptions
 from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.planned_reference import PlannedOptions, PlannedReference
-from spacerobot_ros.control.reference import PROFILES, OutputErrors
+from spacerobot_ros.control.reference import PROFILES
 from spacerobot_ros.control.wheels import WheelOptions
 from spacerobot_ros.errors import counted
 from spacerobot_ros.model.shared_parameters import CommanderConfig
@@ -35,9 +36,9 @@ class ErrorMargin:
         "rad",
     )
 
-    def as_errors(self) -> OutputErrors:
+    def as_distances(self) -> OutputDistance:
         """Return the margins; margins given as 0, and joint margins, are infinite."""
-        return OutputErrors(self.position or math.inf, self.attitude or math.inf, math.inf)
+        return OutputDistance(self.position or math.inf, self.attitude or math.inf, math.inf)
 
 
 def waypoints_refusal(count: int) -> str:
@@ -110,3 +111,10 @@ class ControllerConfig(CommanderConfig):
     detumble: DetumbleOptions = group(DetumbleOptions())
     gains: Gains = group(Gains())
     options: Mapping[str, Any] = registered(LAWS)
+
+    @property
+    def tolerances(self) -> OutputDistance:
+        """Tolerances of all kinds of outputs, m and rad."""
+        return OutputDistance(
+            self.position_tolerance, self.attitude_tolerance, self.joint_tolerance
+        )

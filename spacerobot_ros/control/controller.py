@@ -32,7 +32,6 @@ from spacerobot_ros.control.planned_reference import (
 )
 from spacerobot_ros.control.reference import (
     PROFILES,
-    OutputErrors,
     QuinticReference,
     ReferenceProfile,
     StepReference,
@@ -461,12 +460,13 @@ class CoordinatedController:
         """Time at which the reference reaches its goal, s; None without a reference."""
         return None if self.profile is None else self._began + self.profile.duration
 
-    def errors(self) -> OutputErrors:
-        """Return the errors of the last command's outputs relative to the reference."""
-        worst, error = {"position": 0.0, "attitude": 0.0, "joints": 0.0}, self.law.error.tolist()
+    def errors(self) -> OutputDistance:
+        """Return the errors of the last command's outputs relative to the reference; 0 for kinds
+        that are not controlled."""
+        worst, error = dict.fromkeys(OutputDistance._fields, 0.0), self.law.error.tolist()
         for kind, places in self._distances:
             worst[kind] = max(worst[kind], math.hypot(*[error[i] for i in places]))
-        return OutputErrors(**worst)
+        return OutputDistance(**worst)
 
     def distance_from_reference(self) -> OutputDistance:
         """Return the distance of the last command's outputs from the reference."""
@@ -477,7 +477,7 @@ class CoordinatedController:
         outputs = self.law.outputs
         return outputs.selection.distance(outputs.errors(state, goal))
 
-    def error_bounds(self, margins: OutputErrors) -> Array:
+    def error_bounds(self, margins: OutputDistance) -> Array:
         """Return the output errors (m,) beyond which control is lost.
 
         Call this after the first command towards the current goals. All outputs of a kind have the

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.reference import OutputErrors
+from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.space_robot import SpaceRobot
 
@@ -118,7 +118,7 @@ class GoalMonitor:
         time: Scalar,
         at_rest: Scalar,
         ends: Scalar,
-        errors: OutputErrors,
+        errors: OutputDistance,
         config: ControllerConfig,
     ) -> Scalar:
         """Return the goal's :class:`Decision` from the errors in a state, if control is not lost.
@@ -155,7 +155,7 @@ class GoalMonitor:
         time: Scalar,
         at_rest: Scalar,
         ends: Scalar,
-        errors: OutputErrors,
+        errors: OutputDistance,
         rate_share: Scalar,
         error_share: Scalar,
         config: ControllerConfig,
@@ -324,25 +324,16 @@ def _joint_at_stop(robot: SpaceRobot, q: Array) -> str:
     return ""
 
 
-def _largest_share(errors: OutputErrors, config: ControllerConfig) -> float:
+def _largest_share(errors: OutputDistance, config: ControllerConfig) -> float:
     return max(
         error / max(tolerance, _LEAST_SMALLEST_TOLERANCE)
-        for error, tolerance in (
-            (errors.position, config.position_tolerance),
-            (errors.attitude, config.attitude_tolerance),
-            (errors.joints, config.joint_tolerance),
-        )
+        for error, tolerance in zip(errors, config.tolerances, strict=True)
     )
 
 
 def _lag(
-    errors: OutputErrors, controller: CoordinatedController, config: ControllerConfig
+    errors: OutputDistance, controller: CoordinatedController, config: ControllerConfig
 ) -> float:
     assert controller.profile is not None
-    ways = controller.profile.distances()
-    pairs = (
-        (errors.position, ways.position, config.position_tolerance),
-        (errors.attitude, ways.attitude, config.attitude_tolerance),
-        (errors.joints, ways.joints, config.joint_tolerance),
-    )
-    return max((e / way for e, way, tolerance in pairs if min(e, way) > tolerance), default=0.0)
+    parts = zip(errors, controller.profile.distances(), config.tolerances, strict=True)
+    return max((e / way for e, way, tolerance in parts if min(e, way) > tolerance), default=0.0)

@@ -330,7 +330,7 @@ class GoalWatch:
     def loss_by_errors(self, controller: CoordinatedController, config: ControllerConfig) -> str:
         """Return a clause about errors far beyond the goal distance; empty: no such errors."""
         if self._error_bounds is None:
-            self._error_bounds = controller.error_bounds(config.error_margin.as_errors())
+            self._error_bounds = controller.error_bounds(config.error_margin.as_distances())
         share = controller.law.largest_error_share(self._error_bounds)
         if not self.monitor.check_errors(share):
             return ""
@@ -404,11 +404,7 @@ def decided_message(
     ``cause`` is the reason, if known, why the robot came no closer; ``missed`` lists the missed
     components of a partly reached goal; ``touched`` is the contact that made the goal fail.
     """
-    limits = (
-        (distance.position, config.position_tolerance),
-        (distance.attitude, config.attitude_tolerance),
-        (distance.joints, config.joint_tolerance),
-    )
+    limits = list(zip(distance, config.tolerances, strict=True))
     tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
     away = f"{distance} from it (tolerance {tolerance})"
     if state is not ControllerState.FAILED:

@@ -45,6 +45,24 @@ _PARALLEL_TOLERANCE = 1e-6
 """Sine of the largest angle between axes that are considered parallel."""
 
 
+class OutputDistance(NamedTuple):
+    """Distances between the outputs and a reference, by kind of output.
+
+    ``position`` (m) and ``attitude`` (rad): distance and angle along the controlled axes, of the
+    base or of the end-effector, whichever distance or angle is larger; ``joints``: the largest
+    joint error, m or rad. Kinds that are not controlled are NaN in messages, and 0 where the
+    distances are compared with limits of the same type.
+    """
+
+    position: float
+    attitude: float
+    joints: float
+
+    def __str__(self) -> str:
+        parts = zip(self, ("m", "rad", AT_JOINTS), strict=True)
+        return ", ".join(quantity(*part) for part in parts if not math.isnan(part[0]))
+
+
 @dataclass(frozen=True)
 class OutputSelection:
     """Components of ``z1`` (paper 4, eqs 22 and 31), in this order.
@@ -73,7 +91,7 @@ class OutputSelection:
 
     def distance(self, errors: Array) -> OutputDistance:
         """Return the distances for the output errors (m,)."""
-        largest = dict.fromkeys(("position", "attitude", "joints"), math.nan)
+        largest = dict.fromkeys(OutputDistance._fields, math.nan)
         for kind, places in self.distances:
             size = float(np.linalg.norm(errors[list(places)]))
             largest[kind] = max(size, largest[kind]) if largest[kind] >= 0 else size
@@ -113,24 +131,6 @@ class OutputSelection:
                 f"{count} outputs are selected; robot '{description.name}' has "
                 f"{freedom} degrees of freedom."
             )
-
-
-@dataclass(frozen=True)
-class OutputDistance:
-    """Distances between the outputs and a reference; NaN for uncontrolled kinds.
-
-    ``position`` (m) and ``attitude`` (rad): distance and angle along the controlled axes, of the
-    base or of the end-effector, whichever distance or angle is larger; ``joints``: the largest
-    joint error, m or rad.
-    """
-
-    position: float
-    attitude: float
-    joints: float
-
-    def __str__(self) -> str:
-        parts = ((self.position, "m"), (self.attitude, "rad"), (self.joints, AT_JOINTS))
-        return ", ".join(quantity(*part) for part in parts if not math.isnan(part[0]))
 
 
 def default_selection(description: RobotDescription, end_effector_link: str) -> OutputSelection:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -17,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.control.limits import MotionLimits
+from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.state import JointReference, PoseReference, Reference
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
@@ -30,15 +30,6 @@ _QUINTIC_PEAK_RATE = 15 / 8
 
 _QUINTIC_PEAK_ACCELERATION = 10 / math.sqrt(3)
 """Largest d2s/dt2 of a one-second quintic."""
-
-
-@dataclass(frozen=True)
-class OutputErrors:
-    """Largest output errors: positions (m), attitudes (rad), single joints (m or rad)."""
-
-    position: float
-    attitude: float
-    joints: float
 
 
 class ReferenceProfile(ABC):
@@ -73,13 +64,13 @@ class ReferenceProfile(ABC):
     def at(self, time: float) -> Reference:
         """Return the reference at ``time`` s after the start."""
 
-    def distances(self) -> OutputErrors:
+    def distances(self) -> OutputDistance:
         """Return the distances between the start and the goal."""
         start, goal, joints = self.start, self.goal, 0.0
         if start.joints is not None and goal.joints is not None:
             joints = float(np.abs(goal.joints.q - start.joints.q).max(initial=0.0))
         lines = [line for line in self.lines() if line is not None]
-        return OutputErrors(
+        return OutputDistance(
             max((line.length for line in lines), default=0.0),
             max((line.angle for line in lines), default=0.0),
             joints,

@@ -22,8 +22,12 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.planner import PlannerCommander
-from spacerobot_ros.commanding.trajectory_output import Outcome, TrajectoryEnd, TrajectoryOutput
+from spacerobot_ros.commanding.planner import (
+    Outcome,
+    PlannerCommander,
+    TrajectoryEnd,
+    TrajectoryOutput,
+)
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.messages.builders import goal_markers, path_message, trajectory_message
 from spacerobot_ros.messages.readers import joint_template

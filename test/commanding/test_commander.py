@@ -15,9 +15,8 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
 from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
 from spacerobot_ros.commanding.host import ArrayDecoder, CommanderActivity, StateArrays
-from spacerobot_ros.commanding.planner import PlannerCommander
+from spacerobot_ros.commanding.planner import PlannerCommander, TrajectoryOutput
 from spacerobot_ros.commanding.plant_state import PlantStopped
-from spacerobot_ros.commanding.trajectory_output import TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goals import END_EFFECTOR
 from spacerobot_ros.control.servicing import Task

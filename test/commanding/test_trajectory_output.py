@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from spacerobot_ros.commanding.trajectory_output import (
+from spacerobot_ros.commanding.planner import (
     Outcome,
     TrajectoryEnd,
     TrajectoryOutput,

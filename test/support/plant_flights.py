@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import astuple
 
 import numpy as np
 
@@ -156,9 +155,7 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
         decision = decide(controller, monitor, tick, state.qdot, bounds)
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
             result.decision[row], result.decision_tick[row] = decision, tick
-            result.decision_distance[row] = astuple(
-                controller.controller.distance_between(state, goal)
-            )
+            result.decision_distance[row] = controller.controller.distance_between(state, goal)
         return commands
 
     return command

@@ -154,14 +154,13 @@ class Gains:
         return np.array([pair.ki for pair in self._pairs(selection)])
 
     def _pairs(self, selection: OutputSelection) -> list[GainPair]:
-        return [
-            *(_axis_gains(axis, self.base_position, self.base_attitude) for axis in selection.base),
-            *(
-                _axis_gains(axis, self.end_effector_position, self.end_effector_attitude)
-                for axis in selection.end_effector
-            ),
-            *(self.joints for _ in selection.joints),
-        ]
+        pairs: list[GainPair] = []
+        for axes, position, attitude in (
+            (selection.base, self.base_position, self.base_attitude),
+            (selection.end_effector, self.end_effector_position, self.end_effector_attitude),
+        ):
+            pairs += [attitude if axis.startswith("r") else position for axis in axes]
+        return pairs + [self.joints] * len(selection.joints)
 
 
 def _checked_matrix(
@@ -628,7 +627,3 @@ class ControlLaw(ABC):
         self._function.evaluate()
         actuation = self._out["actuation"].copy()
         return Actuation(actuation[:6], actuation[6:])
-
-
-def _axis_gains(axis: str, position: GainPair, attitude: GainPair) -> GainPair:
-    return attitude if axis.startswith("r") else position
