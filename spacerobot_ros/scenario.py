@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import yaml
 
 from spacerobot_ros.bag.config import RecorderConfig
@@ -30,6 +31,7 @@ from spacerobot_ros.model.shared_parameters import (
 from spacerobot_ros.model.urdf import load_world, parse_robot
 from spacerobot_ros.parameters import (
     Value,
+    as_numbers,
     configured,
     declared,
     is_of_every_node,
@@ -107,6 +109,7 @@ class Kill:
     until: float
 
 
+_POSITION: frozenset[Controlled] = frozenset({"position"})
 _ATTITUDE: frozenset[Controlled] = frozenset({"attitude"})
 
 _KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
@@ -152,8 +155,8 @@ class Scenario:
         default_factory=lambda: {"plant": {"time_mode": "lockstep"}}
     )
     has_goal: bool = True
-    _configs: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """Cached results of :meth:`config` by node."""
+    _configs: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    """Configurations by node, shared by all scenarios with the same parameters."""
 
     def config(self, node: str) -> Any:
         """Return the configuration of a node, from defaults, parameters in the file, and overrides.
@@ -313,19 +316,8 @@ class Scenario:
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
         """Return the scenario with additional parameters set for one node."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
-        made = self._replace_fields(overrides=merged)
-        made._configs.pop(node, None)
-        return made
-
-    def with_poses(self, goal: Goal, end_effector_goal: Goal | None) -> Scenario:
-        """Return the scenario with other goals."""
-        return self._replace_fields(goal=goal, end_effector_goal=end_effector_goal)
-
-    def _replace_fields(self, **changes: Any) -> Scenario:
-        """Return a changed copy of the scenario, which reuses the existing configurations."""
-        made = replace(self, **changes)
-        made._configs.update(self._configs)
-        return made
+        others = {name: config for name, config in self._configs.items() if name != node}
+        return replace(self, overrides=merged, _configs=others)
 
     def in_real_time(self, factor: float) -> Scenario:
         """Return the scenario at ``factor`` times real time."""
@@ -361,7 +353,7 @@ class Scenario:
             if self._is_robot_alone:
                 robot = self.in_file["plant"]
                 nodes = {"plant": robot, "coordinated_control": {**robot, "law": method}}
-                return replace(self, in_file=nodes, commanders=(node,))
+                return replace(self, in_file=nodes, commanders=(node,), _configs={})
         if node not in self.commanders:
             raise ParameterError(
                 f"'{method}' is a {kind}, and the scenario '{self.name}' has no section "
@@ -388,7 +380,7 @@ class Scenario:
         scenario = self
         for text in texts:
             node, name, value = parse_setting(text)
-            if node in COMMANDERS and node not in scenario.commanders:
+            if node in COMMANDERS and node not in self.commanders:
                 raise ParameterError(
                     f"'{text}' is for the node '{node}', which is not running: the scenario "
                     f"'{self.name}' flies with {' and '.join(self.commanders)}."
@@ -422,42 +414,37 @@ class Scenario:
 
     def with_goal(
         self,
-        pose: Sequence[float] | None = None,
-        rotvec: Sequence[float] | None = None,
-        rpy_deg: Sequence[float] | None = None,
+        pose: Goal | npt.ArrayLike | None = None,
+        rotvec: npt.ArrayLike | None = None,
+        rpy_deg: npt.ArrayLike | None = None,
+        *,
+        position: npt.ArrayLike | None = None,
+        end_effectors: Sequence[EndEffectorGoal] = (),
     ) -> Scenario:
-        """Return the scenario with a new goal pose (7,) or position (3,), and with a new attitude
-        (3,), if they are given.
-
-        The attitude is a rotation vector (rad), or roll, pitch and yaw about fixed axes (deg). See
+        """Return the scenario with the given goals; see :func:`changed_goal` and
         :meth:`with_other_goal`.
+
+        With ``end_effectors``, only the given components of the base pose are requested.
 
         Raises
         ------
         GoalError
-            The pose or the attitude is not finite, or the attitude is given twice.
+            The pose or the attitude is not finite, the attitude is given twice, or a link has two
+            goals.
         """
-        goal = self.goal
-        if pose is not None:
-            given = Goal.checked(pose[:3], pose[3:] or goal.quaternion)
-            goal = replace(goal, position=given.position, quaternion=given.quaternion)
-        if rotvec is not None and rpy_deg is not None:
-            raise GoalError("The goal attitude is given twice, in radians and in degrees.")
-        if rotvec is not None:
-            given = Goal.from_rotvec(goal.position.tolist(), rotvec)
-            goal = replace(goal, quaternion=given.quaternion)
-        if rpy_deg is not None:
-            given = Goal.from_rpy(goal.position.tolist(), rpy_deg)
-            goal = replace(goal, quaternion=given.quaternion)
-        if goal is self.goal:
-            return self
-        asked = self.goal.asked
-        if pose is not None:
-            asked = asked.union(POSE if len(pose) == 7 else ["position"])
-        if rotvec is not None or rpy_deg is not None:
-            asked = asked.union(_ATTITUDE)
-        aimed = replace(goal, end_effectors=(), base=POSE, asked=asked, waypoints=None)
-        return self.with_other_goal(aimed)
+        scenario = self
+        if any(each is not None for each in (pose, position, rotvec, rpy_deg)):
+            goal = changed_goal(self.goal, pose, position, rotvec, rpy_deg)
+            scenario = self.with_other_goal(goal)
+        if not end_effectors:
+            return scenario
+        asked: set[Controlled] = set()
+        if pose is not None or position is not None:
+            asked.add("position")
+        whole = isinstance(pose, Goal) or (pose is not None and np.size(pose) == 7)
+        if whole or rotvec is not None or rpy_deg is not None:
+            asked.add("attitude")
+        return scenario.with_end_effectors(end_effectors, frozenset(asked))
 
     def with_other_goal(self, goal: Goal) -> Scenario:
         """Return the scenario with another goal and a description that mentions this goal.
@@ -521,6 +508,60 @@ class Scenario:
         controlled = "coordinated_control" in self.commanders
         if waypoints is not None and controlled and self.controller.profile != planned:
             raise ParameterError(waypoints_refusal(len(waypoints)))
+
+
+def changed_goal(
+    before: Goal,
+    pose: Goal | npt.ArrayLike | None = None,
+    position: npt.ArrayLike | None = None,
+    rotvec: npt.ArrayLike | None = None,
+    rpy_deg: npt.ArrayLike | None = None,
+) -> Goal:
+    """Return a goal for the base, with the remaining parts of another goal.
+
+    Parameters
+    ----------
+    before
+        The other goal; its end-effector goals and waypoints are dropped.
+    pose
+        A goal, a pose (7,) or a position (3,), m.
+    position, rotvec, rpy_deg
+        Position (3,), m, and attitude (3,) as a rotation vector (rad), or as roll, pitch and yaw
+        about fixed axes (deg); they override ``pose``.
+
+    Raises
+    ------
+    GoalError
+        The pose or the attitude is not finite, or the attitude is given twice.
+    """
+    if rotvec is not None and rpy_deg is not None:
+        raise GoalError("The goal attitude is given twice, in radians and in degrees.")
+    made = replace(before, end_effectors=(), base=POSE, waypoints=None)
+    if isinstance(pose, Goal):
+        made = pose
+    elif pose is not None:
+        numbers = as_numbers(pose, "The goal", GoalError).reshape(-1)
+        if len(numbers) not in (3, 7):
+            raise GoalError(
+                "A goal must have 3 numbers (position) or 7 (position and quaternion), not "
+                f"{len(numbers)}."
+            )
+        whole = len(numbers) == 7
+        given = Goal.checked(numbers[:3], numbers[3:] if whole else before.quaternion)
+        asked = POSE if whole else before.asked | _POSITION
+        made = replace(made, position=given.position, quaternion=given.quaternion, asked=asked)
+    if position is not None:
+        place = as_numbers(position, "The position", GoalError).reshape(-1)
+        given = Goal.checked(place, made.quaternion)
+        made = replace(made, position=given.position, asked=made.asked | _POSITION)
+    if rotvec is not None:
+        turn = as_numbers(rotvec, "The rotvec", GoalError).reshape(-1)
+        given = Goal.from_rotvec(made.position, turn.tolist())
+    elif rpy_deg is not None:
+        given = Goal.from_rpy(made.position, rpy_deg)
+    else:
+        return made
+    return replace(made, quaternion=given.quaternion, asked=made.asked | _ATTITUDE)
 
 
 @lru_cache(maxsize=64)

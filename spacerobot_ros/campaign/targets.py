@@ -474,9 +474,8 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Dispers
             goal = replace(goal, quaternion=turned)
         asked: set[Controlled] = {"position" if part == "position" else "attitude"}
         goal = replace(goal, asked=goal.asked | asked)
-        goals = {key: getattr(flight.scenario, key) for key in ("goal", "end_effector_goal")}
-        moved = flight.scenario.with_poses(*(goals | {kind: goal}).values())
-        return replace(flight, scenario=moved)
+        changed: dict[str, Any] = {kind: goal}
+        return replace(flight, scenario=replace(flight.scenario, **changed))
 
     unit = "m" if part == "position" else "rad"
     return DispersionTarget(name, apply, unit, False, frozenset({name}))

@@ -22,7 +22,7 @@ from spacerobot_ros.errors import counted, reason
 from spacerobot_ros.files import read_regular, write_output
 
 if TYPE_CHECKING:
-    from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal
+    from spacerobot_ros.planning.core.goal import EndEffectorGoal
     from spacerobot_ros.scenario import Scenario
     from spacerobot_ros.session.viewing import Viewer
 
@@ -246,14 +246,9 @@ class GoalOptions:
         """Return a scenario with this goal; warn about a rotation that looks like degrees."""
         if self.rotvec is not None:
             warn_of_large_angles(self.rotvec, "--goal-rpy-deg")
-        scenario = scenario.with_goal(self.pose, self.rotvec, self.rpy_deg)
-        if not self.end_effectors:
-            return scenario
-        attitude = self.rotvec is not None or self.rpy_deg is not None
-        asked: set[Controlled] = {"attitude"} if attitude else set()
-        if self.pose is not None:
-            asked |= {"position"} if len(self.pose) == 3 else {"position", "attitude"}
-        return scenario.with_end_effectors(self.end_effectors, frozenset(asked))
+        return scenario.with_goal(
+            self.pose, self.rotvec, self.rpy_deg, end_effectors=self.end_effectors
+        )
 
 
 def end_effector_goals(

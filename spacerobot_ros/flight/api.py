@@ -8,7 +8,6 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros import planning
@@ -20,15 +19,16 @@ from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.trials import PlanningProblem, robot_state_of
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.parameters import require_known
+from spacerobot_ros.parameters import as_numbers, require_known
 from spacerobot_ros.planning import GaitSchedule, Goal
 from spacerobot_ros.planning.api import EndEffectorValues, end_effector_goals
-from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
+from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.resources import resource_names
 from spacerobot_ros.scenario import (
     Scenario,
+    changed_goal,
     load_scenario,
     scenario_names,
     scenario_of,
@@ -187,13 +187,13 @@ def plan(
         assert not isinstance(what, Scenario)
         if goal is not None:
             start = Goal.checked(*_ORIGIN)
-            goal, position, rotvec = _changed_goal(start, goal, position, rotvec), None, None
+            goal, position, rotvec = changed_goal(start, goal, position, rotvec), None, None
             if (shape := options.pop("joint_positions", None)) is not None:
                 goal = replace(goal, joint_positions=Goal.checked(*_ORIGIN, shape).joint_positions)
             if hands:
                 goal = replace(goal, end_effectors=hands)
         chosen = {
-            name: _float_list(value, name)
+            name: as_numbers(value, f"The {name}", GoalError).reshape(-1).tolist()
             for name, value in (("position", position), ("rotvec", rotvec))
             if value is not None
         }
@@ -207,7 +207,7 @@ def plan(
             method = "optimal" if of_method else PlannerConfig().method
         return planning.plan(what, goal, method=method, **{**chosen, **options})
     scenario = what if isinstance(what, Scenario) else load_scenario(str(what))
-    scenario = _with_goals(scenario, goal, position, rotvec, hands)
+    scenario = scenario.with_goal(goal, rotvec, position=position, end_effectors=hands)
     _require_goal(scenario)
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
@@ -255,56 +255,4 @@ def scenario_to_fly(
             scenario = scenario_of(what.description)
         case _:
             scenario = scenario_or_robot(str(what))
-    return _with_goals(scenario, goal, position, rotvec, hands)
-
-
-def _with_goals(
-    scenario: Scenario,
-    goal: Goal | npt.ArrayLike | None,
-    position: npt.ArrayLike | None,
-    rotvec: npt.ArrayLike | None,
-    hands: Sequence[EndEffectorGoal],
-) -> Scenario:
-    if any(each is not None for each in (goal, position, rotvec)):
-        scenario = scenario.with_other_goal(_changed_goal(scenario.goal, goal, position, rotvec))
-    if not hands:
-        return scenario
-    asked: set[Controlled] = set() if goal is None else set(POSE)
-    asked |= set() if position is None else {"position"}
-    asked |= set() if rotvec is None else {"attitude"}
-    return scenario.with_end_effectors(hands, frozenset(asked))
-
-
-def _changed_goal(
-    before: Goal,
-    goal: Goal | npt.ArrayLike | None,
-    position: npt.ArrayLike | None,
-    rotvec: npt.ArrayLike | None,
-) -> Goal:
-    made = before
-    if isinstance(goal, Goal):
-        made = goal
-    elif goal is not None:
-        pose = _float_list(goal, "goal")
-        if len(pose) not in (3, 7):
-            raise GoalError(
-                "A goal must have 3 numbers (position) or 7 (position and quaternion), not "
-                f"{len(pose)}."
-            )
-        given = Goal.checked(pose[:3], pose[3:] or before.quaternion)
-        made = replace(before, position=given.position, quaternion=given.quaternion)
-        made = replace(made, asked=POSE if pose[3:] else before.asked | {"position"})
-    if position is not None:
-        given = Goal.checked(_float_list(position, "position"), made.quaternion)
-        made = replace(made, position=given.position, asked=made.asked | {"position"})
-    if rotvec is not None:
-        given = Goal.from_rotvec(made.position.tolist(), _float_list(rotvec, "rotvec"))
-        made = replace(made, quaternion=given.quaternion, asked=made.asked | {"attitude"})
-    return made
-
-
-def _float_list(values: npt.ArrayLike, what: str) -> list[float]:
-    try:
-        return [float(x) for x in np.asarray(values, dtype=float).reshape(-1)]
-    except (TypeError, ValueError, OverflowError):
-        raise GoalError(f"The {what} {values!r} is not a list of numbers.") from None
+    return scenario.with_goal(goal, rotvec, position=position, end_effectors=hands)

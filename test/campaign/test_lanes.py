@@ -238,7 +238,7 @@ def test_lanes_measure_the_end_effector_that_a_planner_does_not_move(engine: str
         set={"plant.end_effector_frame": "mass_2", "planner.max_corrections": 0},
     )
     goal = Goal.checked([0.4, 0.1, 0.2], [0.0, 0.0, 0.0, 1.0])
-    scenario = made.scenario.with_poses(made.scenario.goal, goal)
+    scenario = replace(made.scenario, end_effector_goal=goal)
     of_lanes, one_by_one = assert_same_flights(replace(made, scenario=scenario), engine)
     for row in (*of_lanes.values(), *one_by_one.values()):
         assert 0.0 < row.metrics["end_effector_position_error_m"] < 5.0

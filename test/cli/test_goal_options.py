@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,21 +45,6 @@ POSE = (1.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8)
 HAND = (4.0, 5.0, 6.0)
 
 
-class RequestedPart:
-    """A scenario that keeps the goals that it is asked for."""
-
-    def __init__(self) -> None:
-        self.goals: list[Any] = []
-
-    def with_goal(self, *goal: Any) -> RequestedPart:
-        self.goals.append(goal)
-        return self
-
-    def with_end_effectors(self, hands: Any, base: Any) -> RequestedPart:
-        self.goals.append(([hand.link for hand in hands], sorted(base)))
-        return self
-
-
 @pytest.mark.parametrize(
     ("pose", "rotvec", "rpy_deg", "base"),
     [
@@ -75,13 +60,23 @@ class RequestedPart:
 def test_beside_goals_of_end_effectors_the_base_has_what_is_asked(
     pose: Any, rotvec: Any, rpy_deg: Any, base: list[str]
 ) -> None:
-    asked: Any = RequestedPart()
+    scenario = load_scenario("sliding_masses")
     hands = end_effector_goals((), (HAND,), ("left",))
-    GoalOptions(pose, rotvec, rpy_deg, hands).apply_to(asked)
-    assert asked.goals == [(pose, rotvec, rpy_deg), (["left"], base)]
-    alone: Any = RequestedPart()
-    GoalOptions(pose, rotvec, rpy_deg).apply_to(alone)
-    assert alone.goals == [(pose, rotvec, rpy_deg)]
+    found = GoalOptions(pose, rotvec, rpy_deg, hands).apply_to(scenario).goal
+    assert [hand.link for hand in found.end_effectors] == ["left"]
+    assert sorted(found.base) == base
+    alone = GoalOptions(pose, rotvec, rpy_deg).apply_to(scenario).goal
+    assert not alone.end_effectors
+    assert sorted(alone.base) == ["attitude", "position"]
+    for goal in (found, alone):
+        at = scenario.goal.position if pose is None else pose[:3]
+        np.testing.assert_allclose(goal.position, at)
+        turn = [0.0, 0.0, math.sin(0.5), math.cos(0.5)]
+        if rpy_deg is not None:
+            turn = [0.0, 0.0, math.sin(math.radians(0.5)), math.cos(math.radians(0.5))]
+        elif rotvec is None:
+            turn = list(scenario.goal.quaternion if pose is None or len(pose) == 3 else pose[3:])
+        np.testing.assert_allclose(goal.quaternion, turn, atol=1e-15)
 
 
 def test_end_effectors_have_names_in_the_order_of_poses_then_positions() -> None:
@@ -139,8 +134,8 @@ def test_a_rotation_of_more_than_a_turn_is_noted(
 ) -> None:
     warn_of_large_angles(rotvec, "--here")
     assert capsys.readouterr() == ("", said)
-    asked: Any = RequestedPart()
-    GoalOptions(None, rotvec, None).apply_to(asked)
+    with suppress(GoalError):  # Of angles that are not finite.
+        GoalOptions(None, rotvec, None).apply_to(load_scenario("sliding_masses"))
     assert capsys.readouterr().err == said.replace("--here", "--goal-rpy-deg")
 
 
