@@ -45,7 +45,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE
-from spacerobot_ros.model.world import links_with_shapes, obstacles_from_topic
+from spacerobot_ros.model.urdf import links_with_shapes, obstacles_from_topic
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig

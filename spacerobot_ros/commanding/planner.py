@@ -17,7 +17,7 @@ from spacerobot_ros.errors import CommandError, PlanningError, printable
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import with_world
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive

@@ -32,8 +32,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
-from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.model.world import obstacles_from_topic, with_world
+from spacerobot_ros.model.urdf import obstacles_from_topic, parse_robot, with_world
 from spacerobot_ros.parameters import declared, known_values
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal

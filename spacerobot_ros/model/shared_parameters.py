@@ -9,8 +9,7 @@ from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.model_functions import SymbolicModels
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.model.urdf import load_robot, load_world, parse_robot
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import load_robot, load_world, parse_robot, with_world
 from spacerobot_ros.parameters import nonnegative, parameter
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND

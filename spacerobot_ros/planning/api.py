@@ -14,8 +14,7 @@ from spacerobot_ros.errors import GoalError, ParameterError, counted
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
-from spacerobot_ros.model.urdf import load_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import load_world, with_world
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import END_EFFECTOR_METHOD, PATH_METHOD, PlanRequest

@@ -16,8 +16,7 @@ from spacerobot_ros.collision import (
 from spacerobot_ros.collision.planes import PlaneDistance
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.planning import RobotState
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.prediction import BasePrediction

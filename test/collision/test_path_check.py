@@ -19,8 +19,7 @@ from spacerobot_ros.collision.rounded_box import RoundedBox, separation
 from spacerobot_ros.model import RobotDescription, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_rpy
-from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.resources import robot_file
 
 

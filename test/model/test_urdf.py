@@ -18,11 +18,12 @@ from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Inertia, JointKind, Shape
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_of
-from spacerobot_ros.model.srdf import with_srdf
-from spacerobot_ros.model.urdf import load_world, parse_world
-from spacerobot_ros.model.world import (
+from spacerobot_ros.model.urdf import (
     links_with_shapes,
+    load_world,
     obstacles_from_topic,
+    parse_world,
+    with_srdf,
     with_world,
 )
 from spacerobot_ros.resources import robot_file, share_directory

@@ -38,8 +38,7 @@ from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
-from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.nodes.common.fly_to import GoalClient, NavigateToPoseAction
 from spacerobot_ros.nodes.common.messages import goal_of, interface_class, message_class, shape_of
 from spacerobot_ros.planning import BasePath, Goal

@@ -25,7 +25,7 @@ from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import with_world
 from spacerobot_ros.planning import (
     GaitSchedule,
     Goal,

@@ -23,8 +23,7 @@ from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import Array, Pose
 from spacerobot_ros.model.shared_parameters import robot_of
-from spacerobot_ros.model.urdf import load_world, parse_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import load_world, parse_world, with_world
 from spacerobot_ros.planning import (
     METHODS,
     GaitSchedule,

@@ -15,8 +15,7 @@ from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
-from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 from spacerobot_ros.planning.methods.thrust.problem import Propulsion, ThrustGoal
 from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner

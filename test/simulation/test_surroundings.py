@@ -20,8 +20,7 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.external_loads import EARTH_GRAVITATION
-from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import build_plant

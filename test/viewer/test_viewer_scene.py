@@ -21,8 +21,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.thrusters import find_thrusters
-from spacerobot_ros.model.urdf import parse_robot, parse_world
-from spacerobot_ros.model.world import with_world
+from spacerobot_ros.model.urdf import parse_robot, parse_world, with_world
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus

@@ -30,7 +30,7 @@ from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import BodyMotion, Payload
 from spacerobot_ros.model.shared_parameters import robot_of
-from spacerobot_ros.model.world import obstacles_from_topic, with_world
+from spacerobot_ros.model.urdf import obstacles_from_topic, with_world
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode, described_robot
 from spacerobot_ros.nodes.common.process import run_node

@@ -28,8 +28,7 @@ from spacerobot_ros.messages.builders import goal_message
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.thrusters import find_thrusters
-from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.model.world import obstacles_from_topic
+from spacerobot_ros.model.urdf import obstacles_from_topic, parse_robot
 from spacerobot_ros.nodes.common.messages import shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node

@@ -8,7 +8,7 @@ from typing import Any
 
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE, CommanderConfig
-from spacerobot_ros.model.srdf import with_srdf
+from spacerobot_ros.model.urdf import with_srdf
 from spacerobot_ros.parameters import nonnegative, parameter, registered
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE
 from spacerobot_ros.planning.core.goal import Tolerance

@@ -33,8 +33,8 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     quaternions_from_rotvecs,
 )
+from spacerobot_ros.model.urdf import with_world
 from spacerobot_ros.model.wheels import ReactionWheels
-from spacerobot_ros.model.world import with_world
 from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
