@@ -8,8 +8,8 @@ which store only extreme values and the last state, return the measures directly
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from operator import attrgetter
 from typing import Any
@@ -37,39 +37,46 @@ class Outcome(str, Enum):
     """The flight ended before the goal was decided."""
 
 
+def _capture_measure(metric: str, unit: str, description: str, *, yes_or_no: bool = False) -> Any:
+    """Return a field of :class:`CaptureMeasures`, with the metric whose value it is."""
+    facts = {"metric": metric, "unit": unit, "description": description, "yes_or_no": yes_or_no}
+    return field(default=math.nan, metadata=facts)
+
+
 @dataclass(frozen=True)
 class CaptureMeasures:
-    """The measures of a capture; values are NaN if there is no target, or if the respective
-    event did not occur.
-
-    Attributes
-    ----------
-    captured
-        Whether the target was captured.
-    placed
-        Whether the target was held when the goal was reached.
-    time
-        Time of the first capture, s.
-    distance
-        Distance, m, between end-effector and grapple frame at the capture; without a capture, the
-        smallest distance during the flight.
-    impulse, angular_impulse
-        Norms of the impulse, N s, and of its moment at the end-effector, N m s.
-    joint_impulse
-        Largest grasp impulse along a joint coordinate, N m s or N s.
-    detumbling_time, detumbling_bound
-        Time, s, until the robot and the target came to rest, and the shortest possible time.
+    """The measures of a capture, each with the name of its metric, unit and meaning; values are NaN
+    if there is no target, or if the respective event did not occur.
     """
 
-    captured: float = math.nan
-    placed: float = math.nan
-    time: float = math.nan
-    distance: float = math.nan
-    impulse: float = math.nan
-    angular_impulse: float = math.nan
-    joint_impulse: float = math.nan
-    detumbling_time: float = math.nan
-    detumbling_bound: float = math.nan
+    captured: float = _capture_measure(
+        "captured", "", "whether the target was captured, 1 or 0", yes_or_no=True
+    )
+    placed: float = _capture_measure(
+        "placed", "", "whether the goal was reached with the target, 1 or 0", yes_or_no=True
+    )
+    time: float = _capture_measure("capture_time_s", "s", "time of the capture")
+    distance: float = _capture_measure(
+        "capture_distance_m",
+        "m",
+        "distance between end-effector and grapple frame at the capture; without a capture, the "
+        "smallest distance",
+    )
+    impulse: float = _capture_measure("capture_impulse_Ns", "N s", "impulse of the capture")
+    angular_impulse: float = _capture_measure(
+        "capture_angular_impulse_Nms", "N m s", "moment of the capture impulse at the end-effector"
+    )
+    joint_impulse: float = _capture_measure(
+        "capture_joint_impulse",
+        "N m s or N s",
+        "largest component of the capture impulse along a joint coordinate",
+    )
+    detumbling_time: float = _capture_measure(
+        "detumbling_time_s", "s", "time until the robot and the target came to rest"
+    )
+    detumbling_bound: float = _capture_measure(
+        "detumbling_bound_s", "s", "shortest time to rest with the available torques"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,9 +256,10 @@ class Metric:
     yes_or_no: bool = False
 
 
-def _capture_metric(name: str, unit: str, description: str, *, yes_or_no: bool = False) -> Metric:
+def _capture_metric(name: str, facts: Mapping[str, Any]) -> Metric:
     evaluate = attrgetter(f"capture.{name}")
-    return Metric(unit, description, lambda m, _: float(evaluate(m)), yes_or_no=yes_or_no)
+    unit, description = facts["unit"], facts["description"]
+    return Metric(unit, description, lambda m, _: float(evaluate(m)), yes_or_no=facts["yes_or_no"])
 
 
 def _error_metric(part: str, unit: str, description: str) -> Metric:
@@ -336,34 +344,10 @@ METRICS: dict[str, Metric] = {
         lambda m, _: m.clearance,
         smallest_is_worst=True,
     ),
-    "captured": _capture_metric(
-        "captured", "", "whether the target was captured, 1 or 0", yes_or_no=True
-    ),
-    "placed": _capture_metric(
-        "placed", "", "whether the goal was reached with the target, 1 or 0", yes_or_no=True
-    ),
-    "capture_time_s": _capture_metric("time", "s", "time of the capture"),
-    "capture_distance_m": _capture_metric(
-        "distance",
-        "m",
-        "distance between end-effector and grapple frame at the capture; without a capture, the "
-        "smallest distance",
-    ),
-    "capture_impulse_Ns": _capture_metric("impulse", "N s", "impulse of the capture"),
-    "capture_angular_impulse_Nms": _capture_metric(
-        "angular_impulse", "N m s", "moment of the capture impulse at the end-effector"
-    ),
-    "capture_joint_impulse": _capture_metric(
-        "joint_impulse",
-        "N m s or N s",
-        "largest component of the capture impulse along a joint coordinate",
-    ),
-    "detumbling_time_s": _capture_metric(
-        "detumbling_time", "s", "time until the robot and the target came to rest"
-    ),
-    "detumbling_bound_s": _capture_metric(
-        "detumbling_bound", "s", "shortest time to rest with the available torques"
-    ),
+    **{
+        each.metadata["metric"]: _capture_metric(each.name, each.metadata)
+        for each in fields(CaptureMeasures)
+    },
 }
 """Every metric by name."""
 

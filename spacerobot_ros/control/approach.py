@@ -164,9 +164,10 @@ class ApproachPlan:
         out = self.path_to_standoff.at(times - self.start)
         inward = self.path_to_contact.at(np.maximum(times - self.closing_time, 0.0))
         late = (times >= self.closing_time)[:, np.newaxis]
-        names = ("x", "xdot", "xddot", "phi", "phidot", "phiddot")
         return RelativeMotionOverTime(
-            *(np.where(late, getattr(inward, name), getattr(out, name)) for name in names)
+            np.where(late, inward.values, out.values),
+            np.where(late, inward.rates, out.rates),
+            np.where(late, inward.accelerations, out.accelerations),
         )
 
 

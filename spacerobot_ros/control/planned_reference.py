@@ -176,8 +176,8 @@ class GrappleReference(PlannedReference):
         super().__init__(start, Reference(base, hand, joints), limits, motion)
         self.motion, self.grapple = motion, grapple
         frame = grapple.motion.grapple([motion.duration])
-        beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 3))
-        self._base = RelativeMotionOverTime(beside.x, still, still, beside.phi, still, still)
+        beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 6))
+        self._base = RelativeMotionOverTime(beside.values, still, still)
 
     def relative(self, times: Array) -> RelativeMotionOverTime:
         """Return the motion of the end-effector relative to the grapple frame at one time, (1,)."""

@@ -163,7 +163,7 @@ class Composites:
 def composites(kin: TreeKinematics) -> Composites:
     """Sum the body inertias inward (Featherstone, table 6.2)."""
     n, c = kin.moving_body_count, kin.r_BC_B
-    J = tuple(kin.second_moment(k) for k in range(n + 1))
+    J = tuple(kin.mass_properties.second_moment(k, kin.R[k]) for k in range(n + 1))
     composite = []
     for k in range(n + 1):
         rho = kin.com[k] - c
@@ -253,7 +253,7 @@ def motion_forces(
 
     forces = []
     for k in range(kin.moving_body_count + 1):
-        arm = kin.R[k] @ kin.center(k)
+        arm = kin.R[k] @ kin.mass_properties.centers[k]
         force = kin.mass(k) * (accelerations[k] + A[k] @ arm)
         # The moment is the integral of rho x A rho over the body: the axial vector of A J.
         AJ = A[k] @ parts.J[k]
@@ -363,9 +363,8 @@ def state_slices(n: int) -> tuple[slice, ...]:
 
 def shape_equations(kin: TreeKinematics, *, loaded: bool = False) -> ca.Function:
     """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
-    x, command = _state_symbols(kin, loaded=loaded)
-    equations = _equations(kin, x, command, loaded=loaded)
-    inputs = {"x": x, "command": command, **kin.mass_properties.inputs}
+    equations = _equations(kin, loaded=loaded)
+    inputs = equations.inputs | kin.mass_properties.inputs
     name = "loaded_shape_equations" if loaded else "shape_equations"
     return dense_function(name, inputs, {"K": equations.system.K, "Q": equations.Q})
 
@@ -376,11 +375,10 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = Fal
     If ``holding``, the function takes a third argument ``free`` (n,): 1 for a moving joint, 0 for a
     joint held at its current rate. If ``loaded``, external loads are included.
     """
-    x, command = _state_symbols(kin, loaded=loaded)
     free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
-    _, quaternion, qdot, p_W, L_W, _ = (x[part] for part in state_slices(kin.n))
-    equations = _equations(kin, x, command, loaded=loaded)
+    equations = _equations(kin, loaded=loaded)
     system = equations.system
+    _, quaternion, qdot, p_W, L_W, _ = (equations.inputs["x"][part] for part in state_slices(kin.n))
     # A held joint is absent from the equations of other joints; its own equation is qddot = 0.
     K = system.K * (free @ free.T)
     for j in range(kin.n):
@@ -399,10 +397,7 @@ def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = Fal
         p_W / kin.total_mass,
         *([1.0] if loaded else []),
     )
-    inputs = {"x": x, "command": command}
-    if holding:
-        inputs["free"] = free
-    inputs |= kin.mass_properties.inputs
+    inputs = equations.inputs | ({"free": free} if holding else {}) | kin.mass_properties.inputs
     name = "holding_rate" if holding else "flight_rate"
     return dense_function(f"loaded_{name}" if loaded else name, inputs, {"x_dot": x_dot})
 
@@ -435,25 +430,14 @@ def servo_rate(kin: TreeKinematics) -> ca.Function:
     return dense_function("loaded_servo_rate", inputs, {"x_dot": x_dot})
 
 
-def _state_symbols(kin: TreeKinematics, *, loaded: bool) -> tuple[ca.SX, ca.SX]:
-    parts = [
-        kin.q if name == "q" else ca.SX.sym(name, part.stop - part.start)
-        for name, part in zip(
-            ("q", "quaternion", "qdot", "p_W", "L_W", "r_WC_W"), state_slices(kin.n), strict=True
-        )
-    ]
-    if not loaded:
-        return ca.vertcat(*parts), ca.SX.sym("command", kin.n + 6)
-    size = LoadLayout(len(kin.robot.links)).size
-    return ca.vertcat(*parts, ca.SX.sym("time")), ca.SX.sym("command", kin.n + 6 + size)
-
-
 @dataclass(frozen=True)
 class _Equations:
-    """The equations of motion in a state: the shape system, ``omega_WB_B``, the base wrench as
-    moment over force ``external``, ``Q``, and the external loads, if any.
+    """The equations of motion in a state: the symbols ``x`` and ``command`` by name, the shape
+    system, ``omega_WB_B``, the base wrench as moment over force ``external``, ``Q``, and the
+    external loads, if any.
     """
 
+    inputs: dict[str, ca.SX]
     system: ShapeSystem
     omega: ca.SX
     external: ca.SX
@@ -461,18 +445,27 @@ class _Equations:
     loads: ExternalLoads | None
 
 
-def _equations(kin: TreeKinematics, x: ca.SX, command: ca.SX, *, loaded: bool) -> _Equations:
-    _, quaternion, qdot, _, L_W, r_WC_W = (x[part] for part in state_slices(kin.n))
-    tau, wrench_B = command[: kin.n], command[kin.n : kin.n + 6]
+def _equations(kin: TreeKinematics, *, loaded: bool) -> _Equations:
+    quaternion, qdot, p_W, L_W, r_WC_W = (
+        ca.SX.sym(name, part.stop - part.start)
+        for name, part in zip(
+            ("quaternion", "qdot", "p_W", "L_W", "r_WC_W"), state_slices(kin.n)[1:], strict=True
+        )
+    )
+    command = ca.SX.sym("command", kin.n + 6)
+    tau, wrench_B = command[: kin.n], command[kin.n :]
+    x = ca.vertcat(kin.q, quaternion, qdot, p_W, L_W, r_WC_W)
     system = shape_system(kin)
     loads = None
     if loaded:
-        vector, time = command[kin.n + 6 :], x[-1]
+        vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
+        time = ca.SX.sym("time")
         loads = external_loads(kin, system.parts.J, quaternion, r_WC_W, vector, time)
+        x, command = ca.vertcat(x, time), ca.vertcat(command, vector)
     external = external_force(kin, wrench_B)
     omega = system.base_motion(matrix_from_quaternion(quaternion).T @ L_W, qdot)
     Q, _ = shape_forces(system, omega, qdot, external, tau, loads)
-    return _Equations(system, omega, external, Q, loads)
+    return _Equations({"x": x, "command": command}, system, omega, external, Q, loads)
 
 
 def _joint_motion(kin: TreeKinematics, k: int) -> ca.SX:

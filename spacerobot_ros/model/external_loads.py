@@ -1,20 +1,10 @@
 """External loads on robot links: wrenches, a gravity gradient, and a tilted air table.
 
-All loads on a robot form one vector (:class:`LoadLayout`); all times are in plant time. Frame W is
-in free fall on a circular orbit with mean motion n and does not rotate. The orbital frame O has its
-x axis radially outward and its z axis along the orbit normal, as in the equations of Clohessy and
-Wiltshire; ``R_WO`` is the attitude of O at time zero. With the unit vector o along the radius, a
-mass element at r from the origin of W accelerates by ``n^2 (3 o o' - 1) r``, to first order in an
-inverse-square field (Hughes, Spacecraft Attitude Dynamics, chapter 8). The force on body k and the
-moment about its centre of mass r_k are ::
-
-    f_k = m_k n^2 (3 o o' - 1) r_k,    n_k = 3 n^2 o x I_k o
-
-Summed over the bodies, these loads are the moment ``3 n^2 o x D o`` about the system's centre of
-mass, where D is the locked inertia, and the force ``M n^2 (3 o o' - 1) r_C`` on that centre.
-
-On an air table, all bodies have the same acceleration, and friction is proportional to momentum:
-``f_k = -d m_k v_k``, ``n_k = -d I_k omega_k``.
+The equations are derived in docs/theory/external_loads.md. All loads on a robot form one vector
+(:class:`LoadLayout`); all times are in plant time. Frame W is in free fall on a circular orbit with
+mean motion n and does not rotate. The orbital frame O has its x axis radially outward and its z
+axis along the orbit normal; ``R_WO`` is the attitude of O at time zero, ``o`` the unit vector along
+the radius.
 """
 
 from __future__ import annotations

@@ -1,21 +1,9 @@
 """Grasp of a floating body by a floating robot, modelled as an inelastic impact.
 
-Let ``z = [v_WB_B; omega_WB_B; qdot]`` (6 + n,) be the robot's velocity, ``nu`` (6,) the body's
-velocity (the linear velocity of its centre of mass, and its angular velocity) and ``L`` (6,) the
-grasp impulse on the robot (force and torque at the grasp point), all in components of the base
-frame B. Then
-
-    H (z+ - z) = J' L,    M (nu+ - nu) = -G' L,    J z+ = G nu+,
-
-where H is the robot's inertia matrix, M the body's spatial inertia, J the end-effector Jacobian and
-G the map from the body's twist to the same point. The joints are free: no motor or
-brake exerts an impulse. So
-
-    L = (J H^-1 J' + G M^-1 G')^-1 (G nu - J z),
-
-and the energy ``(G nu - J z)' L / 2`` is lost (Carnot). Momentum is conserved, because L acts on
-the robot and the body with opposite signs. The formulation follows Yoshida and Nenchev, and
-Dimitrov and Yoshida; see the theory page on captures.
+The equations are derived in docs/theory/capture.md. The grasp impulse on the robot makes the
+velocities of the end-effector and of the grasped point equal. The joints are free: no motor or
+brake exerts an impulse. Momentum is conserved, because the impulse acts on the robot and the body
+with opposite signs. The formulation follows Yoshida and Nenchev, and Dimitrov and Yoshida.
 """
 
 from __future__ import annotations

@@ -71,6 +71,13 @@ def repeat_step(step: ca.Function, count: int) -> ca.Function:
     return ca.Function(f"{step.name()}_{count}", [x, *held], [x_next])
 
 
+def divided_step(name: str, step: ca.Function, count: int) -> ca.Function:
+    """Return the function that takes a step ``(x, u, loads, h) -> x`` as ``count`` equal steps."""
+    x, (u, loads, h, *p) = _symbols_for_inputs(step)
+    x_next = repeat_step(step, count)(x, u, loads, h / count, *p)
+    return ca.Function(name, [x, u, loads, h, *p], [x_next])
+
+
 def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     """Return one Runge-Kutta step ``(x, qdot, L_W, h) -> x`` of ``x = [q; quaternion_WB]``.
 

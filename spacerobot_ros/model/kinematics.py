@@ -95,15 +95,6 @@ class TreeKinematics:
         per: float | ca.SX = 1 / self.mass_properties.total
         return per if isinstance(per, float) else ca.fabs(per)
 
-    def center(self, k: int) -> ca.DM | ca.SX:
-        """Centre of mass (3,) of body k in its own frame, m."""
-        return self.mass_properties.centers[k]
-
-    def second_moment(self, k: int) -> ca.SX:
-        """Return the second moment of mass (3, 3) of body k about its centre, in base
-        components."""
-        return self.mass_properties.second_moment(k, self.R[k])
-
     def parent(self, k: int) -> int:
         """Parent index of body k; -1 for the base."""
         return self.robot.bodies[k].parent

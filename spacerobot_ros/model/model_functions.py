@@ -36,6 +36,7 @@ from spacerobot_ros.model.dynamics import (
     bias,
     connection,
     curvature,
+    momentum_derivatives,
     momentum_of_bodies,
     point_jacobian,
 )
@@ -47,11 +48,10 @@ from spacerobot_ros.model.inertial_parameters import (
 )
 from spacerobot_ros.model.integration import (
     attitude_step,
-    repeat_step,
+    divided_step,
     runge_kutta_step,
 )
 from spacerobot_ros.model.kinematics import tree_kinematics
-from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
@@ -294,24 +294,13 @@ class ModelFunctions:
         return self._dense_model_function("rotate", inputs, {"vector_W": rotated})
 
     def _velocity_step(self, substeps: str) -> ca.Function:
-        count = int(substeps)
         step = attitude_step(self._locked_inertia())
-        x, qdot = ca.MX.sym("x", self.n + 4), ca.MX.sym("qdot", self.n)
-        L_W, h = ca.MX.sym("L_W", 3), ca.MX.sym("h")
-        p = [ca.MX.sym(name, each.numel()) for name, each in self.mass_inputs.items()]
-        x_next = repeat_step(step, count)(x, qdot, L_W, h / count, *p)
-        return ca.Function(f"velocity_step_{count}", [x, qdot, L_W, h, *p], [x_next])
+        return divided_step(f"velocity_step_{substeps}", step, int(substeps))
 
     def _loaded_velocity_step(self, substeps: str) -> ca.Function:
         """Return ``(x, qdot, loads, h) -> x`` of :func:`.servo_rate` in some Runge-Kutta steps."""
-        count = int(substeps)
         step = runge_kutta_step(servo_rate(self._kin), attitude=slice(self.n, self.n + 4))
-        x = ca.MX.sym("x", self.n + 14)
-        qdot, h = ca.MX.sym("qdot", self.n), ca.MX.sym("h")
-        loads = ca.MX.sym("loads", LoadLayout(len(self.link_names)).size)
-        p = [ca.MX.sym(name, each.numel()) for name, each in self.mass_inputs.items()]
-        x_next = repeat_step(step, count)(x, qdot, loads, h / count, *p)
-        return ca.Function(f"loaded_velocity_step_{count}", [x, qdot, loads, h, *p], [x_next])
+        return divided_step(f"loaded_velocity_step_{substeps}", step, int(substeps))
 
     def _total_mass(self) -> ca.Function:
         return dense_function("total_mass", self.mass_inputs, {"M": self._kin.total_mass})

@@ -1,19 +1,13 @@
 """Estimates the ten inertial parameters of a held body from motion and momentum conservation.
 
 The momentum of a body is linear in its parameters ``phi = [m, m c, I]`` (10,): mass, first moment
-and moments of inertia about the origin of its frame L (Atkeson, An and
-Hollerbach, 1986). The robot's own momentum ``P_r`` is known from its model. Without loads other
-than the known impulse J since the first state, where the total momentum is P_0,
-
-    P_r(t) + A(t) phi = P_0 + J(t),
-
-for linear and angular momentum about a fixed point. P_0 is unknown, too. If columns of A
-are constant along a motion (such as a planar motion), that motion does not determine all
-parameters; the undetermined parameters are reported. The estimated parameters are physically
-consistent: a rigid body with these parameters exists. This holds if and only if the pseudo-inertia
-matrix ``[[tr(I)/2 1 - I, m c], [m c', m]]`` is positive definite (Wensing, Kim and Slotine, 2018),
-which a Cholesky factor with logarithms on the diagonal ensures (Rucker and Wensing, 2022). The
-sources are cited from memory.
+and moments of inertia about the origin of its frame L (Atkeson, An and Hollerbach, 1986). The
+least-squares problem is described in docs/theory/capture.md. If columns of the regressor are
+constant along a motion (such as a planar motion), that motion does not determine all parameters;
+the undetermined parameters are reported. The estimated parameters are physically consistent: their
+pseudo-inertia matrix is positive definite (Wensing, Kim and Slotine, 2018), which a Cholesky factor
+with logarithms on the diagonal ensures (Rucker and Wensing, 2022). The sources are cited from
+memory.
 """
 
 from __future__ import annotations

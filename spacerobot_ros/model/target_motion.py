@@ -70,10 +70,13 @@ class FrameMotion:
     def with_relative_motion(self, path: RelativeMotionOverTime) -> FrameMotion:
         """Return the motion of a frame that moves relative to this frame."""
         R, omega, alpha = self.R, self.omega, self.alpha
-        arm, v_rel, a_rel = (_rotate_vectors(R, each) for each in (path.x, path.xdot, path.xddot))
+        arm, v_rel, a_rel = (
+            _rotate_vectors(R, each[:, :3])
+            for each in (path.values, path.rates, path.accelerations)
+        )
         w_rel, wdot_rel = (_rotate_vectors(R, each) for each in path.rotation)
         return FrameMotion(
-            R @ matrices_from_quaternions(quaternions_from_rotvecs(path.phi)),
+            R @ matrices_from_quaternions(quaternions_from_rotvecs(path.values[:, 3:])),
             self.r + arm,
             self.v + cross(omega, arm) + v_rel,
             omega + w_rel,
@@ -85,6 +88,15 @@ class FrameMotion:
             alpha + cross(omega, w_rel) + wdot_rel,
         )
 
+    def relative_translation(self, r: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
+        """Return position, velocity and acceleration (K, 3) of points relative to this frame, in
+        W, given their position, velocity and acceleration (K, 3) in W.
+        """
+        omega, arm = self.omega, r - self.r
+        v_rel = v - self.v - cross(omega, arm)
+        a_rel = a - self.a - cross(self.alpha, arm) - cross(omega, cross(omega, arm))
+        return arm, v_rel, a_rel - 2 * cross(omega, v_rel)
+
 
 @dataclass(frozen=True)
 class RelativeMotionOverTime:
@@ -92,32 +104,23 @@ class RelativeMotionOverTime:
 
     Attributes
     ----------
-    x, xdot, xddot
-        Position (K, 3), m, and the derivatives of the position.
-    phi, phidot, phiddot
-        Rotation vector (K, 3) of ``R_GE``, rad, and its derivatives.
+    values, rates, accelerations
+        (K, 6) position, m, and rotation vector of ``R_GE``, rad, and their first and second
+        derivatives.
     """
 
-    x: Array
-    xdot: Array
-    xddot: Array
-    phi: Array
-    phidot: Array
-    phiddot: Array
-
-    @classmethod
-    def stacked(cls, motions: Sequence[RelativeMotionOverTime]) -> RelativeMotionOverTime:
-        """Return the given motions, concatenated in time."""
-        names = [each.name for each in fields(cls)]
-        return cls(*(np.concatenate([getattr(each, name) for each in motions]) for name in names))
+    values: Array
+    rates: Array
+    accelerations: Array
 
     @property
     def rotation(self) -> tuple[Array, Array]:
         """Angular velocity (K, 3), rad/s, and acceleration (K, 3), rad/s^2, of E relative to G.
 
-        The velocity is ``J(phi) phidot``, with the left Jacobian of SO(3).
+        The velocity is ``J(phi) phidot``, with the rotation vector phi and the left Jacobian of
+        SO(3).
         """
-        phi, phidot, phiddot = self.phi, self.phidot, self.phiddot
+        phi, phidot, phiddot = (x[:, 3:] for x in (self.values, self.rates, self.accelerations))
         B, C, B_rate, C_rate = _jacobian_terms(phi, phidot)
         first, second = cross(phi, phidot), cross(phi, phiddot)
         twice = cross(phi, first)
@@ -135,26 +138,19 @@ class RelativeMotionOverTime:
     def between(cls, frame: FrameMotion, moving: FrameMotion) -> RelativeMotionOverTime:
         """Return the motion of ``moving`` relative to ``frame``, both at a single time (K = 1)."""
         R, omega = frame.R[0], frame.omega[0]
-        arm = moving.r[0] - frame.r[0]
-        v = moving.v[0] - frame.v[0] - cross(omega, arm)
-        a = moving.a[0] - frame.a[0] - cross(frame.alpha[0], arm)
-        a = a - cross(omega, cross(omega, arm)) - 2 * cross(omega, v)
+        motion = cls(*(np.zeros((1, 6)) for _ in range(3)))
+        translation = frame.relative_translation(moving.r, moving.v, moving.a)
+        parts = (motion.values, motion.rates, motion.accelerations)
+        for part, vectors in zip(parts, translation, strict=True):
+            part[0, :3] = R.T @ vectors[0]
         w_W = moving.omega[0] - omega
         wdot = R.T @ (moving.alpha[0] - frame.alpha[0] - cross(omega, w_W))
         phi = rotvec_from_quaternion(quaternion_from_matrix(R.T @ moving.R[0]))
-        J = _left_jacobian(phi)
-        phidot = np.linalg.solve(J, R.T @ w_W)
-        zero = np.zeros((1, 3))
-        x, xdot, xddot = ((R.T @ each)[np.newaxis] for each in (arm, v, a))
-        without = cls(x, xdot, xddot, phi[np.newaxis], phidot[np.newaxis], zero)
-        phiddot = np.linalg.solve(J, wdot - without.rotation[1][0])
-        return cls(x, xdot, xddot, without.phi, without.phidot, phiddot[np.newaxis])
-
-
-def _left_jacobian(phi: Array) -> Array:
-    B, C, _, _ = _jacobian_terms(phi[np.newaxis], phi[np.newaxis])
-    phi_hat = hat(phi)
-    return np.asarray(np.eye(3) + B * phi_hat + C * phi_hat @ phi_hat)
+        B, C, _, _ = _jacobian_terms(phi[np.newaxis], phi[np.newaxis])
+        J = np.eye(3) + B * hat(phi) + C * hat(phi) @ hat(phi)
+        motion.values[0, 3:], motion.rates[0, 3:] = phi, np.linalg.solve(J, R.T @ w_W)
+        motion.accelerations[0, 3:] = np.linalg.solve(J, wdot - motion.rotation[1][0])
+        return motion
 
 
 def _jacobian_terms(phi: Array, phidot: Array) -> tuple[Array, Array, Array, Array]:
@@ -190,20 +186,15 @@ class RelativePath:
 
     def __init__(self, start: RelativeMotionOverTime, position: Array, duration: float) -> None:
         self.duration = duration
-        self._end = np.concatenate([position, np.zeros(3)])
-        y = np.concatenate([start.x[0], start.phi[0]])
-        rate = np.concatenate([start.xdot[0], start.phidot[0]])
-        acceleration = np.concatenate([start.xddot[0], start.phiddot[0]])
-        zero = np.zeros(6)
-        self._coefficients = _quintic((y, rate, acceleration), (self._end, zero, zero), duration)
+        self._end, zero = np.concatenate([position, np.zeros(3)]), np.zeros(6)
+        begin = start.values[0], start.rates[0], start.accelerations[0]
+        self._coefficients = _quintic(begin, (self._end, zero, zero), duration)
 
     @classmethod
     def from_rest(cls, start: Array, end: Array, duration: float) -> RelativePath:
         """Return the path between two positions (3,), at rest at both ends, with the attitude of
         G."""
-        zero = np.zeros((1, 3))
-        motion = RelativeMotionOverTime(start[np.newaxis], zero, zero, zero, zero, zero)
-        return cls(motion, end, duration)
+        return cls(_fixed_at(start), end, duration)
 
     def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
         """Return the motion at times (K,), s since the start; at rest after the end."""
@@ -211,10 +202,13 @@ class RelativePath:
         parts = _evaluate_polynomials(self._coefficients, t)
         rested = np.asarray(times, dtype=float) >= self.duration
         parts[0][rested], parts[1][rested], parts[2][rested] = self._end, 0.0, 0.0
-        y, ydot, yddot = parts
-        return RelativeMotionOverTime(
-            y[:, :3], ydot[:, :3], yddot[:, :3], y[:, 3:], ydot[:, 3:], yddot[:, 3:]
-        )
+        return RelativeMotionOverTime(*parts)
+
+
+def _fixed_at(position: Array) -> RelativeMotionOverTime:
+    """Return no motion (K = 1) at a position (3,), with the attitude of G."""
+    zero = np.zeros((1, 6))
+    return RelativeMotionOverTime(np.append(position, np.zeros(3))[np.newaxis], zero, zero)
 
 
 def _quintic(start: Sequence[Array], end: Sequence[Array], T: float) -> Array:
@@ -252,13 +246,22 @@ class TorqueFreeMotion:
         The target.
     motion
         State of the target's root link frame.
+
+    Attributes
+    ----------
+    velocity
+        Centre-of-mass velocity (3,) in W, m/s.
+    arm_length
+        Distance of the grapple frame from the centre of mass, m.
     """
 
     def __init__(self, body: TargetBody, motion: BodyMotion) -> None:
         self._body = body
         inertia, R = body.inertia, motion.R_WT
         self._arm = R @ inertia.com
-        self._r, self._v = motion.r_WT + self._arm, motion.v + cross(motion.omega, self._arm)
+        self._r = motion.r_WT + self._arm
+        self.velocity = motion.v + cross(motion.omega, self._arm)
+        self.arm_length = float(np.linalg.norm(body.grapple.r - inertia.com))
         self._L = R @ inertia.about_com @ R.T @ motion.omega
         self._inverse = np.linalg.inv(inertia.about_com)
         fastest = float(np.linalg.norm(self._L) * np.linalg.eigvalsh(self._inverse)[-1])
@@ -270,24 +273,14 @@ class TorqueFreeMotion:
         :class:`TargetExpression`."""
         inertia, grapple = self._body.inertia, self._body.grapple
         at = self._quaternions(np.array([time]))[0]
-        r = self._r + time * self._v
+        r, v = self.center_of_mass(time), self.velocity
         about = inertia.about_com[np.triu_indices(3)]
         arm, turn = grapple.r - inertia.com, quaternion_from_matrix(grapple.R)
-        return np.concatenate([[time], at, self._L, r, self._v, [inertia.mass], about, arm, turn])
-
-    @property
-    def velocity(self) -> Array:
-        """Centre-of-mass velocity (3,) in W, m/s."""
-        return self._v
-
-    @property
-    def arm_length(self) -> float:
-        """Distance of the grapple frame from the centre of mass, m."""
-        return float(np.linalg.norm(self._body.grapple.r - self._body.inertia.com))
+        return np.concatenate([[time], at, self._L, r, v, [inertia.mass], about, arm, turn])
 
     def center_of_mass(self, time: float) -> Array:
         """Return the centre of mass (3,) in W, m."""
-        return np.asarray(self._r + time * self._v)
+        return np.asarray(self._r + time * self.velocity)
 
     @property
     def grapple_in_target(self) -> Array:
@@ -300,14 +293,14 @@ class TorqueFreeMotion:
         t = np.asarray(times, dtype=float)
         X = self._quaternions(t)
         arm = matrices_from_quaternions(X) @ self._body.inertia.com
-        return X, self._r + t[:, np.newaxis] * self._v - arm
+        return X, self._r + t[:, np.newaxis] * self.velocity - arm
 
     def later(self, elapsed: float) -> TorqueFreeMotion:
         """Return the same motion starting at a later time."""
         X, r = self.body_poses([elapsed])
         R = matrices_from_quaternions(X)
         omega = R[0] @ self._rates(R)[0]
-        v = self._v - cross(omega, R[0] @ self._body.inertia.com)
+        v = self.velocity - cross(omega, R[0] @ self._body.inertia.com)
         return TorqueFreeMotion(self._body, BodyMotion(R[0], r[0], v, omega))
 
     def grapple(self, times: npt.ArrayLike) -> FrameMotion:
@@ -321,8 +314,8 @@ class TorqueFreeMotion:
         arm = R @ (grapple.r - inertia.com)
         return FrameMotion(
             R @ grapple.R,
-            self._r + t[:, np.newaxis] * self._v + arm,
-            self._v + cross(omega, arm),
+            self._r + t[:, np.newaxis] * self.velocity + arm,
+            self.velocity + cross(omega, arm),
             omega,
             cross(alpha, arm) + cross(omega, cross(omega, arm)),
             alpha,
@@ -453,9 +446,7 @@ class PathInWorld:
     ) -> None:
         self.duration = relative.duration
         self._relative, self._target, self._start = relative, target, start
-        zero = np.zeros((1, 3))
-        fixed = RelativeMotionOverTime(position[np.newaxis], zero, zero, zero, zero, zero)
-        end = target.grapple([start + self.duration]).with_relative_motion(fixed)
+        end = target.grapple([start + self.duration]).with_relative_motion(_fixed_at(position))
         first, last = ((each.r[0], each.v[0], each.a[0]) for each in (moving, end))
         self._coefficients = _quintic(first, last, self.duration)
 
@@ -466,13 +457,9 @@ class PathInWorld:
         on_way = t < self.duration
         if not on_way.any():
             return found
-        r, v, a = _evaluate_polynomials(self._coefficients, t[on_way])
         frame = self._target.grapple(self._start + t[on_way])
-        arm, omega = r - frame.r, frame.omega
-        v_rel = v - frame.v - cross(omega, arm)
-        a_rel = a - frame.a - cross(frame.alpha, arm) - cross(omega, cross(omega, arm))
-        a_rel = a_rel - 2 * cross(omega, v_rel)
-        R_GW = np.swapaxes(frame.R, 1, 2)
-        for values, each in ((found.x, arm), (found.xdot, v_rel), (found.xddot, a_rel)):
-            values[on_way] = _rotate_vectors(R_GW, each)
+        in_W = frame.relative_translation(*_evaluate_polynomials(self._coefficients, t[on_way]))
+        parts, R_GW = (found.values, found.rates, found.accelerations), np.swapaxes(frame.R, 1, 2)
+        for part, vectors in zip(parts, in_W, strict=True):
+            part[on_way, :3] = _rotate_vectors(R_GW, vectors)
         return found

@@ -1,18 +1,11 @@
 """Reaction wheels: bodies of revolution on the base that spin about their axes.
 
 A wheel is the child of a continuous joint with the element ``<wheel/>``, whose ``<limit>``
-specifies the largest rate and torque. Since a wheel is a body of revolution, its angle has no
-effect; only its spin matters. Let ``A`` (3, k) be the wheel axes in the base frame, ``J`` (k,) the
-moments of inertia about them, and ``h = J (A' omega + qdot_w)`` (k,) the spins: the wheel momenta
-about their axes in inertial space. Then the base and the arm obey the equations of a robot without
-wheels (a gyrostat)
-
-    M(q) z0ddot + C(q, z0dot) = Q,    base torque n = n_thrusters - A tau_w - omega x (A h),    (1)
-    hdot = tau_w,                                                                              (2)
-
-where M includes the wheels' masses but not their moments J about their axes (Hughes, Spacecraft
-Attitude Dynamics, chapter 3). A control law for the base and the arm therefore also works for a
-robot with wheels, which produce part of its base torque.
+specifies the largest rate and torque. Let ``A`` (3, k) be the wheel axes in the base frame, ``J``
+(k,) the moments of inertia about them, and ``h = J (A' omega + qdot_w)`` (k,) the spins: the wheel
+momenta about their axes in inertial space. The base and the arm obey the equations of a gyrostat, a
+robot without wheels (docs/theory/wheels.md), so a control law for the base and the arm also works
+for a robot with wheels, which produce part of its base torque.
 """
 
 from __future__ import annotations
@@ -157,8 +150,8 @@ class ReactionWheels:
 
     @cached_property
     def gyrostat(self) -> RobotDescription:
-        """The robot of eq. (1): it has only the other joints, and the wheels are part of the base,
-        without moments of inertia about their axes.
+        """The robot without wheels: it has only the other joints, and the wheels are part of the
+        base, without moments of inertia about their axes.
         """
         links = {link.name: link for link in self.description.links}
         for name, moment in zip(self.names, self.inertia, strict=True):

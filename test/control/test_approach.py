@@ -324,7 +324,9 @@ def test_small_and_large_turns_have_one_formula() -> None:
     zero = np.zeros((1, 3))
     direction = np.array([[0.6, 0.0, -0.8]])
     found = [
-        RelativeMotionOverTime(zero, zero, zero, angle * direction, phidot, phiddot)
+        RelativeMotionOverTime(
+            *(np.hstack([zero, each]) for each in (angle * direction, phidot, phiddot))
+        )
         for angle in (0.9999e-3, 1.0001e-3)
     ]
     for before, after in zip(found[0].rotation, found[1].rotation, strict=True):

@@ -342,12 +342,13 @@ def test_a_body_in_the_way_is_gone_round() -> None:
     found = plan(NEAR, clearance=answers)
     assert isinstance(found.path_to_standoff, PathInWorld)
     assert found.distance == 0.07
-    standoff = found.path_to_standoff.at([found.path_to_standoff.duration]).x[0]
+    standoff = found.path_to_standoff.at([found.path_to_standoff.duration]).values[0, :3]
     np.testing.assert_allclose(standoff, OPTIONS.standoff)
     answers = Answers(0.01, 0.2, 0.04, 0.3)
     farther = plan(NEAR, clearance=answers)
     outward = farther.path_to_standoff
-    np.testing.assert_allclose(outward.at([outward.duration]).x[0], 2 * np.array(OPTIONS.standoff))
+    end = outward.at([outward.duration]).values[0, :3]
+    np.testing.assert_allclose(end, 2 * np.array(OPTIONS.standoff))
     assert farther.path_to_contact.duration > found.path_to_contact.duration
 
 
@@ -406,5 +407,5 @@ def test_a_path_in_the_world_joins_motion_and_standoff() -> None:
     lengths = [np.linalg.norm(np.diff(each.r, axis=0), axis=1).sum() for each in (moved, around)]
     assert lengths[0] < lengths[1]
     after = path.at([T + 1.0])
-    np.testing.assert_allclose(after.x[0], OPTIONS.standoff)
-    np.testing.assert_allclose(after.xdot[0], 0.0)
+    np.testing.assert_allclose(after.values[0, :3], OPTIONS.standoff)
+    np.testing.assert_allclose(after.rates[0, :3], 0.0)

@@ -44,8 +44,7 @@ from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistance
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, compiled, source_hash
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.dynamics import solve_positive_definite
-from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
+from spacerobot_ros.model.dynamics import momentum_derivatives, solve_positive_definite
 from spacerobot_ros.model.symbolic_rotations import (
     quaternion_from_small_rotvec,
     quaternion_multiply,

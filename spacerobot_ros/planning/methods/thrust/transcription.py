@@ -31,8 +31,7 @@ from spacerobot_ros.collision.planes import PLANE_SIZE
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import source_hash
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.dynamics import solve_positive_definite
-from spacerobot_ros.model.momentum_derivatives import momentum_derivatives
+from spacerobot_ros.model.dynamics import momentum_derivatives, solve_positive_definite
 from spacerobot_ros.model.symbolic_rotations import (
     half_angle_vector,
     matrix_from_quaternion,
