@@ -101,15 +101,14 @@ class Registry(dict[str, type[T]]):
             self._add_all_of(_module_of(file))
 
     def _add_all_of(self, module: ModuleType) -> None:
-        for entry in list(vars(module).values()):
-            _require_base(entry, module)
-            own = inspect.isclass(entry) and entry.__module__ == module.__name__
+        classes: list[Any] = [each for each in vars(module).values() if inspect.isclass(each)]
+        for entry in classes:
+            if entry.__module__ != module.__name__:
+                continue
+            if not issubclass(entry, self.base):
+                _require_base(entry)
             # A class without a name of its own is a base class.
-            if (
-                own
-                and issubclass(entry, self.base)
-                and ("name" in vars(entry) or not inspect.isabstract(entry))
-            ):
+            elif "name" in vars(entry) or not inspect.isabstract(entry):
                 self.register(entry)
 
     def _usable_name(self, entry: Any) -> str:
@@ -214,15 +213,13 @@ def _module_of(file: Path) -> ModuleType:
     return module
 
 
-def _require_base(entry: Any, module: ModuleType) -> None:
+def _require_base(entry: type[Any]) -> None:
     """Reject a class that looks like a law or method but has no base class of this package."""
-    if not (inspect.isclass(entry) and entry.__module__ == module.__name__):
-        return
     works = any(callable(getattr(entry, each, None)) for each in ("compute", "results", "plan"))
     package = __name__.partition(".")[0]
     derived = any(each.__module__.partition(".")[0] == package for each in entry.__mro__)
     if isinstance(getattr(entry, "name", None), str) and works and not derived:
         raise ParameterError(
-            f"The class '{entry.__name__}' of the plugin '{module.__file__}' is neither a control "
+            f"The class '{entry.__name__}' of the plugin {_origin(entry)} is neither a control "
             "law nor a gait method: derive it from NumpyLaw, ControlLaw or GaitMethod."
         )

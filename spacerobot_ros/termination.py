@@ -15,16 +15,14 @@ from __future__ import annotations
 import io
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO
-
-if TYPE_CHECKING:
-    import subprocess
+from typing import Any, TextIO
 
 _MESSAGE_BY_SIGNAL = {
     signal.SIGINT: "Interrupted.",
@@ -235,8 +233,6 @@ def start_child(
     The child must be guarded. ``environment`` is the environment of the child, by default a
     copy of this process's environment; for ``options``, see ``subprocess.Popen``.
     """
-    import subprocess
-
     given = os.environ if environment is None else environment
     variables = {**given, _PARENT_VARIABLE: f"{os.getpid()}"}
     return subprocess.Popen(
@@ -266,8 +262,6 @@ def end_child(process: subprocess.Popen[bytes], signals: Mapping[int, float]) ->
         end; signal 0 means only waiting. After that, the child is killed together with its whole
         session.
     """
-    import subprocess
-
     for number, patience in signals.items():
         process.send_signal(number)
         with suppress(subprocess.TimeoutExpired):
@@ -301,8 +295,6 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
     FileNotFoundError
         There is no such program.
     """
-    import subprocess
-
     with (
         _on_first_signal(None),
         subprocess.Popen(

@@ -96,8 +96,7 @@ class RobotTransforms:
         """Return the message for a base link pose (7,) and joint positions (n,)."""
         self._poses[0] = pose
         if self._links is not None:
-            self._links.update(q)
-            self._poses[1:] = self._links.transforms
+            self._poses[1:] = self._links.transforms_at(q)
         return self._template.serialised(time_ns, self._poses)
 
     def messages(self, times_ns: NDArray[np.int64], poses: Array, q: Array) -> list[bytes]:
@@ -159,9 +158,9 @@ class StateFrames:
 def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:
     """Return each link's parent and pose (7,) in the parent, by link name, for a measured state."""
     links, prefix = ForwardKinematics(description), state.prefix
-    links.update(state.q)
     frames = {prefix + description.base_link: (state.world, state.pose)}
-    for names, poses in ((links.moving, links.transforms), (links.fixed, links.fixed_transforms)):
+    moving = links.transforms_at(state.q)
+    for names, poses in ((links.moving, moving), (links.fixed, links.fixed_transforms)):
         for (parent, child), pose in zip(names, poses, strict=True):
             frames[prefix + child] = prefix + parent, pose
     return frames

@@ -280,9 +280,8 @@ class ForwardKinematics:
         Link names, with the base link first and each link after its parent.
     moving, fixed
         Parent and child of each moving joint, and of each fixed joint.
-    transforms, fixed_transforms
-        Poses of the moving and of the fixed children in their parents: (k, 7), updated in place by
-        :meth:`update`, and (m, 7).
+    fixed_transforms
+        Poses (m, 7) of the fixed children in their parents.
     """
 
     def __init__(self, robot: RobotDescription) -> None:
@@ -291,10 +290,8 @@ class ForwardKinematics:
         fixed = [joint for joint in robot.joints if joint.kind is JointKind.FIXED]
         self.moving: Frames = tuple((joint.parent, joint.child) for joint in moving)
         self.fixed: Frames = tuple((joint.parent, joint.child) for joint in fixed)
-        self.fixed_transforms = np.array([_transform_at_zero(joint) for joint in fixed]).reshape(
-            -1, 7
-        )
-        self.transforms = np.array([_transform_at_zero(joint) for joint in moving]).reshape(-1, 7)
+        self.fixed_transforms = _transforms_at_zero(fixed)
+        at_zero = _transforms_at_zero(moving)
         follows = [joint.mimic or Mimic(joint.name, 1.0, 0.0) for joint in moving]
         self._index = np.array([names.index(each.joint) for each in follows], dtype=int)
         self._factor = np.array([each.multiplier for each in follows])
@@ -302,10 +299,9 @@ class ForwardKinematics:
         slides = np.array([joint.kind is JointKind.PRISMATIC for joint in moving], dtype=bool)
         axes = np.array([joint.axis for joint in moving]).reshape(-1, 3)
         turned = np.array([joint.origin.R @ joint.axis for joint in moving]).reshape(-1, 3)
-        self._position = self.transforms[:, :3].copy()
+        self._position, self._cosine_part = at_zero[:, :3], at_zero[:, 3:]
         self._direction = np.where(slides[:, None], turned, 0.0)
         self._half = np.where(slides, 0.0, 0.5)
-        self._cosine_part = self.transforms[:, 3:].copy()
         about = np.hstack([axes, np.zeros((len(moving), 1))])
         self._sine_part = numeric_multiply(self._cosine_part, about).reshape(-1, 4)
         self.links = tuple(robot.frames)
@@ -314,23 +310,15 @@ class ForwardKinematics:
             (self.links.index(joint.parent), rows[joint.child]) for joint in joints_outward(robot)
         ]
 
-    def update(self, q: Array) -> None:
-        """Update the transforms for joint positions (n,), m or rad."""
-        self._write_transforms(self.transforms, q)
-
     def transforms_at(self, q: Array) -> Array:
-        """Return the transforms (..., k, 7) for joint positions (..., n), m or rad."""
-        transforms = np.empty((*q.shape[:-1], *self.transforms.shape))
-        self._write_transforms(transforms, q)
-        return transforms
-
-    def _write_transforms(self, transforms: Array, q: Array) -> None:
+        """Return the poses (..., k, 7) of the moving children in their parents for joint positions
+        (..., n), m or rad.
+        """
         moved = self._factor * q[..., self._index] + self._offset
-        half = self._half * moved
-        transforms[..., :3] = self._position + moved[..., None] * self._direction
-        transforms[..., 3:] = (
-            np.cos(half)[..., None] * self._cosine_part + np.sin(half)[..., None] * self._sine_part
-        )
+        half = (self._half * moved)[..., None]
+        position = self._position + moved[..., None] * self._direction
+        attitude = np.cos(half) * self._cosine_part + np.sin(half) * self._sine_part
+        return np.concatenate([position, attitude], axis=-1)
 
     def link_poses(self, q: Array) -> tuple[Array, Array]:
         """Return ``R_BL`` (..., L, 3, 3) and ``r_BL_B`` (..., L, 3), m, of all :attr:`links`.
@@ -371,5 +359,6 @@ class ForwardKinematics:
         return np.concatenate([r_WL[number], quaternion_from_matrix(R_WL[number])])
 
 
-def _transform_at_zero(joint: Joint) -> Array:
-    return np.concatenate([joint.origin.r, quaternion_from_matrix(joint.origin.R)])
+def _transforms_at_zero(joints: Sequence[Joint]) -> Array:
+    poses = [[*joint.origin.r, *quaternion_from_matrix(joint.origin.R)] for joint in joints]
+    return np.array(poses, dtype=float).reshape(-1, 7)

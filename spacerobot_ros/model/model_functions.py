@@ -11,6 +11,7 @@ import pickle
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -85,14 +86,13 @@ class ModelFunctions:
         return _model_of_key(_RobotKey.of(robot, robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
-        """Return a model function by name (one of the keys of ``_builders``).
+        """Return a model function by name, with an argument after a colon for some.
 
         ``compile=False`` returns the symbolic function, for building larger functions.
         """
         kind, _, argument = name.partition(":")
         if name not in self._symbolic:
-            build = self._builders[kind]
-            self._symbolic[name] = build(argument) if argument else build()
+            self._symbolic[name] = self._build(kind, argument)
         # Compiling the large curvature would take longer than its few calls in a plan.
         if not compile or kind == "curvature":
             return self._symbolic[name]
@@ -139,127 +139,101 @@ class ModelFunctions:
                 f"it has {', '.join(self.link_names)}"
             ) from None
 
+    def _build(self, kind: str, argument: str) -> ca.Function:
+        match kind:
+            case "momentum_derivatives":
+                q, *motion = (self._symbols[x] for x in ("q", "omega_WB_B", "qdot", "eta"))
+                results = momentum_derivatives(self._inertia, *motion)
+                return ca.Function(kind, [q, *motion], ca.cse([*results]))
+            case "jacobian":
+                index = self.link_index(argument)
+                J = point_jacobian(self._kin, argument)
+                return self._function_of(f"jacobian_{index}", "q", result=J)
+            case "curvature":
+                return self._curvature()
+            case "shape_equations" | "loaded_shape_equations":
+                return shape_equations(self._kin, loaded=kind.startswith("loaded"))
+            case "velocity_step":
+                step = attitude_step(self.function("locked_inertia", compile=False))
+                return divided_step(f"{kind}_{argument}", step, int(argument))
+            case "loaded_velocity_step":
+                step = runge_kutta_step(servo_rate(self._kin), slice(self.n, self.n + 4))
+                return divided_step(f"{kind}_{argument}", step, int(argument))
+            case "flight_step" | "holding_step" | "loaded_flight_step" | "loaded_holding_step":
+                holding, loaded = "holding" in kind, kind.startswith("loaded")
+                rate = state_rate(self._kin, holding=holding, loaded=loaded)
+                return runge_kutta_step(rate, state_slices(self.n)[1])
+        inputs, outputs = self._closed_form(kind)
+        return self._function_of(kind, inputs, **outputs)
+
+    def _closed_form(self, kind: str) -> tuple[str, dict[str, ca.SX]]:
+        """Return the names of the inputs of a function, and the expressions of its results."""
+        kin, parts, x = self._kin, self._inertia, SimpleNamespace(**self._symbols)
+        R_WB = matrix_from_quaternion(x.quaternion_WB)
+        match kind:
+            case "center_of_mass":
+                return "q", {"result": kin.r_BC_B}
+            case "locked_inertia":
+                return "q", {"result_0": parts.D, "result_1": parts.D_q}
+            case "link_poses":
+                R, r, _ = zip(*map(kin.frame, self.link_names), strict=True)
+                return "q", {"R_BL": ca.horzcat(*R), "r_BL_B": ca.horzcat(*r)}
+            case "inertia_matrix":
+                return "q", {"result": parts.H_plus}
+            case "connection":
+                return "q", {"result": self._connection}
+            case "bias":
+                C_plus = bias(kin, x.v_cm_B, x.omega_WB_B, x.qdot)
+                return "q v_cm_B omega_WB_B qdot", {"C_plus": C_plus}
+            case "forward_dynamics":
+                motion = x.v_cm_B, x.omega_WB_B, x.qdot
+                z0ddot = composite_dynamics(kin, *motion, x.wrench_B, x.tau)
+                return "q v_cm_B omega_WB_B qdot wrench_B tau", {"z0ddot": z0ddot}
+            case "joint_efforts":
+                return "q qdot qddot", {"tau": joint_efforts(kin, x.qdot, x.qddot)}
+            case "servo_efforts" | "loaded_servo_efforts":
+                # The efforts of servos that change the joint rates within ``h``.
+                inputs, loads = "quaternion_WB q before after L_W h", None
+                if kind.startswith("loaded"):
+                    inputs = f"{inputs} r_WC_W loads"
+                    time = x.loads[LoadLayout(len(self.link_names)).time]
+                    place = x.quaternion_WB, x.r_WC_W
+                    loads = external_loads(kin, parts.J, *place, x.loads, time)
+                mean, change = (x.before + x.after) / 2, (x.after - x.before) / x.h
+                return inputs, {"tau": joint_efforts(kin, mean, change, R_WB.T @ x.L_W, loads)}
+            case "momentum":
+                p_B, L_B, energy = momentum_of_bodies(kin, x.v_WB_B, x.omega_WB_B, x.qdot)
+                outputs = {"p_W": R_WB @ p_B, "L_W": R_WB @ L_B, "energy": energy}
+                return "quaternion_WB q v_WB_B omega_WB_B qdot", outputs
+            case "base_twist":
+                v, omega = base_twist(kin, parts, x.qdot, R_WB.T @ x.p_W, R_WB.T @ x.L_W)
+                return "quaternion_WB q qdot p_W L_W", {"v_WB_B": v, "omega_WB_B": omega}
+            case "rotate":
+                return "quaternion_WB vector_B", {"vector_W": R_WB @ x.vector_B}
+            case "total_mass":
+                return "", {"M": kin.total_mass}
+        raise KeyError(kind)
+
     @cached_property
-    def _builders(self) -> dict[str, Callable[..., ca.Function]]:
-        return {
-            "center_of_mass": lambda: self._shape_function("center_of_mass", self._kin.r_BC_B),
-            "locked_inertia": self._locked_inertia,
-            "momentum_derivatives": self._momentum_derivatives,
-            "link_poses": self._link_poses,
-            "inertia_matrix": lambda: self._shape_function("inertia_matrix", self._inertia.H_plus),
-            "bias": self._bias,
-            "forward_dynamics": self._forward_dynamics,
-            "shape_equations": lambda: shape_equations(self._kin),
-            "flight_step": self._flight_step,
-            "holding_step": lambda: self._flight_step(holding=True),
-            "loaded_shape_equations": lambda: shape_equations(self._kin, loaded=True),
-            "loaded_flight_step": lambda: self._flight_step(loaded=True),
-            "loaded_holding_step": lambda: self._flight_step(holding=True, loaded=True),
-            "joint_efforts": self._joint_efforts,
-            "servo_efforts": self._servo_efforts,
-            "loaded_servo_efforts": lambda: self._servo_efforts(loaded=True),
-            "jacobian": self._jacobian,
-            "connection": lambda: self._shape_function("connection", self._connection),
-            "curvature": self._curvature,
-            "momentum": self._momentum,
-            "base_twist": self._base_twist,
-            "rotate": self._rotate,
-            "velocity_step": self._velocity_step,
-            "loaded_velocity_step": self._loaded_velocity_step,
-            "total_mass": self._total_mass,
+    def _symbols(self) -> dict[str, ca.SX]:
+        """Symbols of all inputs by name."""
+        n, loads = self.n, LoadLayout(len(self.link_names)).size
+        sizes = {
+            **dict.fromkeys(("qdot", "qddot", "before", "after", "tau"), n),
+            **dict.fromkeys(("v_cm_B", "v_WB_B", "omega_WB_B", "vector_B", "eta"), 3),
+            **dict.fromkeys(("p_W", "L_W", "r_WC_W"), 3),
+            **{"quaternion_WB": 4, "wrench_B": 6, "h": 1, "loads": loads},
         }
+        return {"q": self._kin.q} | {name: ca.SX.sym(name, size) for name, size in sizes.items()}
 
     @cached_property
     def _connection(self) -> ca.SX:
         return connection(self._kin, self._inertia)
 
-    def _dense_model_function(
-        self, name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]
-    ) -> ca.Function:
-        """Return a function of the model; symbolic mass properties become its last input."""
-        return dense_function(name, inputs | self.mass_inputs, outputs)
-
-    def _shape_function(self, name: str, *outputs: ca.SX) -> ca.Function:
-        names = ["result"] if len(outputs) == 1 else [f"result_{i}" for i in range(len(outputs))]
-        return self._dense_model_function(
-            name, {"q": self._kin.q}, dict(zip(names, outputs, strict=True))
-        )
-
-    def _locked_inertia(self) -> ca.Function:
-        return self._shape_function("locked_inertia", self._inertia.D, self._inertia.D_q)
-
-    def _momentum_derivatives(self) -> ca.Function:
-        symbols = [self._kin.q, *(ca.SX.sym(k, d) for k, d in (("omega", 3), ("qdot", self.n)))]
-        symbols.append(ca.SX.sym("eta", 3))
-        results = momentum_derivatives(self._inertia, *symbols[1:])
-        return ca.Function("momentum_derivatives", symbols, ca.cse([*results]))
-
-    def _link_poses(self) -> ca.Function:
-        frames = [self._kin.frame(link) for link in self.link_names]
-        R = ca.horzcat(*(frame[0] for frame in frames))
-        r = ca.horzcat(*(frame[1] for frame in frames))
-        return self._dense_model_function(
-            "link_poses", {"q": self._kin.q}, {"R_BL": R, "r_BL_B": r}
-        )
-
-    def _state_symbols(self, v: str, *, quaternion: bool = False) -> dict[str, ca.SX]:
-        """Return shape and velocity symbols by name; ``v`` is the name of the linear velocity."""
-        attitude = {"quaternion_WB": ca.SX.sym("quaternion", 4)} if quaternion else {}
-        return {
-            **attitude,
-            "q": self._kin.q,
-            v: ca.SX.sym("v", 3),
-            "omega_WB_B": ca.SX.sym("omega", 3),
-            "qdot": ca.SX.sym("qdot", self.n),
-        }
-
-    def _bias(self) -> ca.Function:
-        state = self._state_symbols("v_cm_B")
-        _, *velocities = state.values()
-        return self._dense_model_function("bias", state, {"C_plus": bias(self._kin, *velocities)})
-
-    def _forward_dynamics(self) -> ca.Function:
-        state = self._state_symbols("v_cm_B")
-        _, *velocities = state.values()
-        forces = {"wrench_B": ca.SX.sym("wrench_B", 6), "tau": ca.SX.sym("tau", self.n)}
-        acceleration = composite_dynamics(self._kin, *velocities, *forces.values())
-        inputs = {**state, **forces}
-        return self._dense_model_function("forward_dynamics", inputs, {"z0ddot": acceleration})
-
-    def _flight_step(self, *, holding: bool = False, loaded: bool = False) -> ca.Function:
-        rate = state_rate(self._kin, holding=holding, loaded=loaded)
-        return runge_kutta_step(rate, attitude=state_slices(self.n)[1])
-
-    def _joint_efforts(self) -> ca.Function:
-        rates = {"qdot": ca.SX.sym("qdot", self.n), "qddot": ca.SX.sym("qddot", self.n)}
-        efforts = joint_efforts(self._kin, *rates.values())
-        return self._dense_model_function(
-            "joint_efforts", {"q": self._kin.q, **rates}, {"tau": efforts}
-        )
-
-    def _servo_efforts(self, *, loaded: bool = False) -> ca.Function:
-        """Return the servo efforts that change the joint rates within ``h``."""
-        n, quaternion = self.n, ca.SX.sym("quaternion", 4)
-        before, after = ca.SX.sym("before", n), ca.SX.sym("after", n)
-        L_W, h = ca.SX.sym("L_W", 3), ca.SX.sym("h")
-        mean, change = (before + after) / 2, (after - before) / h
-        L_B = matrix_from_quaternion(quaternion).T @ L_W
-        inputs = {"quaternion_WB": quaternion, "q": self._kin.q, "before": before, "after": after}
-        inputs |= {"L_W": L_W, "h": h}
-        if not loaded:
-            efforts = joint_efforts(self._kin, mean, change, L_B)
-            return self._dense_model_function("servo_efforts", inputs, {"tau": efforts})
-        layout = LoadLayout(len(self.link_names))
-        r_WC_W, vector = ca.SX.sym("r_WC_W", 3), ca.SX.sym("loads", layout.size)
-        J, time = self._inertia.J, vector[layout.time]
-        loads = external_loads(self._kin, J, quaternion, r_WC_W, vector, time)
-        efforts = joint_efforts(self._kin, mean, change, L_B, loads)
-        inputs |= {"r_WC_W": r_WC_W, "loads": vector}
-        return self._dense_model_function("loaded_servo_efforts", inputs, {"tau": efforts})
-
-    def _jacobian(self, link: str) -> ca.Function:
-        index = self.link_index(link)
-        return self._shape_function(f"jacobian_{index}", point_jacobian(self._kin, link))
+    def _function_of(self, name: str, inputs: str, **outputs: ca.SX) -> ca.Function:
+        """Return a function of named inputs; symbolic mass properties become its last input."""
+        symbols = {each: self._symbols[each] for each in inputs.split()}
+        return dense_function(name, symbols | self.mass_inputs, outputs)
 
     def _curvature(self) -> ca.Function:
         K = curvature(self._connection, self._kin.q)
@@ -269,41 +243,6 @@ class ModelFunctions:
         # It has few common subexpressions, and searching for them takes several times as long.
         names = [*inputs], ["result"]
         return ca.Function("curvature", [*inputs.values()], [ca.densify(stacked)], *names)
-
-    def _momentum(self) -> ca.Function:
-        state = self._state_symbols("v_WB_B", quaternion=True)
-        quaternion, _, *velocities = state.values()
-        R_WB = matrix_from_quaternion(quaternion)
-        p_B, L_B, energy = momentum_of_bodies(self._kin, *velocities)
-        outputs = {"p_W": R_WB @ p_B, "L_W": R_WB @ L_B, "energy": energy}
-        return self._dense_model_function("momentum", state, outputs)
-
-    def _base_twist(self) -> ca.Function:
-        qdot = ca.SX.sym("qdot", self.n)
-        quaternion, p_W, L_W = ca.SX.sym("quaternion", 4), ca.SX.sym("p", 3), ca.SX.sym("L", 3)
-        R_BW = matrix_from_quaternion(quaternion).T
-        v, omega = base_twist(self._kin, self._inertia, qdot, R_BW @ p_W, R_BW @ L_W)
-        inputs = {"quaternion_WB": quaternion, "q": self._kin.q, "qdot": qdot}
-        inputs |= {"p_W": p_W, "L_W": L_W}
-        return self._dense_model_function("base_twist", inputs, {"v_WB_B": v, "omega_WB_B": omega})
-
-    def _rotate(self) -> ca.Function:
-        quaternion, vector = ca.SX.sym("quaternion", 4), ca.SX.sym("vector", 3)
-        rotated = matrix_from_quaternion(quaternion) @ vector
-        inputs = {"quaternion_WB": quaternion, "vector_B": vector}
-        return self._dense_model_function("rotate", inputs, {"vector_W": rotated})
-
-    def _velocity_step(self, substeps: str) -> ca.Function:
-        step = attitude_step(self._locked_inertia())
-        return divided_step(f"velocity_step_{substeps}", step, int(substeps))
-
-    def _loaded_velocity_step(self, substeps: str) -> ca.Function:
-        """Return ``(x, qdot, loads, h) -> x`` of :func:`.servo_rate` in some Runge-Kutta steps."""
-        step = runge_kutta_step(servo_rate(self._kin), attitude=slice(self.n, self.n + 4))
-        return divided_step(f"loaded_velocity_step_{substeps}", step, int(substeps))
-
-    def _total_mass(self) -> ca.Function:
-        return dense_function("total_mass", self.mass_inputs, {"M": self._kin.total_mass})
 
 
 _MAX_SYMBOLIC_MODELS = 8

@@ -60,7 +60,13 @@ class SpaceRobot:
         self.upper = description.limits("upper")
         self.velocity_limit = description.limits("velocity")
         self.effort_limit = description.limits("effort")
-        self._model, self._p = self._chosen_model(build)
+        self._model: ModelFunctions
+        self._p: Array | None
+        if build is None:
+            self._model, self._p = self._numeric_model, None
+        else:
+            self._build = build
+            self._model, self._p = build.model(self.inertial)
         self._buffers: dict[str, BufferedFunction] = {}
         self._compiles = True
         self._require_positive_inertia()
@@ -371,12 +377,6 @@ class SpaceRobot:
     @cached_property
     def _build(self) -> SymbolicModels:
         return SymbolicModels.of(self.description)
-
-    def _chosen_model(self, build: SymbolicModels | None) -> tuple[ModelFunctions, Array | None]:
-        if build is None:
-            return self._numeric_model, None
-        self._build = build
-        return build.model(self.inertial)
 
     @cached_property
     def _numeric_model(self) -> ModelFunctions:

@@ -475,11 +475,6 @@ class ThrusterModulator:
         self.unmet[:] = 0.0
         self.begun[:] = False
 
-    @property
-    def begun_pulse_impulse(self) -> Array:
-        """Impulse (6,) remaining in minimum pulses that have begun, N s, N m s."""
-        return np.asarray(self._wrenches @ self._remaining)
-
     def fire(self, wrench: Array) -> Array:
         """Return the on-time of each thruster (m,) in the next period, s.
 

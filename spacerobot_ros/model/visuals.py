@@ -1,20 +1,20 @@
 """Robot visuals as triangles and sharp edges, for pictures, pages and the viewer.
 
 Colours, cameras and backgrounds are chosen by pictures, pages and the viewer. Meshes come from
-files
-(:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), to which a recorder
-adds the result of :func:`meshes_for_bag`; :class:`MeshFolder` writes them back to files.
+files (:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), to which a
+recorder adds the result of :func:`meshes_for_bag`; :func:`with_attached_meshes` writes them back to
+files.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -263,59 +263,39 @@ def meshes_from_attachments(
     return found
 
 
-class MeshFolder:
-    """A folder with those meshes of a bag that are not on this machine, for programs that read
-    files.
+def with_attached_meshes(urdf: str, attachments: Mapping[str, bytes], folder: Path) -> str:
+    """Return a URDF string in which meshes that exist only in a bag are replaced by files, for
+    programs that read files; other meshes keep their names.
 
     Parameters
     ----------
+    urdf
+        The URDF string.
     attachments
         Bag attachments, as returned by :func:`meshes_for_bag`.
+    folder
+        Folder for the files.
 
     Raises
     ------
     OSError
-        The folder cannot be created.
+        A file cannot be written.
     """
 
-    def __init__(self, attachments: Mapping[str, bytes]) -> None:
-        self._attachments = attachments
-        self._folder = TemporaryDirectory(prefix="spacerobot_")
-        self._files: dict[str, Path | None] = {}
-
-    def urdf_with_mesh_files(self, urdf: str) -> str:
-        """Return the URDF with meshes that exist only in the bag replaced by files in this folder.
-
-        Other meshes keep their names.
-        """
-        return with_mesh_files(urdf, self._mesh_file_of)
-
-    def _mesh_file_of(self, resource: str) -> Path | None:
-        if resource not in self._files:
-            self._files[resource] = self._write_mesh(resource)
-        return self._files[resource]
-
-    def _write_mesh(self, resource: str) -> Path | None:
-        data = self._attachments.get(f"{_ATTACHMENT_PREFIX}{resource}")
+    def write_mesh(resource: str) -> Path | None:
+        data = attachments.get(f"{_ATTACHMENT_PREFIX}{resource}")
         if data is None or mesh_file(resource) is not None:
             return None
+        # Name and bytes are not copied from the bag, which may come from a stranger.
+        path = folder / f"{hashlib.sha256(data).hexdigest()[:32]}.stl"
         try:
-            mesh = mesh_of_stl(data, resource).coarsened(_MAX_FACES_IN_BAG)
+            if not path.is_file():
+                path.write_bytes(stl_of(mesh_of_stl(data, resource).coarsened(_MAX_FACES_IN_BAG)))
         except MeshError:
             return None
-        # Name and bytes are not copied from the bag, which may come from a stranger.
-        path = Path(self._folder.name, f"{len(self._files)}.stl")
-        path.write_bytes(stl_of(mesh))
         return path
 
-    def close(self) -> None:
-        """Remove the folder."""
-        self._folder.cleanup()
-
-
-def has_meshes(attachments: Mapping[str, bytes]) -> bool:
-    """Whether a mesh is attached to a bag."""
-    return any(name.startswith(_ATTACHMENT_PREFIX) for name in attachments)
+    return with_mesh_files(urdf, write_mesh)
 
 
 def _mesh_uris(robot: RobotDescription) -> list[str]:

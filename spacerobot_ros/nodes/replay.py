@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -31,7 +33,7 @@ from spacerobot_ros.errors import (
 )
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
 from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.model.visuals import MeshFolder, has_meshes
+from spacerobot_ros.model.visuals import with_attached_meshes
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
@@ -79,7 +81,7 @@ class ReplayNode(FlightNode):
         self._sends: dict[str, Callable[[bytes], None]] = {}
         self._playing_timers: list[Timer] = []
         self._close_bag: Callable[[], None] = lambda: None
-        self._meshes: MeshFolder | None = None
+        self._mesh_folder: TemporaryDirectory[str] | None = None
         super().__init__(name, **kwargs)
 
     # -- life cycle ---------------------------------------------------------------------------
@@ -104,8 +106,8 @@ class ReplayNode(FlightNode):
         self._close_bag = self._playback.close
         self._outputs: list[Publisher] = []
         self._sends = {}
-        if has_meshes(bag.attachments):
-            self._meshes = MeshFolder(bag.attachments)
+        self._attachments = bag.attachments
+        self._mesh_folder = TemporaryDirectory(prefix="spacerobot_")
         replayed = {topic.name for topic in self._playback.topics}
         self._create_publishers(renamed_topics(config.remap, replayed))
         self._paused = config.paused
@@ -156,9 +158,9 @@ class ReplayNode(FlightNode):
     def cleanup(self) -> None:
         """Close the bag, and remove its mesh files."""
         self._close_bag()
-        meshes, self._meshes = self._meshes, None
-        if meshes is not None:
-            meshes.close()
+        folder, self._mesh_folder = self._mesh_folder, None
+        if folder is not None:
+            folder.cleanup()
 
     def destroy_node(self) -> None:
         """Close the bag and remove its mesh files, in any node state."""
@@ -199,8 +201,9 @@ class ReplayNode(FlightNode):
             self._outputs.append(publisher)
             send: Callable[[bytes], None] = publisher.publish
             described = topic.type_name == _TEXT_TYPE and topic.name.endswith(_DESCRIPTION_TOPIC)
-            if described and self._meshes is not None:
-                send = _with_mesh_files(send, self._meshes)
+            if described and self._mesh_folder is not None:
+                folder = Path(self._mesh_folder.name)
+                send = _with_mesh_files(send, self._attachments, folder)
             self._sends[topic.name] = send
         if not self._outputs and not own_clock:
             raise SpaceRobotError("None of the bag's message types is installed here.")
@@ -347,7 +350,9 @@ class ReplayNode(FlightNode):
         return f"{message.topic} at {message.log_time_ns / SECOND:.9f} s"
 
 
-def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Callable[[bytes], None]:
+def _with_mesh_files(
+    send: Callable[[bytes], None], attachments: Mapping[str, bytes], folder: Path
+) -> Callable[[bytes], None]:
 
     def send_with_files(data: bytes) -> None:
         try:
@@ -355,7 +360,7 @@ def _with_mesh_files(send: Callable[[bytes], None], meshes: MeshFolder) -> Calla
         except RuntimeError:  # A description that cannot be read is replayed unchanged.
             send(data)
             return
-        located = meshes.urdf_with_mesh_files(text)
+        located = with_attached_meshes(text, attachments, folder)
         send(data if located == text else serialize_message(String(data=located)))
 
     return send_with_files

@@ -96,7 +96,7 @@ class RobotDrawing:
         paths = self._node_paths(robot)
         frames: dict[str, Any] = {}
         for pairs, poses in (
-            (kinematics.moving, kinematics.transforms),
+            (kinematics.moving, kinematics.transforms_at(np.zeros(len(robot.joint_names)))),
             (kinematics.fixed, kinematics.fixed_transforms),
         ):
             for (_, child), pose in zip(pairs, poses, strict=True):
@@ -160,8 +160,7 @@ class RobotDrawing:
 
     def set_joint_positions(self, q: Array) -> None:
         """Move the links to joint positions (n,), m or rad."""
-        self._kinematics.update(q)
-        for frame, pose in zip(self._moving, self._kinematics.transforms, strict=True):
+        for frame, pose in zip(self._moving, self._kinematics.transforms_at(q), strict=True):
             frame.position = pose[:3]
             frame.wxyz = wxyz(pose[3:])
 

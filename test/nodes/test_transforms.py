@@ -237,9 +237,9 @@ def test_transforms_have_the_measured_pose_and_shape_and_not_the_true_ones(
         assert r.tolist() == [pose.position.x, pose.position.y, pose.position.z]
         np.testing.assert_allclose(R, matrix_from_quaternion([o.x, o.y, o.z, o.w]), atol=TOLERANCE)
         assert np.linalg.norm(r - [0.4, -0.2, 0.3]) > 1e-3, "that is the true pose"
-        kinematics.update(np.array(joints.position))
         children = (child for _, child in kinematics.moving)
-        places = dict(zip(children, kinematics.transforms, strict=True))
+        transforms = kinematics.transforms_at(np.array(joints.position))
+        places = dict(zip(children, transforms, strict=True))
         for link in links:
             R, r = placed(link.transform)
             place = places[link.child_frame_id]
@@ -347,7 +347,7 @@ def test_a_goal_in_a_frame_of_the_robot_is_one_in_the_world(harness: Harness, fr
     flight.ticks(2)
     base = np.array([*away, *turned])
     links = ForwardKinematics(load_robot(robot_file("sliding_masses")))
-    pose = base if frame != LINK else compose_poses(base, links.transforms[0])
+    pose = base if frame != LINK else compose_poses(base, links.transforms_at(np.zeros(3))[0])
     # The base where it is now, as it looks from the frame, and 3 cm ahead of that.
     there = np.linalg.inv(homogeneous(pose)) @ homogeneous(base)
     there[:3, 3] += 0.03 * there[:3, 0]
