@@ -119,6 +119,9 @@ _KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
 """Keys in the scenario section that require a component of the base pose."""
 
 
+_NO_GOAL = replace(Goal.checked([0, 0, 0], [0, 0, 0, 1]), asked=frozenset())
+
+
 @dataclass(frozen=True)
 class Scenario:
     """The nodes of a flight with their parameters, and the flight's goals.
@@ -143,9 +146,9 @@ class Scenario:
 
     name: str
     path: Path
-    description: str
-    goal: Goal
     in_file: Mapping[str, Mapping[str, Any]]
+    description: str = ""
+    goal: Goal = _NO_GOAL
     end_effector_goal: Goal | None = None
     commanders: tuple[str, ...] = ("planner",)
     published: tuple[Published, ...] = ()
@@ -154,7 +157,7 @@ class Scenario:
     overrides: Mapping[str, Mapping[str, Any]] = field(
         default_factory=lambda: {"plant": {"time_mode": "lockstep"}}
     )
-    has_goal: bool = True
+    has_goal: bool = False
     _configs: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     """Configurations by node, shared by all scenarios with the same parameters."""
 
@@ -638,9 +641,7 @@ def load_scenario(name: str) -> Scenario:
     commanders = tuple(name for name in COMMANDERS if name in in_file) or COMMANDERS[:1]
     plant = in_file.get("plant", {})
     if "scenario" not in content and (plant.get("robot") or plant.get("robot_description")):
-        return replace(
-            _scenario_without_goal(path.stem, path.resolve(), in_file), commanders=commanders
-        )
+        return Scenario(path.stem, path.resolve(), in_file, commanders=commanders)
     if not isinstance(values, dict):
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
@@ -651,21 +652,19 @@ def load_scenario(name: str) -> Scenario:
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
             f"the keys are {', '.join(_SCENARIO_KEYS)}."
         )
+    goal, end_effector_goal = _parse_goals(values, path)
     return Scenario(
         name=path.stem,
         path=path.resolve(),
         description=str(values.get("description", "")),
-        goal=_parse_goal("goal", values, path),
-        end_effector_goal=(
-            _parse_goal("end_effector_goal", values, path)
-            if any(key.startswith("end_effector_goal_") for key in values)
-            else None
-        ),
+        goal=goal,
+        end_effector_goal=end_effector_goal,
         commanders=commanders,
         published=_parse_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
+        has_goal=True,
     )._with_goal_topics()
 
 
@@ -718,30 +717,16 @@ def scenario_or_robot(name: str) -> Scenario:
     path = path if path.is_file() else robot_file(name)
     load_robot(path)  # A file that is not a robot is rejected before the missing goal.
     robot = {"robot": str(path.resolve()) if path == Path(name) else name}
-    return _scenario_without_goal(path.name.split(".")[0], path, _nodes_of(robot))
+    return Scenario(path.name.split(".")[0], path, _nodes_of(robot))
 
 
 def scenario_of(robot: RobotDescription) -> Scenario:
     """Return a scenario without a goal for a robot, like :func:`scenario_or_robot`."""
-    nodes = _nodes_of({"robot_description": robot.urdf})
-    return _scenario_without_goal(robot.name, Path(), nodes)
+    return Scenario(robot.name, Path(), _nodes_of({"robot_description": robot.urdf}))
 
 
 def _nodes_of(robot: dict[str, str]) -> dict[str, dict[str, Any]]:
     return {"plant": robot, "planner": robot}
-
-
-def _scenario_without_goal(
-    name: str, path: Path, in_file: Mapping[str, Mapping[str, Any]]
-) -> Scenario:
-    return Scenario(
-        name=name,
-        path=path,
-        description="",
-        goal=replace(Goal.checked([0, 0, 0], [0, 0, 0, 1]), asked=frozenset()),
-        in_file=in_file,
-        has_goal=False,
-    )
 
 
 def scenario_names() -> list[str]:
@@ -792,35 +777,39 @@ def _parse_published(rows: Any, path: Path) -> tuple[Published, ...]:
         ) from error
 
 
-def _parse_goal(name: str, values: Mapping[str, Any], path: Path) -> Goal:
+def _parse_goals(values: Mapping[str, Any], path: Path) -> tuple[Goal, Goal | None]:
+    """Return the goal and the end-effector goal, if any, of a scenario section."""
     try:
-        position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
-        orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
-        if f"{name}_rotvec" in values:
-            orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
-        shape = values.get(f"{name}_joint_positions")
-        goal = Goal.checked(position, orientation, shape)
-        if name == "goal":
-            parts = (part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values))
-            goal = replace(goal, asked=frozenset(parts))
-            if numbers := values.get("goal_waypoints"):
-                if len(numbers) % 7:
-                    raise GoalError(
-                        f"goal_waypoints has {counted(len(numbers), 'number')}; each pose has 7."
-                    )
-                poses = np.vstack([np.reshape(numbers, (-1, 7)), goal.path_values])
-                goal = replace(goal, waypoints=Goal.through(poses).waypoints, asked=POSE)
-        links = values.get("end_effector_goals", {}) if name == "goal" else {}
-        if not links:
-            return goal
-        if not isinstance(links, Mapping):
-            raise TypeError(f"end_effector_goals must map names to poses, not {links!r}.")
-        of_base = any(f"{name}_{part}" in values for part in ("position", "orientation", "rotvec"))
-        goals = [EndEffectorGoal.of_numbers(str(link), pose) for link, pose in links.items()]
-        hands = Goal.of_end_effectors(goals).end_effectors
-        return replace(goal, end_effectors=hands, base=POSE if of_base else frozenset())
+        goal = _parse_pose("goal", values)
+        asked = frozenset(
+            part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values)
+        )
+        goal = replace(goal, asked=asked)
+        if numbers := values.get("goal_waypoints"):
+            if len(numbers) % 7:
+                raise GoalError(
+                    f"goal_waypoints has {counted(len(numbers), 'number')}; each pose has 7."
+                )
+            poses = np.vstack([np.reshape(numbers, (-1, 7)), goal.path_values])
+            goal = replace(goal, waypoints=Goal.through(poses).waypoints, asked=POSE)
+        if links := values.get("end_effector_goals", {}):
+            if not isinstance(links, Mapping):
+                raise TypeError(f"end_effector_goals must map names to poses, not {links!r}.")
+            goals = [EndEffectorGoal.of_numbers(str(link), pose) for link, pose in links.items()]
+            hands = Goal.of_end_effectors(goals).end_effectors
+            goal = replace(goal, end_effectors=hands, base=POSE if asked else frozenset())
+        has_other = any(key.startswith("end_effector_goal_") for key in values)
+        return goal, _parse_pose("end_effector_goal", values) if has_other else None
     except (GoalError, ValueError, TypeError, AttributeError) as error:
         raise ParameterError(f"The goal in the scenario file {path} is invalid: {error}") from error
+
+
+def _parse_pose(name: str, values: Mapping[str, Any]) -> Goal:
+    position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
+    orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
+    if f"{name}_rotvec" in values:
+        orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
+    return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
 
 
 # -- parameter files and settings --------------------------------------------------------------
