@@ -11,7 +11,8 @@ from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription
 from spacerobot_ros.resources import robot_file, share_directory
-from spacerobot_ros.scenario import load_scenario, read_sections
+from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.scenario_files import read_sections
 from spacerobot_ros.topics import GLOBAL_TOPICS
 
 PACKAGE = "spacerobot_ros"

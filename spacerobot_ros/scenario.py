@@ -1,7 +1,4 @@
-"""Scenarios: ROS parameter files for the nodes of a flight, with a section for the goals.
-
-This module also reads parameter files and command line settings.
-"""
+"""Scenarios: ROS parameter files for the nodes of a flight, with a section for the goals."""
 
 from __future__ import annotations
 
@@ -16,30 +13,20 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig, waypoints_refusal
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.planned_reference import PlannedReference
-from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted, reason
-from spacerobot_ros.files import load_yaml
+from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.model.shared_parameters import (
     DEFAULT_POSITION_TOLERANCE,
     automatic_tolerance,
 )
-from spacerobot_ros.model.urdf import load_world, parse_robot
-from spacerobot_ros.parameters import (
-    Value,
-    as_numbers,
-    configured,
-    declared,
-    is_of_every_node,
-    known_values,
-    values_of,
-)
+from spacerobot_ros.model.urdf import parse_robot
+from spacerobot_ros.parameters import Value, configured, declared, is_of_every_node, values_of
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal
+from spacerobot_ros.planning.core.goal import Controlled, EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.resources import (
@@ -49,75 +36,24 @@ from spacerobot_ros.resources import (
     share_directory,
     suggestion,
 )
-from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.faults import line_refusal, parse_times
-from spacerobot_ros.viewer.server import ViewerConfig
-
-CONFIGS: Mapping[str, type[Any]] = {
-    "plant": PlantConfig,
-    "planner": PlannerConfig,
-    "coordinated_control": ControllerConfig,
-    "recorder": RecorderConfig,
-    "viewer": ViewerConfig,
-}
-"""Configuration class of each configurable node."""
-
-NODES = tuple(CONFIGS)
-
-COMMANDERS = ("planner", "coordinated_control")
-"""Nodes that accept goals; a scenario runs the nodes with a section in its file."""
-
-_GOAL_KEYS = ("goal", "end_effector_goal")
-_SCENARIO_KEYS = (
-    "description",
-    "published",
-    "published_method",
-    "kills",
-    "world",
-    "goal_joint_positions",
-    "goal_waypoints",
-    "end_effector_goals",
-    *(f"{goal}_{part}" for goal in _GOAL_KEYS for part in ("position", "orientation", "rotvec")),
+from spacerobot_ros.scenario_files import COMMANDERS as COMMANDERS
+from spacerobot_ros.scenario_files import CONFIGS as CONFIGS
+from spacerobot_ros.scenario_files import (
+    GOAL_KEYS,
+    KEYS_OF_PARTS,
+    changed_goal,
+    number_in,
+    parse_goals,
+    parse_kills,
+    parse_published,
+    parse_setting,
+    read_scenario,
 )
+from spacerobot_ros.scenario_files import Kill as Kill
+from spacerobot_ros.scenario_files import Published as Published
+from spacerobot_ros.simulation.config import PlantConfig
 
 _LONGEST_TF_PERIOD = 0.1  # wall s
-
-_OTHER_GOAL = "Flown to a goal other than the scenario's"
-
-
-@dataclass(frozen=True)
-class Published:
-    """A published value for this scenario, for comparison with the measured value.
-
-    ``quantity`` is a key in the run summary, or a gait note in the planner's status;
-    ``note`` is a comment on the printed value (a misprint, an integration error).
-    """
-
-    quantity: str
-    printed: list[float]
-    note: str = ""
-
-
-@dataclass(frozen=True)
-class Kill:
-    """A node that is killed at the simulated time ``at``, s, and stays offline until
-    ``until``, s.
-    """
-
-    node: str
-    at: float
-    until: float
-
-
-_POSITION: frozenset[Controlled] = frozenset({"position"})
-_ATTITUDE: frozenset[Controlled] = frozenset({"attitude"})
-
-_KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
-    "position": frozenset({"goal_position"}),
-    "attitude": frozenset({"goal_orientation", "goal_rotvec"}),
-}
-"""Keys in the scenario section that require a component of the base pose."""
-
 
 _NO_GOAL = replace(Goal.checked([0, 0, 0], [0, 0, 0, 1]), asked=frozenset())
 
@@ -208,11 +144,11 @@ class Scenario:
         """Return the automatic position tolerance for a commander's robot, m."""
         named = config if config.robot_description or config.robot else self.plant
         try:
-            text, file = named.robot_description, Path()
-            if not text:
-                file = robot_file(named.robot)
-            return automatic_tolerance(_described(text, file, 0.0 if text else _changed(file)))
-        except (ParameterError, RobotDescriptionError):
+            text = named.robot_description
+            file = Path() if text else robot_file(named.robot)
+            changed = 0.0 if text else file.stat().st_mtime
+            return automatic_tolerance(_described(text, file, changed))
+        except (OSError, ParameterError, RobotDescriptionError):
             return DEFAULT_POSITION_TOLERANCE  # The robot is rejected when it is built.
 
     def _parameters_as_written(self, node: str) -> dict[str, Any]:
@@ -293,7 +229,7 @@ class Scenario:
         return tuple(link or DEFAULT_END_EFFECTOR for link in self.end_effectors)
 
     def _goal_poses(self) -> dict[str, list[float]]:
-        goals = zip(_GOAL_KEYS, (self.goal, self.end_effector_goal), strict=True)
+        goals = zip(GOAL_KEYS, (self.goal, self.end_effector_goal), strict=True)
         poses = {name: goal for name, goal in goals if goal is not None and goal.base}
         return {
             f"{name}_{part}": values.tolist()
@@ -353,8 +289,9 @@ class Scenario:
         kind, node, parameter = "gait method", "planner", "method"
         if method in LAWS:
             kind, node, parameter = "control law", "coordinated_control", "law"
-            if self._is_robot_alone:
-                robot = self.in_file["plant"]
+            robot = self.in_file.get("plant", {})
+            # A robot alone, as scenario_or_robot returns it, has no other parameters.
+            if len(robot) == 1 and self.in_file == _nodes_of(dict(robot)):
                 nodes = {"plant": robot, "coordinated_control": {**robot, "law": method}}
                 return replace(self, in_file=nodes, commanders=(node,), _configs={})
         if node not in self.commanders:
@@ -364,12 +301,6 @@ class Scenario:
                 f"{' and '.join(self.commanders)}."
             )
         return self.with_overrides(node, {parameter: method})
-
-    @property
-    def _is_robot_alone(self) -> bool:
-        """Whether it has no parameters but the robot, as :func:`scenario_or_robot` returns it."""
-        sections = tuple(self.in_file.values())
-        return self.in_file == _nodes_of(dict(sections[0])) and len(sections[0]) == 1
 
     def with_settings(self, texts: Sequence[str]) -> Scenario:
         """Return the scenario with each ``node.parameter=value`` set; see :func:`parse_setting`.
@@ -459,7 +390,8 @@ class Scenario:
 
     def described_for_other_goal(self) -> Scenario:
         """Return the scenario with a description that mentions another goal."""
-        return replace(self, description=self.description and _OTHER_GOAL)
+        other = "Flown to a goal other than the scenario's"
+        return replace(self, description=self.description and other)
 
     def with_end_effectors(
         self, goals: Sequence[EndEffectorGoal], base: frozenset[Controlled] = frozenset()
@@ -513,72 +445,10 @@ class Scenario:
             raise ParameterError(waypoints_refusal(len(waypoints)))
 
 
-def changed_goal(
-    before: Goal,
-    pose: Goal | npt.ArrayLike | None = None,
-    position: npt.ArrayLike | None = None,
-    rotvec: npt.ArrayLike | None = None,
-    rpy_deg: npt.ArrayLike | None = None,
-) -> Goal:
-    """Return a goal for the base, with the remaining parts of another goal.
-
-    Parameters
-    ----------
-    before
-        The other goal; its end-effector goals and waypoints are dropped.
-    pose
-        A goal, a pose (7,) or a position (3,), m.
-    position, rotvec, rpy_deg
-        Position (3,), m, and attitude (3,) as a rotation vector (rad), or as roll, pitch and yaw
-        about fixed axes (deg); they override ``pose``.
-
-    Raises
-    ------
-    GoalError
-        The pose or the attitude is not finite, or the attitude is given twice.
-    """
-    if rotvec is not None and rpy_deg is not None:
-        raise GoalError("The goal attitude is given twice, in radians and in degrees.")
-    made = replace(before, end_effectors=(), base=POSE, waypoints=None)
-    if isinstance(pose, Goal):
-        made = pose
-    elif pose is not None:
-        numbers = as_numbers(pose, "The goal", GoalError).reshape(-1)
-        if len(numbers) not in (3, 7):
-            raise GoalError(
-                "A goal must have 3 numbers (position) or 7 (position and quaternion), not "
-                f"{len(numbers)}."
-            )
-        whole = len(numbers) == 7
-        given = Goal.checked(numbers[:3], numbers[3:] if whole else before.quaternion)
-        asked = POSE if whole else before.asked | _POSITION
-        made = replace(made, position=given.position, quaternion=given.quaternion, asked=asked)
-    if position is not None:
-        place = as_numbers(position, "The position", GoalError).reshape(-1)
-        given = Goal.checked(place, made.quaternion)
-        made = replace(made, position=given.position, asked=made.asked | _POSITION)
-    if rotvec is not None:
-        turn = as_numbers(rotvec, "The rotvec", GoalError).reshape(-1)
-        given = Goal.from_rotvec(made.position, turn.tolist())
-    elif rpy_deg is not None:
-        given = Goal.from_rpy(made.position, rpy_deg)
-    else:
-        return made
-    return replace(made, quaternion=given.quaternion, asked=made.asked | _ATTITUDE)
-
-
 @lru_cache(maxsize=64)
 def _described(text: str, file: Path, changed: float) -> RobotDescription:
     """Return the robot in a URDF string, or in a file with the modification time ``changed``."""
     return parse_robot(text) if text else load_robot(file)
-
-
-def _changed(file: Path) -> float:
-    """Return the modification time of a file; 0: it cannot be read."""
-    try:
-        return file.stat().st_mtime
-    except OSError:
-        return 0.0
 
 
 def scenario_text(scenario: Scenario) -> str:
@@ -586,7 +456,7 @@ def scenario_text(scenario: Scenario) -> str:
     values and node kills.
     """
     about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
-    for part, keys in _KEYS_OF_PARTS.items():
+    for part, keys in KEYS_OF_PARTS.items():
         if part not in scenario.goal.asked:
             about = {key: value for key, value in about.items() if key not in keys}
     if scenario.goal.end_effectors:
@@ -634,25 +504,11 @@ def load_scenario(name: str) -> Scenario:
             f"There is no scenario '{name}'; there are: {', '.join(known)}, or any YAML file."
             f"{suggestion(name, [*known, *robots])}"
         )
-    content = _read_content(path)
-    section = content.get("scenario")
-    values = section.get("ros__parameters") if isinstance(section, dict) else None
-    in_file = _sections(content, path)
+    in_file, values = read_scenario(path)
     commanders = tuple(name for name in COMMANDERS if name in in_file) or COMMANDERS[:1]
-    plant = in_file.get("plant", {})
-    if "scenario" not in content and (plant.get("robot") or plant.get("robot_description")):
+    if values is None:
         return Scenario(path.stem, path.resolve(), in_file, commanders=commanders)
-    if not isinstance(values, dict):
-        raise ParameterError(
-            f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
-        )
-    unknown = sorted(set(map(str, values)) - set(_SCENARIO_KEYS))
-    if unknown:
-        raise ParameterError(
-            f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
-            f"the keys are {', '.join(_SCENARIO_KEYS)}."
-        )
-    goal, end_effector_goal = _parse_goals(values, path)
+    goal, end_effector_goal = parse_goals(values, path)
     return Scenario(
         name=path.stem,
         path=path.resolve(),
@@ -660,40 +516,12 @@ def load_scenario(name: str) -> Scenario:
         goal=goal,
         end_effector_goal=end_effector_goal,
         commanders=commanders,
-        published=_parse_published(values.get("published", {}), path),
+        published=parse_published(values.get("published", {}), path),
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
         has_goal=True,
     )._with_goal_topics()
-
-
-def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a scenario file, with full paths for files next to it."""
-    beside = {
-        name: str((path.parent / file).resolve())
-        for name in ("robot", "world", "target.robot", "srdf", "thrusters")
-        if isinstance(file := values.get(name), str)
-        and (is_path(file) or name in ("srdf", "thrusters"))
-        and (path.parent / file).is_file()
-    }
-    return {**values, **beside}
-
-
-def _with_world(
-    in_file: dict[str, dict[str, Any]], world: str, path: Path
-) -> dict[str, dict[str, Any]]:
-    """Return a scenario file's parameters, with its obstacles for the plant and the planner."""
-    try:
-        file = (path.parent / world).resolve()
-        load_world(file)
-    except RobotDescriptionError as error:
-        raise ParameterError(f"The world in the scenario file {path} is invalid: {error}") from None
-    return in_file | {
-        node: {"world": str(file), **in_file[node]}
-        for node in ("plant", "planner")
-        if node in in_file
-    }
 
 
 def scenario_or_robot(name: str) -> Scenario:
@@ -735,102 +563,6 @@ def scenario_names() -> list[str]:
     return [*resource_names("config", ".yaml"), *(f"faults/{name}" for name in faults)]
 
 
-def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
-    """Parse kills from lines ``NODE at SECONDS [until SECONDS]``, sorted by time.
-
-    Raises
-    ------
-    ParameterError
-        A line has a different format, its node cannot be killed, or its times are not in ascending
-        order.
-    """
-    if not isinstance(lines, list):
-        raise ParameterError(
-            f"'kills' in {where} is {lines!r}, not a list of lines NODE at SECONDS."
-        )
-    return tuple(sorted((_parse_kill(line, where) for line in lines), key=lambda k: k.at))
-
-
-def _parse_kill(line: object, where: str) -> Kill:
-    refusal = line_refusal(str(line), f"kill in {where}")
-    node, *words = str(line).split() or [""]
-    if node not in ("plant", *COMMANDERS):
-        raise refusal(f"its node is one of {', '.join(('plant', *COMMANDERS))}")
-    if words[:1] != ["at"]:
-        raise refusal("it must be NODE at SECONDS [until SECONDS]")
-    at, until = parse_times(words, node, 0.0, refusal)
-    if at < 0.0:
-        raise refusal(f"it is at {at:g} s, before the start of the flight")
-    return Kill(node, at, until)
-
-
-def _parse_published(rows: Any, path: Path) -> tuple[Published, ...]:
-    try:
-        return tuple(
-            Published(quantity, [float(x) for x in row["printed"]], str(row.get("note", "")))
-            for quantity, row in rows.items()
-        )
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ParameterError(
-            f"The section 'published' in the scenario file {path} is not "
-            f"quantity: {{printed: [numbers], note: text}}: {error!r}."
-        ) from error
-
-
-def _parse_goals(values: Mapping[str, Any], path: Path) -> tuple[Goal, Goal | None]:
-    """Return the goal and the end-effector goal, if any, of a scenario section."""
-    try:
-        goal = _parse_pose("goal", values)
-        asked = frozenset(
-            part for part, keys in _KEYS_OF_PARTS.items() if not keys.isdisjoint(values)
-        )
-        goal = replace(goal, asked=asked)
-        if numbers := values.get("goal_waypoints"):
-            if len(numbers) % 7:
-                raise GoalError(
-                    f"goal_waypoints has {counted(len(numbers), 'number')}; each pose has 7."
-                )
-            poses = np.vstack([np.reshape(numbers, (-1, 7)), goal.path_values])
-            goal = replace(goal, waypoints=Goal.through(poses).waypoints, asked=POSE)
-        if links := values.get("end_effector_goals", {}):
-            if not isinstance(links, Mapping):
-                raise TypeError(f"end_effector_goals must map names to poses, not {links!r}.")
-            goals = [EndEffectorGoal.of_numbers(str(link), pose) for link, pose in links.items()]
-            hands = Goal.of_end_effectors(goals).end_effectors
-            goal = replace(goal, end_effectors=hands, base=POSE if asked else frozenset())
-        has_other = any(key.startswith("end_effector_goal_") for key in values)
-        return goal, _parse_pose("end_effector_goal", values) if has_other else None
-    except (GoalError, ValueError, TypeError, AttributeError) as error:
-        raise ParameterError(f"The goal in the scenario file {path} is invalid: {error}") from error
-
-
-def _parse_pose(name: str, values: Mapping[str, Any]) -> Goal:
-    position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
-    orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
-    if f"{name}_rotvec" in values:
-        orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
-    return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))
-
-
-# -- parameter files and settings --------------------------------------------------------------
-
-
-def read_sections(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters in a parameter file, by node and full name.
-
-    A section applies to a node in any namespace (``/**/plant``), in one namespace
-    (``/robot_1/plant``), in no namespace (``plant``), or to all nodes (``/**``). If two sections
-    set the same parameter, the later one takes precedence. A section for all nodes has the lowest
-    precedence.
-
-    Raises
-    ------
-    ParameterError
-        The file cannot be read, or a section has no ``ros__parameters`` that contains parameters.
-    """
-    return _sections(_read_content(path), path)
-
-
 def different_parameters(scenarios: Sequence[Scenario]) -> list[tuple[str, ...]]:
     """Return each parameter that differs between the scenarios, with its unit and values.
 
@@ -861,86 +593,3 @@ def _value_text(value: Any) -> str:
         case int() | float():
             return f"{value:.9g}"
     return str(value)
-
-
-def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any]]:
-    in_file = {
-        node: _with_files_beside(path, parameters)
-        for node, parameters in _parameters_by_node(content, path).items()
-    }
-    section = content.get("scenario")
-    values = section.get("ros__parameters") if isinstance(section, dict) else None
-    world = values.get("world") if isinstance(values, dict) else None
-    return in_file if world is None else _with_world(in_file, str(world), path)
-
-
-def _read_content(path: Path) -> dict[Any, Any]:
-    """Return the content of a parameter file; empty if the file is not a mapping."""
-    try:
-        content = load_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ParameterError(
-            f"The scenario file {path} cannot be read: {reason(error)}."
-        ) from error
-    return content if isinstance(content, dict) else {}
-
-
-def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
-    by_node: dict[str, dict[str, Any]] = {}
-    of_all_nodes: dict[str, Any] = {}
-    for key, section in content.items():
-        node = str(key).rpartition("/")[2]
-        if node not in (*NODES, "**"):
-            continue
-        section = {} if section is None else section
-        values = section.get("ros__parameters", {}) if isinstance(section, dict) else None
-        if not isinstance(values, dict):
-            raise ParameterError(
-                f"The section '{key}' of the scenario file {path} is not 'ros__parameters:' with "
-                f"parameters under it."
-            )
-        chosen = of_all_nodes if node == "**" else by_node.setdefault(node, {})
-        chosen.update(_flatten_section(values))
-    for node, values in by_node.items():
-        by_node[node] = {**known_values(CONFIGS[node], of_all_nodes), **values}
-    return by_node
-
-
-def parse_setting(text: str) -> tuple[str, str, Any]:
-    """Split ``node.parameter=value``; the value is read as YAML.
-
-    Raises
-    ------
-    ParameterError
-        The string has a different format, or does not name a node.
-    """
-    key, equals, value = text.partition("=")
-    node, dot, name = key.strip().partition(".")
-    if not equals or not dot or node not in NODES or not name:
-        raise ParameterError(
-            f"'{text}' is not node.parameter=value with one of the nodes {', '.join(NODES)}."
-        )
-    try:
-        parsed = load_yaml(value)
-    except ValueError:
-        raise ParameterError(f"The value in '{text}' cannot be read.") from None
-    return node, name, number_in(parsed) if isinstance(parsed, str) else parsed
-
-
-def number_in(text: str) -> float | str:
-    """Convert a string to a number if possible; unlike in YAML, 1e-3 is a number."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _flatten_section(section: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return parameters by full name; a mapping within a section is a parameter group."""
-    flat: dict[str, Any] = {}
-    for key, value in section.items():
-        if isinstance(value, dict):
-            flat |= _flatten_section(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat

@@ -16,7 +16,8 @@ from spacerobot_ros.errors import ParameterError, reason
 from spacerobot_ros.files import read_regular
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import suggestion
-from spacerobot_ros.scenario import Scenario, number_in
+from spacerobot_ros.scenario import Scenario
+from spacerobot_ros.scenario_files import number_in
 
 _TABLE, _CORRELATED = "table", "multivariate_normal"
 

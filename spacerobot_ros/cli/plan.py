@@ -93,7 +93,8 @@ def plan_command(
     from spacerobot_ros.planning.core.goal import missed_parts, reached_message
     from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
     from spacerobot_ros.planning.execution.status import describe_remaining_error
-    from spacerobot_ros.scenario import parse_setting, scenario_or_robot
+    from spacerobot_ros.scenario import scenario_or_robot
+    from spacerobot_ros.scenario_files import parse_setting
 
     for text in settings:
         node, _, _ = parse_setting(text)

@@ -28,12 +28,12 @@ from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.resources import resource_names
 from spacerobot_ros.scenario import (
     Scenario,
-    changed_goal,
     load_scenario,
     scenario_names,
     scenario_of,
     scenario_or_robot,
 )
+from spacerobot_ros.scenario_files import changed_goal
 
 _ORIGIN = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 """The default base pose."""

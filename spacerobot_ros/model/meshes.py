@@ -18,6 +18,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -197,16 +198,8 @@ def read_mesh(path: str | Path) -> TriangleMesh:
         data = read_regular(path)
     except OSError as error:
         raise MeshError(f"The mesh {path} cannot be read: {reason(error)}.") from error
-    try:
-        if suffix == ".stl":
-            mesh = _read_stl(data)
-        elif suffix == ".obj":
-            mesh = _read_obj(data)
-        else:
-            mesh = _read_by_trimesh(path, data)
-        return _require_sound_mesh(mesh)
-    except (_DamagedError, *_PARSE_ERRORS) as error:
-        raise _mesh_error(str(path), error) from error
+    readers = {".stl": _read_stl, ".obj": _read_obj}
+    return _sound_mesh(readers.get(suffix, partial(_read_by_trimesh, path)), data, str(path))
 
 
 def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
@@ -217,10 +210,7 @@ def mesh_of_stl(data: bytes, name: str) -> TriangleMesh:
     MeshError
         The mesh is damaged or too large; the message refers to it by ``name``.
     """
-    try:
-        return _require_sound_mesh(_read_stl(data))
-    except (_DamagedError, *_PARSE_ERRORS) as error:
-        raise _mesh_error(name, error) from error
+    return _sound_mesh(_read_stl, data, name)
 
 
 def stl_of(mesh: TriangleMesh) -> bytes:
@@ -239,17 +229,19 @@ class _DamagedError(Exception):
     """The content of a mesh file is damaged; the text is a clause."""
 
 
-_PARSE_ERRORS = (ValueError, IndexError, OverflowError)
+def _sound_mesh(read: Callable[[bytes], TriangleMesh], data: bytes, name: str) -> TriangleMesh:
+    """Read a mesh without faces of zero area; reject invalid coordinates and indices."""
+    try:
+        return _without_flaws(read(data))
+    except _DamagedError as error:
+        raise MeshError(f"The mesh {name} cannot be read: {error}.") from error
+    except (ValueError, IndexError, OverflowError) as error:
+        # The text of a parse error would quote the file.
+        why = "a coordinate or index is not a number"
+        raise MeshError(f"The mesh {name} cannot be read: {why}.") from error
 
 
-def _mesh_error(name: str, error: Exception) -> MeshError:
-    # The text of a parse error would quote the file.
-    why = error if isinstance(error, _DamagedError) else "a coordinate or index is not a number"
-    return MeshError(f"The mesh {name} cannot be read: {why}.")
-
-
-def _require_sound_mesh(mesh: TriangleMesh) -> TriangleMesh:
-    """Return a mesh without faces of zero area; reject invalid coordinates and indices."""
+def _without_flaws(mesh: TriangleMesh) -> TriangleMesh:
     vertices, faces = mesh.vertices, mesh.faces
     if len(faces) > _MAX_TRIANGLES:
         raise _DamagedError(f"it has {len(faces)} triangles, and at most {_MAX_TRIANGLES} are read")

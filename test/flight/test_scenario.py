@@ -22,19 +22,21 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import (
     CONFIGS,
-    NODES,
     Kill,
     Scenario,
     different_parameters,
     load_scenario,
-    number_in,
-    parse_kills,
-    parse_setting,
-    read_sections,
     scenario_names,
     scenario_of,
     scenario_or_robot,
     scenario_text,
+)
+from spacerobot_ros.scenario_files import (
+    NODES,
+    number_in,
+    parse_kills,
+    parse_setting,
+    read_sections,
 )
 
 

@@ -41,7 +41,8 @@ from spacerobot_ros.nodes.common.node import AUTOSTART, FlightNode
 from spacerobot_ros.parameters import Parameter, declared
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import resource_names, robot_file, share_directory
-from spacerobot_ros.scenario import NODES, Scenario, load_scenario, parse_setting
+from spacerobot_ros.scenario import Scenario, load_scenario
+from spacerobot_ros.scenario_files import NODES, parse_setting
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import (

@@ -28,7 +28,7 @@ from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.scenario import read_sections
+from spacerobot_ros.scenario_files import read_sections
 
 SLIDERS = ["slider_1", "slider_2", "slider_3"]
 VELOCITY = {

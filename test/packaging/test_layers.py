@@ -26,7 +26,8 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("session",),
         ("nodes",),
         ("flight",),  # above the bag and the plant, beside no ROS
-        ("scenario",),  # the configurations of all nodes
+        ("scenario",),
+        ("scenario_files",),  # the configurations of all nodes
         ("commanding",),  # commanders without ROS: of flights, and of nodes
         ("batch",),
         ("viewer",),

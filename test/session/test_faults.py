@@ -23,7 +23,8 @@ from spacerobot_ros.bag.salvage import salvage_bag
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.scenario import load_scenario, parse_kills
+from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.scenario_files import parse_kills
 from spacerobot_ros.session.child import end_message
 from spacerobot_ros.session.processes import KillTimeline
 from spacerobot_ros.session.run import run_scenario
