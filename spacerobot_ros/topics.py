@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 _POSE_MEMBERS = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
 _TWIST_MEMBERS = (*(f"linear.{x}" for x in "xyz"), *(f"angular.{x}" for x in "xyz"))
@@ -119,7 +120,6 @@ def _odometry(prefix: str) -> tuple[StateField, ...]:
     )
 
 
-_PUBLISHED_BY_USER = ("user",)
 _ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
 _JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
 _ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
@@ -130,6 +130,15 @@ _STRING_TYPE = "std_msgs/msg/String"
 _TRANSFORMS_TYPE = "tf2_msgs/msg/TFMessage"
 _TWIST_STAMPED_TYPE = "geometry_msgs/msg/TwistStamped"
 _WRENCH_STAMPED_TYPE = "geometry_msgs/msg/WrenchStamped"
+
+
+def _from_user(name: str, type: str, meaning: str, **options: Any) -> Topic:
+    return Topic(name, type, meaning, ("user",), **options)
+
+
+def _status(name: str, meaning: str, publisher: str = "plant", **options: Any) -> Topic:
+    return Topic(name, _STATUS_TYPE, meaning, (publisher,), latched=True, **options)
+
 
 # The plant publishes its state in this order: the clock first, so that a subscriber that sees a
 # state has seen its time; odom and joint_states late, because they trigger the commanders.
@@ -281,24 +290,17 @@ _TOPIC_TABLE = (
         "`obstacle` if `second` is an obstacle",
         condition="robot links could touch",
     ),
-    Topic(
-        "fault_injection",
-        _STRING_TYPE,
-        "faults for the plant, one per line, or `clear`",
-        _PUBLISHED_BY_USER,
-    ),
-    Topic(
+    _from_user("fault_injection", _STRING_TYPE, "faults for the plant, one per line, or `clear`"),
+    _from_user(
         "disturbance_injection",
         _STRING_TYPE,
         "disturbances for the plant, one per line, or `clear`",
-        _PUBLISHED_BY_USER,
     ),
-    Topic(
+    _from_user(
         "obstacles",
         _STRING_TYPE,
         "URDF of all fixed obstacles, for the planner, a controller that plans, the plant and "
         "viewers; each message replaces all previous obstacles; an empty string removes them",
-        _PUBLISHED_BY_USER,
         latched=True,
     ),
     Topic(
@@ -314,49 +316,42 @@ _TOPIC_TABLE = (
         "commanded thruster force and torque at the base link origin, in the base link frame",
         ("coordinated_control",),
     ),
-    Topic(
+    _from_user(
         "goal_pose",
         _POSE_STAMPED_TYPE,
         "base goal pose in the world; NaN means any position or any attitude",
-        _PUBLISHED_BY_USER,
     ),
-    Topic(
+    _from_user(
         "goal_path",
         _PATH_TYPE,
         "base poses in the world for a controller with `profile: planned`, which brings the robot "
         "to rest at each of them; the last pose is the goal",
-        _PUBLISHED_BY_USER,
     ),
-    Topic(
+    _from_user(
         "goal_joint_states",
         _JOINT_STATE_TYPE,
         "final joint positions for later goals; a message without joints allows any positions",
-        _PUBLISHED_BY_USER,
     ),
-    Topic(
+    _from_user(
         "end_effector/goal_pose",
         _POSE_STAMPED_TYPE,
         "end-effector goal pose in the world; also `NAME/goal_pose` for links in the planner's "
         "`end_effectors`. For the planner, an all-zero orientation means any attitude, and poses "
         "with the same stamp, including the base pose, form one goal",
-        _PUBLISHED_BY_USER,
     ),
-    Topic(
+    _from_user(
         "end_effector/twist",
         _TWIST_STAMPED_TYPE,
         "commanded end-effector twist in the frame in its header: the world, the base link or the "
         "end-effector; also `NAME/twist` for links in the planner's `end_effectors`. The joints "
         "brake if no twist arrives for `twist_timeout`",
-        _PUBLISHED_BY_USER,
     ),
-    Topic(
+    _from_user(
         "end_effector/path",
         _PATH_TYPE,
         "end-effector path in the world, which is straight from pose to pose; the last pose is "
-        "the goal, "
-        "and the base is free; also `NAME/path` for links in the planner's `end_effectors`. "
-        "If all orientations are zero, any attitude is accepted",
-        _PUBLISHED_BY_USER,
+        "the goal, and the base is free; also `NAME/path` for links in the planner's "
+        "`end_effectors`. If all orientations are zero, any attitude is accepted",
     ),
     Topic(
         "joint_reference",
@@ -365,11 +360,10 @@ _TOPIC_TABLE = (
         ("planner",),
         condition="`output` is reference",
     ),
-    Topic(
+    _from_user(
         "base_reference",
         _ODOMETRY_TYPE,
         "moving base reference for coordinated control, one message per state",
-        _PUBLISHED_BY_USER,
     ),
     Topic(
         "gait_schedule",
@@ -385,42 +379,29 @@ _TOPIC_TABLE = (
         ("planner", "coordinated_control"),
         latched=True,
     ),
-    Topic(
+    _status(
         "plant/status",
-        _STATUS_TYPE,
         "plant state, reason, active injected faults, and the held `payload`, on every change; "
         "`state` is inactive, running, resting, paused, latched or failed",
-        latched=True,
     ),
-    Topic(
-        "planner/status",
-        _STATUS_TYPE,
-        "planner state, reason, goal and remaining error",
-        ("planner",),
-        latched=True,
-    ),
-    Topic(
+    _status("planner/status", "planner state, reason, goal and remaining error", "planner"),
+    _status(
         "controller/status",
-        _STATUS_TYPE,
         "controller state, reason, goal, expected arrival (`ends_at_s`), errors, and saturation "
         "losses",
-        ("coordinated_control",),
-        latched=True,
+        "coordinated_control",
     ),
-    Topic(
+    _status(
         "replay/status",
-        _STATUS_TYPE,
         "replay status: `state` (playing, paused or ended), `position_s` from the beginning, "
         "`duration_s` and `rate`; on every change, and five times per second",
-        ("replay",),
+        "replay",
         condition="a bag is replayed",
-        latched=True,
     ),
-    Topic(
+    _from_user(
         "replay/seek",
         "std_msgs/msg/Float64",
         "time at which a replay continues, s after the beginning of the bag",
-        _PUBLISHED_BY_USER,
         condition="a bag is replayed",
     ),
     Topic(
