@@ -151,7 +151,9 @@ def estimate_payload(
     unit = mass * np.array([1.0, *[radius] * 3, *[radius**2] * 6])
     rows = np.concatenate([regressors * unit, -known[..., np.newaxis]], axis=-1)
     modes = dct(rows.mean(axis=1), axis=0, norm="ortho")[1:]
-    errors = _errors_of_means(rows)
+    usual = _usual_differences(rows)
+    # Covariances (6, 11, 11) of the errors in means of triples, by component.
+    errors = np.einsum("tci,tcj->cij", usual, usual) / (3 * len(usual))
     rows = rows - rows.mean(axis=(0, 1))
     least = _ROUNDING * max(np.abs(known).max(initial=0.0), float(np.finfo(float).tiny))
     weights = np.array([1.0] * 3 + [1.0 / radius] * 3)
@@ -222,12 +224,6 @@ def _usual_differences(rows: Array) -> Array:
     differences = (rows[:, 0] - 2.0 * rows[:, 1] + rows[:, 2]) / np.sqrt(6.0)
     size = np.linalg.norm(differences, axis=(1, 2))
     return np.asarray(differences[size <= _MIN_JERK_RATIO * np.median(size)])
-
-
-def _errors_of_means(rows: Array) -> Array:
-    """Return the covariances (6, 11, 11) of the errors in means of triples, by component."""
-    usual = _usual_differences(rows)
-    return np.einsum("tci,tcj->cij", usual, usual) / (3 * len(usual))
 
 
 def _weighted_by_modes(fit: _Fit, modes: Array, errors: Array, least: float) -> _Fit:

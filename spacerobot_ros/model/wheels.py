@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import Proof, RobotDescriptionError, UnreachableError
-from spacerobot_ros.model.description import Array, Body, JointKind, RobotDescription
+from spacerobot_ros.model.description import Array, Body, Joint, JointKind, RobotDescription
 
 _MAX_OFFSET = 1e-4  # m, of the centre of mass from the axis
 
@@ -65,17 +65,16 @@ class ReactionWheels:
     @classmethod
     def of(cls, description: RobotDescription) -> ReactionWheels:
         """Return the wheels of a robot, possibly none."""
-        names = description.wheel_names
         joints = list(description.joint_names)
-        index = np.array([joints.index(name) for name in names], dtype=np.int64)
-        wheels = [_wheel_of(description, name) for name in names]
+        wheels = _wheels_of(description)
+        index = np.array([joints.index(joint.name) for _, joint in wheels], dtype=np.int64)
         return cls(
             description,
-            names,
+            description.wheel_names,
             index,
             np.setdiff1d(np.arange(len(joints)), index),
-            np.array([body.origin.R @ axis for body, axis in wheels]).reshape(-1, 3).T,
-            np.array([_spin_inertia(*wheel) for wheel in wheels]),
+            np.array([body.origin.R @ joint.axis for body, joint in wheels]).reshape(-1, 3).T,
+            np.array([_spin_inertia(body, joint.axis) for body, joint in wheels]),
             description.limits("velocity")[index],
             description.limits("effort")[index],
         )
@@ -154,10 +153,10 @@ class ReactionWheels:
         base, without moments of inertia about their axes.
         """
         links = {link.name: link for link in self.description.links}
-        for name, moment in zip(self.names, self.inertia, strict=True):
-            body, axis = _wheel_of(self.description, name)
+        wheels = _wheels_of(self.description)
+        for (body, joint), moment in zip(wheels, self.inertia, strict=True):
             link = links[body.name]
-            about = link.inertia.about_com - moment * np.outer(axis, axis)
+            about = link.inertia.about_com - moment * np.outer(joint.axis, joint.axis)
             links[body.name] = replace(link, inertia=replace(link.inertia, about_com=about))
         return self.description.with_links(tuple(links.values())).with_locked(
             dict.fromkeys(self.names, 0.0)
@@ -174,11 +173,7 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
     """
     followed = {joint.mimic.joint for joint in robot.moving_joints if joint.mimic is not None}
     parents = {body.parent for body in robot.bodies}
-    for number, body in enumerate(robot.bodies):
-        joint = body.joint
-        if joint is None or not joint.wheel:
-            continue
-        flaw = ""
+    for body, joint in _wheels_of(robot):
         if joint.kind is not JointKind.CONTINUOUS:
             flaw = f'is {joint.kind.value}: give it type="continuous"'
         elif joint.mimic is not None or joint.name in followed:
@@ -188,7 +183,7 @@ def require_reaction_wheels(robot: RobotDescription) -> None:
                 f"is on link '{robot.bodies[body.parent].name}', which moves: a reaction wheel "
                 "must be on the base; without <wheel> it is an ordinary joint"
             )
-        elif number in parents:
+        elif robot.frames[body.name][0] in parents:
             flaw = "carries a joint: a reaction wheel cannot carry joints"
         elif not (0 < joint.limits.velocity < np.inf and 0 < joint.limits.effort < np.inf):
             flaw = (
@@ -221,9 +216,10 @@ def _imbalance_clause(body: Body, axis: Array) -> str:
     return ""
 
 
-def _wheel_of(robot: RobotDescription, joint: str) -> tuple[Body, Array]:
-    """Return a wheel and its axis (3,) in its frame."""
-    return next((b, b.joint.axis) for b in robot.bodies if b.joint and b.joint.name == joint)
+def _wheels_of(robot: RobotDescription) -> list[tuple[Body, Joint]]:
+    """Return the wheels and their joints, in coordinate order."""
+    joints = [(body, body.joint) for body in robot.bodies]
+    return [(body, joint) for body, joint in joints if joint is not None and joint.wheel]
 
 
 def _spin_inertia(body: Body, axis: Array) -> float:
