@@ -20,10 +20,10 @@ from support.urdf_text import without_collisions
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair
 from spacerobot_ros.collision.distances import EnclosureDistances
-from spacerobot_ros.collision.planes import PlaneDistance
+from spacerobot_ros.collision.planes import PlaneDistances
 from spacerobot_ros.errors import PlanningError, RobotDescriptionError
 from spacerobot_ros.files import warn_first_time
-from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
+from spacerobot_ros.model import load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.urdf import obstacles_from_topic, with_srdf
 from spacerobot_ros.model.visuals import solid_mesh
@@ -427,11 +427,6 @@ def y_of(q: Array) -> Array:
     return np.concatenate([q, [0.0, 0.0, 0.0, 1.0]])
 
 
-def rows_of(geometry: CollisionGeometry, pair: int) -> PlaneDistance:
-    center_of_mass = SpaceRobot(geometry.robot).function("center_of_mass", compile=False)
-    return PlaneDistance.of(geometry, pair, center_of_mass)
-
-
 def some_pairs(geometry: CollisionGeometry) -> list[int]:
     return list(range(0, len(geometry.pairs), 1 + len(geometry.pairs) // 5))
 
@@ -445,7 +440,7 @@ def test_a_row_is_the_distance_where_its_plane_is_made(name: str, enclosures: bo
     at, contacts = shapes(geometry, 120), 0
     poses = geometry.poses(at)
     for pair in some_pairs(geometry):
-        row = rows_of(geometry, pair)
+        row = PlaneDistances.of(geometry, [pair])
         distances, planes = geometry.planes(pair, poses)
         exact = geometry.distances(pair, poses)
         contacts += int((exact < 0).sum())
@@ -463,10 +458,10 @@ def test_a_row_changes_as_the_distance_does(name: str) -> None:
     geometry = CollisionGeometry(load_robot(robot_file(name)))
     at, step, compared = shapes(geometry, 12), 1e-5, 0
     for pair in some_pairs(geometry):
-        row = rows_of(geometry, pair)
+        row = PlaneDistances.of(geometry, [pair])
         distances, planes = geometry.planes(pair, geometry.poses(at))
         for q, d, plane in zip(at, distances, planes, strict=True):
-            J = row.jacobian(y_of(q), plane).full()[0, : len(q)]
+            J = row.jacobian(y_of(q), plane)[1].full()[0, : len(q)]
             moves = step * np.eye(len(q))
             after = geometry.distances(pair, geometry.poses(np.vstack([q + moves, q - moves])))
             ahead, behind = (after[: len(q)] - d) / step, (d - after[len(q) :]) / step
@@ -480,17 +475,21 @@ def test_derivatives_are_those_of_differences() -> None:
     geometry = CollisionGeometry(load_robot(robot_file("seven_joint_arm")))
     step = 1e-6
     for pair in (0, 7, 20, 31):
-        row, at = rows_of(geometry, pair), shapes(geometry, 4)
+        row, at = PlaneDistances.of(geometry, [pair]), shapes(geometry, 4)
         _, planes = geometry.planes(pair, geometry.poses(at))
         # Away from the shapes that the planes were made for, too.
         for q, plane in zip(at[::-1], planes, strict=True):
             y = y_of(q)
             moves = step * np.eye(len(y))
-            J = row.jacobian(y, plane).full()
-            slope = [float(row.values(y + e, plane) - row.values(y - e, plane)) for e in moves]
-            assert np.array([slope]) / (2 * step) == pytest.approx(J, abs=1e-7)
-            bend = [
-                (row.jacobian(y + e, plane) - row.jacobian(y - e, plane)).full()[0] for e in moves
+            J = row.jacobian(y, plane)[1].full()
+            differences = [
+                float(row.values(y + e, plane) - row.values(y - e, plane)) for e in moves
             ]
-            H = row.hessian(y, plane, -1.3).full()
+            assert np.array([differences]) / (2 * step) == pytest.approx(J, abs=1e-7)
+            bend = [
+                (row.jacobian(y + e, plane)[1] - row.jacobian(y - e, plane)[1]).full()[0]
+                for e in moves
+            ]
+            slope, H = (each.full() for each in row.hessian(y, plane, -1.3))
+            assert slope == pytest.approx(-1.3 * J)
             assert -1.3 * np.array(bend) / (2 * step) == pytest.approx(H, abs=1e-7)

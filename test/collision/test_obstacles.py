@@ -13,7 +13,7 @@ from spacerobot_ros.collision import (
     ObstaclePair,
     nearest_approaches,
 )
-from spacerobot_ros.collision.planes import PlaneDistance
+from spacerobot_ros.collision.planes import PlaneDistances
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.urdf import parse_world, with_world
@@ -103,9 +103,8 @@ def test_the_nearest_approach_is_between_the_ticks(geometry: CollisionGeometry, 
 
 def test_planes_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None:
     robot = SpaceRobot(geometry.robot)
-    center_of_mass = robot.function("center_of_mass", compile=False)
     pair = pair_of(geometry, "left")
-    row = PlaneDistance.of(geometry, pair, center_of_mass)
+    row = PlaneDistances.of(geometry, [pair])
     shapes, base = moving(7)
     start = Rotation.from_quat(base.quaternion[0])
     r_WC = base.position[0] + start.apply(robot.center_of_mass(shapes[0]))
@@ -132,12 +131,12 @@ def test_planes_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None
         steps = 1e-6 * np.eye(6)
         # Of balls the distance from the plane changes as that of the balls does.
         slope = [(distance(y + e) - distance(y - e)) / 2e-6 for e in steps]
-        assert row.jacobian(y, plane).full()[0] == pytest.approx(slope, abs=1e-5)
+        assert row.jacobian(y, plane)[1].full()[0] == pytest.approx(slope, abs=1e-5)
         bend = [
-            (row.jacobian(y + e, plane) - row.jacobian(y - e, plane)).full()[0] / 2e-6
+            (row.jacobian(y + e, plane)[1] - row.jacobian(y - e, plane)[1]).full()[0] / 2e-6
             for e in steps
         ]
-        assert row.hessian(y, plane, 2.0).full() == pytest.approx(2 * np.array(bend), abs=1e-5)
+        assert row.hessian(y, plane, 2.0)[1].full() == pytest.approx(2 * np.array(bend), abs=1e-5)
 
 
 def test_a_flight_by_an_obstacle_is_measured_and_touches_it(geometry: CollisionGeometry) -> None:

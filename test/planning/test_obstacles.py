@@ -17,7 +17,7 @@ from support.planner_phases import resting
 
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.collision.nearest import Approach
-from spacerobot_ros.collision.planes import PlaneDistance
+from spacerobot_ros.collision.planes import PlaneDistances
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
@@ -263,23 +263,17 @@ def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool)
 N = 2
 
 
-def planes_of_links() -> PlaneDistance:
-    y, plane, multiplier = ca.SX.sym("y", N + 4), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
-    d = ca.sin(y[0]) * y[1] * plane[1] + y[0] ** 2 - plane[3]
-    return PlaneDistance(
-        ca.Function("d", [y, plane], [d]),
-        ca.Function("J", [y, plane], [ca.jacobian(d, y)]),
-        ca.Function("H", [y, plane, multiplier], [ca.hessian(multiplier * d, y)[0]]),
-    )
-
-
-def planes_of_obstacles() -> PlaneDistance:
-    y, plane, multiplier = ca.SX.sym("y", N + 4), ca.SX.sym("plane", 7), ca.SX.sym("lambda")
-    d = y[0] * y[3] + ca.cos(y[1]) * y[5] * plane[2] + plane[6] * y[2] * y[4]
-    return PlaneDistance(
-        ca.Function("d", [y, plane], [d]),
-        ca.Function("J", [y, plane], [ca.jacobian(d, y)]),
-        ca.Function("H", [y, plane, multiplier], [ca.hessian(multiplier * d, y)[0]]),
+def rows() -> PlaneDistances:
+    """Return one row as of links, and one as of a link and an obstacle."""
+    y, w, multipliers = ca.SX.sym("y", N + 4), ca.SX.sym("w", 7, 2), ca.SX.sym("lambda", 2)
+    of_links = ca.sin(y[0]) * y[1] * w[1, 0] + y[0] ** 2 - w[3, 0]
+    of_obstacle = y[0] * y[3] + ca.cos(y[1]) * y[5] * w[2, 1] + w[6, 1] * y[2] * y[4]
+    d = ca.vertcat(of_links, of_obstacle)
+    H, slope = ca.hessian(ca.dot(multipliers, d), y)
+    return PlaneDistances(
+        ca.Function("d", [y, w], [d]),
+        ca.Function("J", [y, w], [d, ca.jacobian(d, y)]),
+        ca.Function("H", [y, w, multipliers], [slope.T, H]),
     )
 
 
@@ -290,7 +284,6 @@ X, X_NEXT = np.array([0.1, -0.2, 0.3, 0.9]), np.array([0.2, -0.1, 0.25, 0.92])
 LACK = 0.03
 Z = np.concatenate([[H], X, START + H * V / 2, V, X_NEXT, V_NEXT, [LACK]])
 PLANES = np.random.default_rng(5).normal(size=(3, 2, 7))
-ROWS = [planes_of_links(), planes_of_obstacles()]
 
 
 def by_hand(z: np.ndarray) -> np.ndarray:
@@ -310,7 +303,7 @@ def by_hand(z: np.ndarray) -> np.ndarray:
 def distance_block() -> ConstraintBlock:
     chain = SpaceRobot.from_file(robot_file("planar_chain"))
     constraints = PathConstraints.of(chain, OptimalOptions())
-    block = Stages.of(chain, np.eye(3), False, constraints).with_distances(ROWS, 3).distances
+    block = Stages.of(chain, np.eye(3), False, constraints).with_distances(rows(), 3).distances
     assert block is not None
     return block
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from spacerobot_ros.collision import Approach, BasePoses
 from spacerobot_ros.collision.geometry import Poses
-from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistance
+from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistances
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
@@ -62,15 +62,10 @@ class DistanceLibrary:
     def __init__(self, clearance: Clearance, robot: SpaceRobot, prediction: BasePrediction) -> None:
         self.clearance = clearance
         self._robot, self._prediction = robot, prediction
-        self._rows: dict[int, PlaneDistance] = {}
 
-    def of(self, pairs: Sequence[int]) -> list[PlaneDistance]:
+    def of(self, pairs: Sequence[int]) -> PlaneDistances:
         """Return the distances of pairs from planes."""
-        center_of_mass = self._robot.function("center_of_mass", compile=False)
-        for pair in pairs:
-            if pair not in self._rows:
-                self._rows[pair] = PlaneDistance.of(self.clearance.geometry, pair, center_of_mass)
-        return [self._rows[pair] for pair in pairs]
+        return PlaneDistances.of(self.clearance.geometry, pairs)
 
     def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
         """Return the pairs to keep apart between the two ends of a motion: none initially.

@@ -643,12 +643,12 @@ class _Search:
         starts = min(problem.options.starts, most)
         guesses = itertools.islice(self._guesses(self._coarse, kept.is_clear), starts)
         clear = (each for each in guesses if kept.is_clear(each))
-        for pair in itertools.zip_longest(self._other_solutions(known, starts), clear):
-            for path, reach in zip(pair, (1.0, _REACH_FROM_GUESS), strict=True):
-                if self._is_over(found=False):
-                    return
-                if path is not None:
-                    yield path, reach
+        left = [(self._other_solutions(known, starts), 1.0), (clear, _REACH_FROM_GUESS)]
+        while left and not self._is_over(found=False):
+            paths, reach = left.pop(0)
+            for path in itertools.islice(paths, 1):
+                yield path, reach
+                left.append((paths, reach))
 
     def _other_solutions(self, known: Trajectory, starts: int) -> Iterator[Trajectory]:
         """Yield solutions from guesses on the coarse grid that differ from the known one."""

@@ -40,7 +40,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistance
+from spacerobot_ros.collision.planes import PLANE_SIZE, PlaneDistances
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cached_function, compiled, source_hash
 from spacerobot_ros.model.description import Array
@@ -217,7 +217,7 @@ class Stages:
         turn = turn_function(robot, drifting=drifting)
         return cls(n, beginning_block(n), interval, ends, path, turn)
 
-    def with_distances(self, rows: Sequence[PlaneDistance], instants: int) -> Stages:
+    def with_distances(self, rows: PlaneDistances, instants: int) -> Stages:
         """Return the problem in which link pairs also keep distances, at a number of instants per
         interval.
         """
@@ -377,63 +377,58 @@ class AttitudeRows:
         return cls(rates, X_next - stepped, jacobian, multiplier, hessian)
 
 
-def _distance_block(n: int, pairs: Sequence[PlaneDistance], instants: int) -> ConstraintBlock:
+def _distance_block(n: int, rows: PlaneDistances, instants: int) -> ConstraintBlock:
     """Return the distances at equally spaced instants of an interval, by the chain rule.
 
     The last instant is the end of the interval. The base rotation there is approximately the
     weighted mean of those at the knots; rows accept any norm. Each instant has its own planes.
     """
-    # In MX, which calls the functions of the pairs: built anew for every choice of pairs.
+    # In MX, which calls the functions of the distances: built anew for every choice of pairs.
     h, s, v, v_next = ca.MX.sym("h"), *(ca.MX.sym(name, n) for name in ("s", "v", "v+"))
     X, X_next, lack = ca.MX.sym("X", 4), ca.MX.sym("X+", 4), ca.MX.sym("lack")
-    z = ca.vertcat(h, X, s, v, X_next, v_next, lack)
-    planes = ca.MX.sym("planes", PLANE_SIZE, len(pairs) * instants)
-    multipliers = ca.MX.sym("lambda", len(pairs) * instants)
-    values, jacobian, hessian = [], [], ca.MX(z.numel(), z.numel())
-    size, curved = n + 4, [_curved_where_it_counts(rows) for rows in pairs]
-    for number, by_row in enumerate(ca.vertsplit(multipliers, len(pairs)), 1):
+    z, count = ca.vertcat(h, X, s, v, X_next, v_next, lack), rows.values.size1_out(0)
+    planes = ca.MX.sym("planes", PLANE_SIZE, count * instants)
+    multipliers = ca.MX.sym("lambda", count * instants)
+    values, measured, jacobian, hessian = [], [], [], ca.MX(z.numel(), z.numel())
+    curved = _curved_where_it_counts(rows)
+    parts = zip(ca.horzsplit(planes, count), ca.vertsplit(multipliers, count), strict=True)
+    for number, (of_instant, multiplier) in enumerate(parts, 1):
         tau = number / instants
         # The point is s + h (b v + c v+).
         b, c = tau - 1 / 2 - tau**2 / 2, tau**2 / 2
         along = b * v + c * v_next
         y = ca.vertcat(s + h * along, (1 - tau) * X + tau * X_next)
-        slopes, slope, curvature = [], ca.MX(1, size), ca.MX(size, size)
-        for row, (rows, multiplier) in enumerate(zip(pairs, ca.vertsplit(by_row), strict=True)):
-            plane = planes[:, (number - 1) * len(pairs) + row]
-            weighted, H = curved[row](y, plane, multiplier)
-            values.append(rows.values(y, plane) + lack)
-            slopes.append(rows.jacobian(y, plane))
-            slope += weighted
-            curvature += H
-        J, slope = ca.vertcat(*slopes), slope[:, :n]
+        values.append(rows.values(y, of_instant) + lack)
+        d, J = rows.jacobian(y, of_instant)
+        measured.append(d + lack)
+        slope, curvature = curved(y, of_instant, multiplier)
+        slope = slope[:, :n]
         bend = ca.horzcat(ca.MX(1, 5 + n), b * slope, ca.MX(1, 4), c * slope)
         # The derivatives of [point; turn] by z: a column, and multiples of unit matrices.
         weights = (b * h, c * h)
-        by_lack = ca.MX.ones(len(pairs), 1)
+        by_lack = ca.MX.ones(count, 1)
         jacobian.append(ca.horzcat(_point_derivative_columns(J, along, weights, tau, n), by_lack))
         half = _point_derivative_columns(curvature, along, weights, tau, n)
         by_point = ca.triu(_point_derivative_columns(half.T, along, weights, tau, n))
         by_point += ca.vertcat(bend, ca.MX(by_point.size1() - 1, by_point.size2()))
         hessian += ca.diagcat(by_point, ca.MX(1, 1))
-    z_p, J = [z, ca.vec(planes)], ca.vertcat(*jacobian)
+    z_p = [z, ca.vec(planes)]
     return ConstraintBlock(
         ca.Function("distances", z_p, [ca.vertcat(*values)]),
-        ca.Function("distances_jac", z_p, [ca.vertcat(*values), J]),
+        ca.Function("distances_jac", z_p, [ca.vertcat(*measured), ca.vertcat(*jacobian)]),
         ca.Function("distances_hess", [*z_p, multipliers], [hessian]),
     )
 
 
-def _curved_where_it_counts(rows: PlaneDistance) -> ca.Function:
-    """Return ``(y, plane, lambda) -> lambda J, H``: for negligible multipliers, zeros without
-    evaluation. Most rows have such multipliers, and Hessians took half of the time for clear paths.
+def _curved_where_it_counts(rows: PlaneDistances) -> ca.Function:
+    """Return ``(y, planes, lambda) -> lambda' J, H``: zeros without evaluation if all multipliers
+    are negligible, as they mostly are.
     """
-    arguments = [ca.MX.sym(f"a{i}", rows.hessian.size1_in(i)) for i in range(3)]
-    y, plane, multiplier = arguments
-    derivatives = [multiplier * rows.jacobian(y, plane), rows.hessian(*arguments)]
-    nothing = [ca.MX.zeros(each.sparsity()) for each in derivatives]
-    of = [ca.Function("curved", arguments, results) for results in (derivatives, nothing)]
-    counts = ca.fabs(multiplier) > _LEAST_MULTIPLIER
-    chosen = ca.Function.if_else("chosen", *of)(counts, *arguments)
+    arguments = [ca.MX.sym(f"a{i}", rows.hessian.sparsity_in(i)) for i in range(3)]
+    nothing = [ca.MX.zeros(rows.hessian.sparsity_out(i)) for i in range(2)]
+    of_nothing = ca.Function("nothing", arguments, nothing)
+    counts = ca.mmax(ca.fabs(arguments[2])) > _LEAST_MULTIPLIER
+    chosen = ca.Function.if_else("chosen", rows.hessian, of_nothing)(counts, *arguments)
     return ca.Function("curved", arguments, chosen)
 
 
