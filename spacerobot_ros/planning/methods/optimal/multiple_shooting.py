@@ -189,6 +189,8 @@ class MultipleShooting:
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
 
+        If links may be closer than required, it may be the last iterate, which is not feasible.
+
         For a fixed time, return the trajectory of least effort, that is, of the least mean square
         of accelerations divided by joint speeds.
 
@@ -248,9 +250,10 @@ class MultipleShooting:
         if not self.converged:
             # If the goal drifts away, no duration compensates for the violations in each interval.
             infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
-            if self._monitor.best is None or infeasible:
+            if infeasible or (self._monitor.best is None and not lack):
                 return None
-            x = self._monitor.best
+            # On the way to a clear path, the last iterate has better planes than the guess.
+            x = x if self._monitor.best is None else self._monitor.best
         trajectory = self._unpack_trajectory(x)
         self.lack = float(x[-1]) if layout.has_lack else 0.0
         return trajectory
