@@ -105,7 +105,7 @@ class PlannedReference(ReferenceProfile):
     @property
     def uses_table(self) -> bool:
         """Whether the motion is planned for a thruster table."""
-        return not self._legs[0].propulsion.norms
+        return self._legs[0].propulsion.is_table
 
     @property
     def propellant(self) -> float | None:
@@ -118,10 +118,10 @@ class PlannedReference(ReferenceProfile):
             return self.goal
         leg, begins = self._leg_at(time)
         sample = leg.at(time - begins)
-        hand = None if self.goal.end_effector is None else sample.end_effector
+        base, hand = PoseReference(*sample.base), PoseReference(*sample.end_effector)
         return Reference(
-            PoseReference(*sample.base),
-            None if hand is None else PoseReference(*hand),
+            base,
+            None if self.goal.end_effector is None else hand,
             JointReference(sample.q, sample.qdot, sample.qddot),
             of_one_motion=True,
         )
@@ -170,7 +170,6 @@ class GrappleReference(PlannedReference):
         self, start: Reference, limits: MotionLimits, motion: ThrustMotion, grapple: Grapple
     ) -> None:
         end = motion.at(motion.duration)
-        assert end.end_effector is not None
         joints = None if start.joints is None else JointReference.at_rest(end.q)
         base, hand = PoseReference(*end.base), PoseReference(*end.end_effector)
         super().__init__(start, Reference(base, hand, joints), limits, motion)

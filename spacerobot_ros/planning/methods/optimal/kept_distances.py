@@ -180,12 +180,7 @@ class KeptDistances:
         """Return shapes (N K, n) and base rotations (N K, 4) since the start at the K instants of
         all N intervals at which pairs are kept apart.
         """
-        intervals = len(path.shapes) - 1
-        instants, X = instants_of(intervals), path.quaternions[:, np.newaxis]
-        tau = np.arange(1, instants + 1)[:, np.newaxis] / instants
-        turns = (1 - tau) * X[:-1] + tau * X[1:]
-        turns /= np.linalg.norm(turns, axis=2, keepdims=True)
-        return path.at_ticks(intervals * instants)[1:], turns.reshape(-1, 4)
+        return path.within_intervals(instants_of(len(path.shapes) - 1))
 
     def is_clear(self, path: Trajectory) -> bool:
         """Whether no pair comes too close along a path."""

@@ -405,6 +405,15 @@ class Trajectory:
         q, v0, v1 = self.shapes[k], self.velocities[k], self.velocities[k + 1]
         return np.asarray(q + self.step * (v0 * tau + (v1 - v0) * tau**2 / 2))
 
+    def within_intervals(self, instants: int) -> tuple[Array, Array]:
+        """Return shapes (N K, n) and attitudes (N K, 4) at K instants in each step, the last one at
+        its end.
+        """
+        X, tau = self.quaternions[:, np.newaxis], np.arange(1, instants + 1)[:, np.newaxis]
+        attitudes = (1 - tau / instants) * X[:-1] + tau / instants * X[1:]
+        attitudes /= np.linalg.norm(attitudes, axis=2, keepdims=True)
+        return self.at_ticks(len(X[1:]) * instants)[1:], attitudes.reshape(-1, 4)
+
     def stretched(self, factor: float) -> Trajectory:
         """Return the trajectory along the same path in ``factor`` times its duration."""
         return replace(self, step=self.step * factor, velocities=self.velocities / factor)

@@ -298,14 +298,10 @@ class Bodies:
     def _along(self, knots: ThrustKnots) -> Samples:
         """Return a path at the instants (N K,) at which pairs are kept apart."""
         X, _, r, V, q, v = state_parts(knots.states)
-        count = INSTANTS * len(knots.levels)
         path = Trajectory(knots.step, np.hstack([q, r]), np.hstack([v, V]), X)
-        q, r = np.split(path.at_ticks(count)[1:], [self._robot.n], axis=1)
-        place = np.arange(1, count + 1)
-        k = (place - 1) // INSTANTS
-        share = (place / INSTANTS - k)[:, np.newaxis]
-        X = BasePoses(path.shapes, X).between(k, share).quaternion
-        times = np.linspace(0.0, knots.duration, count + 1)[1:]
+        places, X = path.within_intervals(INSTANTS)
+        q, r = np.split(places, [self._robot.n], axis=1)
+        times = np.linspace(0.0, knots.duration, len(X) + 1)[1:]
         return Samples(q, base_poses(self._robot, X, r, q), times)
 
     def distances(self, number: int, knots: ThrustKnots) -> Array:

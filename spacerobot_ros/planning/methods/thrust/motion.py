@@ -50,13 +50,13 @@ class FrameSample(NamedTuple):
 
 
 class MotionSample(NamedTuple):
-    """A motion at one instant: frames of the base and the end-effector (None if there is none),
+    """A motion at one instant: frames of the base and the end-effector (the base if there is none),
     joint positions, velocities and accelerations (n,), the wrench (6,) at the base origin in base
     components, and the joint efforts (n,).
     """
 
     base: FrameSample
-    end_effector: FrameSample | None
+    end_effector: FrameSample
     q: Array
     qdot: Array
     qddot: Array
@@ -64,23 +64,16 @@ class MotionSample(NamedTuple):
     tau: Array
 
 
-class MotionFunctions(NamedTuple):
+class MotionFunctions:
     """Functions of one robot's motions, of states (:class:`.ThrustKnots`) and controls ``[qddot;
-    wrench]``: a Runge-Kutta step, the steps of an interval, and a sample.
+    wrench]``: a Runge-Kutta ``step``, the steps of an ``interval``, and a ``sample``.
 
-    The sample contains the base frame and, if ``link`` names one, the end-effector frame as numbers
-    (19,), and the joint efforts.
+    The sample contains the frames of the base and of an end-effector link as numbers (19,), and the
+    joint efforts. Without a link, the base is the end-effector.
     """
 
-    robot: SpaceRobot
-    link: str
-    step: ca.Function
-    interval: ca.Function
-    sample: ca.Function
-
-    @classmethod
-    def of(cls, robot: SpaceRobot, link: str = "") -> MotionFunctions:
-        """Derive the functions."""
+    def __init__(self, robot: SpaceRobot, link: str = "") -> None:
+        self.robot = robot
         names = ("inertia_matrix", "center_of_mass", "link_poses")
         x, (X, L, r, V, q, qdot) = state_symbols(robot.n)
         H, c, (R_all, r_all) = (robot.function(name, compile=False)(q) for name in names)
@@ -105,11 +98,11 @@ class MotionFunctions(NamedTuple):
         C = robot.function("bias", compile=False)(q, v, omega, qdot)
         tau = H[6:, 3:6] @ ca.jtimes(omega, x, x_dot) + H[6:, 6:] @ qddot + C[6:]
         tau -= jacobian(robot.base_link)[:3, 6:].T @ force
-        sample = ca.cse([base, frame(link) if link else ca.SX(19, 1), tau])
+        sample = ca.cse([base, frame(link) if link else base, tau])
         rate = ca.Function("flight_rate", [x, controls], [ca.densify(ca.cse(x_dot))])
-        step = runge_kutta_step(rate, attitude=slice(4))
-        sampled = ca.Function("sample", [x, controls], [ca.densify(each) for each in sample])
-        return cls(robot, link, step, step.mapaccum(EXACT_STEPS), sampled)
+        self.step = runge_kutta_step(rate, attitude=slice(4))
+        self.interval = self.step.mapaccum(EXACT_STEPS)
+        self.sample = ca.Function("sample", [x, controls], [ca.densify(each) for each in sample])
 
 
 def base_poses(robot: SpaceRobot, X: Array, r: Array, q: Array) -> BasePoses:
@@ -189,22 +182,19 @@ class ThrustMotion:
         row = min(int(time / t), len(self._grid) - 2)
         controls = self._controls[row // EXACT_STEPS]
         state = self._functions.step(self._grid[row], controls, time - row * t).full().ravel()
-        numbers = self._functions.sample(state, controls)
-        base, hand, tau = (each.full().ravel() for each in numbers)
-        frames = [FrameSample(*np.split(each, [3, 7, 10, 13, 16])) for each in (base, hand)]
+        *frames, tau = (x.full().ravel() for x in self._functions.sample(state, controls))
+        base, hand = (FrameSample(*np.split(each, [3, 7, 10, 13, 16])) for each in frames)
         *_, q, qdot = state_parts(state)
         qddot, wrench = np.split(controls, [len(q)])
-        return MotionSample(
-            frames[0], frames[1] if self._functions.link else None, q, qdot, qddot, wrench, tau
-        )
+        return MotionSample(base, hand, q, qdot, qddot, wrench, tau)
 
     def effort_share(self, limit: Array) -> float:
         """Return the largest ratio of a joint effort to its limit (n,)."""
         limited = np.isfinite(limit)
         controls = np.repeat(self._controls, EXACT_STEPS, axis=0)
         efforts = self._functions.sample.map(len(controls))
-        ends = (efforts(x.T, controls.T)[2].full() for x in (self._grid[:-1], self._grid[1:]))
-        tau = np.abs(np.hstack(list(ends))[limited])
+        ends = [efforts(x.T, controls.T)[2].full() for x in (self._grid[:-1], self._grid[1:])]
+        tau = np.abs(np.hstack(ends)[limited])
         return float(np.max(tau / limit[limited, np.newaxis], initial=0.0))
 
     def path(self) -> Samples:

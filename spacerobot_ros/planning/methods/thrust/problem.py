@@ -29,26 +29,19 @@ class Propulsion:
     cost
         (m,) cost per second at level one: kg of propellant if there is a table, else N s of
         impulse.
-    norms
-        Groups of levels with a Euclidean norm of at most one; these levels range from -1 to 1. All
-        other levels range from 0 to 1.
+    is_table
+        Whether the levels are those of thrusters, from 0 to 1. Otherwise they are the components of
+        a force and a torque, each with a Euclidean norm of at most one.
     """
 
     wrenches: Array
     cost: Array
-    norms: tuple[tuple[int, ...], ...] = ()
+    is_table: bool
 
     @property
-    def size(self) -> int:
-        """m."""
-        return int(self.wrenches.shape[1])
-
-    @property
-    def lowest(self) -> Array:
-        """Lowest levels (m,): -1 in norm groups, else 0."""
-        lowest = np.zeros(self.size)
-        lowest[[i for group in self.norms for i in group]] = -1.0
-        return lowest
+    def lowest(self) -> float:
+        """Lowest level of each component."""
+        return 0.0 if self.is_table else -1.0
 
     @classmethod
     def of_table(cls, table: ThrusterTable, reserve: float = 0.0) -> Propulsion:
@@ -67,7 +60,7 @@ class Propulsion:
                 "bases that can be pushed and rotated in every direction."
             )
         share = 1.0 - reserve
-        return cls(share * table.wrenches, share * table.mass_flow)
+        return cls(share * table.wrenches, share * table.mass_flow, is_table=True)
 
     @classmethod
     def within(cls, force: float, torque: float, reserve: float = 0.0) -> Propulsion:
@@ -85,13 +78,13 @@ class Propulsion:
                     f"finite limit: set max_{name}."
                 )
         limits = (1.0 - reserve) * np.repeat([force, torque], 3)
-        return cls(np.diag(limits), limits, ((0, 1, 2), (3, 4, 5)))
+        return cls(np.diag(limits), limits, is_table=False)
 
     def largest_force(self) -> float:
         """Return a bound on the force in any direction, N."""
         force = self.wrenches[:3]
-        if self.norms:
-            return float(np.abs(force).max())
+        if not self.is_table:
+            return float(force.max())
         one_way = np.maximum(force.clip(0.0).sum(axis=1), -force.clip(None, 0.0).sum(axis=1))
         return float(np.linalg.norm(one_way))
 
@@ -99,12 +92,11 @@ class Propulsion:
         """Return the cost of levels (m, N) that each last for a second; norms are smoothed at a
         level.
         """
-        single = np.delete(np.arange(self.size), [i for group in self.norms for i in group])
-        cost = ca.sum2(ca.DM(self.cost[single]).T @ levels[single.tolist(), :])
-        for group in self.norms:
-            sizes = ca.sqrt(ca.sum1(levels[list(group), :] ** 2) + rounding**2)
-            cost += self.cost[group[0]] * ca.sum2(sizes - rounding)
-        return cost
+        if self.is_table:
+            return ca.sum2(ca.DM(self.cost).T @ levels)
+        sizes = (ca.sqrt(ca.sum1(each**2) + rounding**2) for each in ca.vertsplit(levels, 3))
+        of_force, of_torque = (ca.sum2(each - rounding) for each in sizes)
+        return self.cost[0] * of_force + self.cost[3] * of_torque
 
 
 @dataclass(frozen=True)

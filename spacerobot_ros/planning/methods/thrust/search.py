@@ -36,7 +36,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.model.urdf import with_world
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import parameter
-from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal.initial_guesses import rates_between
@@ -44,11 +44,7 @@ from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_e
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
 from spacerobot_ros.planning.methods.thrust.bodies import Bodies
-from spacerobot_ros.planning.methods.thrust.motion import (
-    MotionFunctions,
-    ThrustMotion,
-    base_poses,
-)
+from spacerobot_ros.planning.methods.thrust.motion import MotionFunctions, ThrustMotion, base_poses
 from spacerobot_ros.planning.methods.thrust.problem import (
     Grapple,
     Propulsion,
@@ -186,7 +182,7 @@ class ThrustPlanner:
         self._wheels[wheels.index] = True
         self.effort_limit = (1.0 - options.reserve) * robot.effort_limit
         """(n,) efforts that a plan may use."""
-        self._stages = cache(partial(thrust_stages, robot, propulsion.size))
+        self._stages = cache(partial(thrust_stages, robot, len(propulsion.cost)))
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
@@ -196,7 +192,7 @@ class ThrustPlanner:
 
     @cached_property
     def _functions(self) -> MotionFunctions:
-        return MotionFunctions.of(self.robot, self.link)
+        return MotionFunctions(self.robot, self.link)
 
     def plan(
         self, start: RobotMotion, goal: ThrustGoal | Grapple, cancellation: Cancellation = NEVER
@@ -217,7 +213,7 @@ class ThrustPlanner:
         boundary, q = self._boundary(start, goal)
         bodies.require_end(q, goal.base)
         kind = EndKind("" if goal.end_effector is None else self.link)
-        guess = self.guess(boundary, goal.base, q, np.zeros(3))
+        guess = self.guess(boundary, goal.base, q)
         return _Search(self, boundary, kind, stop, bodies).run(guess)
 
     def _plan_grapple(
@@ -238,10 +234,8 @@ class ThrustPlanner:
             search = replace(plain, kind=kind._replace(momentum=True), left=share * left)
             try:
                 return search.run_near(plain.path)
-            except PlanningCancelled:
-                raise
             except PlanningError:
-                continue
+                stop.cancellation.raise_if_requested()
         return motion
 
     def solver(self, kind: EndKind, bodies: Bodies) -> ThrustSolver:
@@ -337,7 +331,9 @@ class ThrustPlanner:
                 )
         return found
 
-    def guess(self, boundary: ThrustBoundary, base: Array, end: Array, bow: Array) -> ThrustKnots:
+    def guess(
+        self, boundary: ThrustBoundary, base: Array, end: Array, bow: Array | float = 0.0
+    ) -> ThrustKnots:
         """Return a guess at full thrust along a quintic: the base moves on a straight line and
         geodesic to a pose (7,), and the joints move straight to a shape (n,). Half-way, the base is
         displaced from the line by ``bow`` (3,), m.
@@ -437,7 +433,7 @@ class _Search:
         # One exists: target distances grow with time, the distance at full thrust with its square.
         for time in itertools.count(_MEETING_PERIOD, _MEETING_PERIOD):
             base, shape, _ = self._meeting(time)
-            guess = self.planner.guess(self.boundary, base, shape, np.zeros(3))
+            guess = self.planner.guess(self.boundary, base, shape)
             if guess.duration <= time:
                 break
         return guess.stretched(time / guess.duration)
@@ -517,9 +513,8 @@ class _Search:
             try:
                 if cleared is not None:
                     return self._settled(cleared)
-            except PlanningCancelled:
-                raise
             except PlanningError as error:
+                self.stop.cancellation.raise_if_requested()
                 failure = error
         raise failure or self._failure(bodies.reason(near[0]))
 
@@ -554,8 +549,9 @@ class _Search:
             duration = DurationBounds(self.earliest, self.latest)
         boundary = self.boundary._replace(goals=self._goals(guess.duration))
         planes = self.bodies.planes(guess) if planes is None else planes
-        args = boundary, guess, weights, self.stop, duration, planes, center, begins
-        return self._solver.solve(*args)
+        return self._solver.solve(
+            boundary, guess, weights, self.stop, duration, planes, center, begins
+        )
 
     @property
     def _solver(self) -> ThrustSolver:
@@ -571,7 +567,7 @@ class _Search:
     def _exact(self, guess: ThrustKnots) -> ThrustMotion:
         """Return the exactly integrated motion of least propellant or time near a path."""
         planner, knots, planes = self.planner, guess, self.bodies.planes(guess)
-        is_rounded = planner.propulsion.norms and self.is_timed and not len(planes)
+        is_rounded = not planner.propulsion.is_table and self.is_timed and not len(planes)
         roundings = _ROUNDINGS[1:] if is_rounded else _ROUNDINGS[1:2]
         *others, weights = (self._weights(guess, each) for each in roundings)
         for each in others:

@@ -176,18 +176,14 @@ class EndKind(NamedTuple):
     """Quantities prescribed at the end of a motion: the base pose and a link pose (empty: none);
     or, with a target, the pose and the velocities of its grapple frame for the link, and optionally
     the total angular momentum of the robot and the target.
+
+    The parameters are the poses (7 each); or, with a target, the number of intervals, the target
+    parameters (:meth:`.TorqueFreeMotion.numbers`), and the angular momentum (3).
     """
 
     link: str = ""
     target: bool = False
     momentum: bool = False
-
-    @property
-    def size(self) -> int:
-        """Number of parameters: poses (7 each), or the intervals, the target parameters
-        (:meth:`.TorqueFreeMotion.numbers`), and the angular momentum (3).
-        """
-        return 4 + TARGET_SIZE if self.target else 7 * (1 + bool(self.link))
 
 
 Stages = tuple[ConstraintBlock, ConstraintBlock, ConstraintBlock]
@@ -224,7 +220,8 @@ def state_symbols(n: int) -> tuple[ca.SX, list[ca.SX]]:
 
 def _end_block(robot: SpaceRobot, kind: EndKind) -> ConstraintBlock:
     """Return the rows of the last knot, of ``[h; x]``."""
-    h, goals = ca.SX.sym("h"), ca.SX.sym("goals", kind.size)
+    size = 4 + TARGET_SIZE if kind.target else 7 * (1 + bool(kind.link))
+    h, goals = ca.SX.sym("h"), ca.SX.sym("goals", size)
     x, (X, L, r, V, s, v) = state_symbols(robot.n)
     q, R = s - h * v / 2, matrix_from_quaternion(X)
     c = robot.function("center_of_mass", compile=False)(q)
@@ -360,7 +357,7 @@ class ThrustSolver:
         self.lack = 0.0
         """Distance by which pairs are closer than required in the last solution, m."""
         self._propulsion, self._acceleration = propulsion, acceleration
-        n, m = len(acceleration), propulsion.size
+        n, m = len(acceleration), len(propulsion.cost)
         self._layout = Layout((13 + 2 * n,), (n, m), intervals, bool(pairs))
         self._program = program = self._assembled(stages, pairs)
         self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
@@ -372,7 +369,7 @@ class ThrustSolver:
         self, stages: Stages, pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]]
     ) -> Program:
         """Assemble the program. Its parameters are the initial shape (n,), the end parameters
-        (:attr:`EndKind.size`), the defects (12, N), the :class:`Weights`, the centres of the
+        (:class:`EndKind`), the defects (12, N), the :class:`Weights`, the centres of the
         squares (n + m, N), and the planes (8,) of every pair at its places.
         """
         layout, propulsion, N = self._layout, self._propulsion, self._layout.intervals
@@ -394,10 +391,10 @@ class ThrustSolver:
             ),
             (start, ca.vertcat(defects, wrenches), goals),
         )
-        if propulsion.norms:
+        if not propulsion.is_table:
             group = ca.SX.sym("u", 3)
             norm = ConstraintBlock.of("norm", group, ca.SX(0, 1), 1 - ca.sumsqr(group))
-            groups = np.vstack([u[:, list(each)] for each in propulsion.norms])
+            groups = np.vstack(np.hsplit(u, 2))
             placed.append(PlacedBlock.after(placed, norm, groups, ca.MX(0, 1)))
         variables = np.hstack([zero, knot[:-1], knot[1:], np.full((N, 1), layout.size - 1)])
         for (block, at), of_pair in zip(pairs, planes, strict=True):
@@ -466,10 +463,10 @@ class ThrustSolver:
         shape = state_parts(boundary.start)[4]
         parameters = (shape, boundary.goals, defects, weights, centers, planes.ravel())
         least, largest = (
-            pack_knots(layout, span / N, bounds, acceleration, levels)
-            for span, bounds, acceleration, levels in (
+            pack_knots(layout, span / N, bounds, acceleration, np.array(level))
+            for span, bounds, acceleration, level in (
                 (duration.shortest, boundary.bounds[0], -most, propulsion.lowest),
-                (duration.longest, boundary.bounds[1], most, np.ones(propulsion.size)),
+                (duration.longest, boundary.bounds[1], most, 1.0),
             )
         )
         if layout.has_lack:
