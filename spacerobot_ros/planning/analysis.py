@@ -22,7 +22,6 @@ from spacerobot_ros.planning.core.controllability import (
     curvatures,
     sample_shapes,
 )
-from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.core.workspaces import Workspaces, workspaces
 from spacerobot_ros.planning.methods.auto import AutoGait
 from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
@@ -111,8 +110,12 @@ def analyze(
         The shape or the link does not belong to this robot.
     """
     link = robot.description.end_effector(end_effector)
-    if link:
-        _check_link(robot, link)
+    names = [each.name for each in robot.description.links if each.name != robot.base_link]
+    if link and link not in names:
+        raise ParameterError(
+            f"Robot '{robot.description.name}' has no link '{link}' other than its base; its links "
+            f"are {', '.join(names)}."
+        )
     given = None if shape is None else _check_shape(robot, shape)
     anywhere = best_sampled_brackets(robot)
     nominal, loops = None, NominalShapeChooser(robot, _LOOP_EDGE_LENGTH)
@@ -123,6 +126,14 @@ def analyze(
     if given is None:
         best = planar if planar.controllable else anywhere
         given = best.shape if nominal is None else nominal.shape
+    objections: dict[str, str | None] = {}
+    for name, method in METHODS.items():
+        try:
+            method.require_suitable(robot)
+            objections[name] = None
+        except PlanningError as refusal:
+            objections[name] = str(refusal)
+    del objections[AutoGait.name]
     return Analysis(
         robot,
         given,
@@ -132,32 +143,10 @@ def analyze(
         _condition_numbers(robot),
         planar,
         check_sliding_masses(robot),
-        {
-            name: _reason_against_method(method, robot)
-            for name, method in METHODS.items()
-            if method is not AutoGait
-        },
+        objections,
         CollisionGeometry(robot.description),
         link,
     )
-
-
-def _reason_against_method(method: type[GaitMethod], robot: SpaceRobot) -> str | None:
-    """Return the reason why a method cannot plan for a robot at all; None if it can."""
-    try:
-        method.require_suitable(robot)
-    except PlanningError as refusal:
-        return str(refusal)
-    return None
-
-
-def _check_link(robot: SpaceRobot, link: str) -> None:
-    names = [each.name for each in robot.description.links if each.name != robot.base_link]
-    if link not in names:
-        raise ParameterError(
-            f"Robot '{robot.description.name}' has no link '{link}' other than its base; its links "
-            f"are {', '.join(names)}."
-        )
 
 
 def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:

@@ -109,11 +109,7 @@ def plan(
                 hands, position=position, quaternion=quaternion, joint_positions=joint_positions
             )
         else:
-            goal = Goal.checked(
-                (0.0, 0.0, 0.0) if position is None else position,
-                (0.0, 0.0, 0.0, 1.0) if quaternion is None else quaternion,
-                joint_positions,
-            )
+            goal = Goal.checked(position, quaternion, joint_positions)
     goal = goal.for_robot(robot.description)
     method = method or (PATH_METHOD if goal.has_path else END_EFFECTOR_METHOD)
     options_of_method = {method: method_options(method, options)}

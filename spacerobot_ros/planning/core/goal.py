@@ -88,8 +88,9 @@ class EndEffectorGoal:
                 f"The goal of {name} has {counted(values.size, 'number')}; give 3 (a position) or "
                 "7 (a position and a quaternion)."
             )
-        given = Goal.checked(values[:3], values[3:] if len(values) == 7 else [0, 0, 0, 1])
-        return cls(link, given.position, given.quaternion if len(values) == 7 else None)
+        has_attitude = len(values) == 7
+        given = Goal.checked(values[:3], values[3:] if has_attitude else None)
+        return cls(link, given.position, given.quaternion if has_attitude else None)
 
     @classmethod
     def along(cls, link: str, poses: npt.ArrayLike) -> EndEffectorGoal:
@@ -247,26 +248,19 @@ class Goal:
         if not goals:
             raise GoalError("The goal names no end-effector.")
         _require_one_goal_each(goals)
-        asked: set[Controlled] = set()
-        if position is not None:
-            asked.add("position")
-        if quaternion is not None:
-            asked.add("attitude")
-        made = cls.checked(
-            [0, 0, 0] if position is None else position,
-            [0, 0, 0, 1] if quaternion is None else quaternion,
-            joint_positions,
-        )
-        return cls(made.position, made.quaternion, made.joint_positions, goals, frozenset(asked))
+        given: dict[Controlled, object] = {"position": position, "attitude": quaternion}
+        base = frozenset(part for part, value in given.items() if value is not None)
+        made = cls.checked(position, quaternion, joint_positions)
+        return replace(made, end_effectors=goals, base=base)
 
     @classmethod
     def checked(
         cls,
-        position: npt.ArrayLike,
-        quaternion: npt.ArrayLike,
+        position: npt.ArrayLike | None = None,
+        quaternion: npt.ArrayLike | None = None,
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return a goal with a unit quaternion.
+        """Return a goal with a unit quaternion; the default pose is the origin of W.
 
         Raises
         ------
@@ -274,8 +268,11 @@ class Goal:
             A list has the wrong length, or contains numbers that are not finite or are too large,
             or the quaternion is zero.
         """
-        r = as_numbers(position, "The goal position", GoalError)
-        q = as_numbers(quaternion, "The goal orientation", GoalError)
+        r, q = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+        if position is not None:
+            r = as_numbers(position, "The goal position", GoalError)
+        if quaternion is not None:
+            q = as_numbers(quaternion, "The goal orientation", GoalError)
         if r.shape != (3,) or q.shape != (4,):
             raise GoalError("A goal needs three position values and four orientation values.")
         if not np.all(np.isfinite(r)):
@@ -287,20 +284,15 @@ class Goal:
             )
         if not np.all(np.isfinite(q)):
             raise GoalError(f"The goal orientation {q.tolist()} is not finite.")
-        shape = (
-            None
-            if joint_positions is None
-            else as_numbers(joint_positions, "The goal shape", GoalError)
-        )
-        if shape is not None and not (
-            shape.ndim == 1
-            and np.all(np.isfinite(shape))
-            and np.all(np.abs(shape) <= _MAX_COORDINATE)
-        ):
-            raise GoalError(
-                f"The goal shape {shape.tolist()} is not a list of finite joint positions "
-                f"of at most {_MAX_COORDINATE:g} m or rad."
-            )
+        shape = None
+        if joint_positions is not None:
+            shape = as_numbers(joint_positions, "The goal shape", GoalError)
+            # A comparison with NaN is false.
+            if shape.ndim != 1 or not np.all(np.abs(shape) <= _MAX_COORDINATE):
+                raise GoalError(
+                    f"The goal shape {shape.tolist()} is not a list of finite joint positions "
+                    f"of at most {_MAX_COORDINATE:g} m or rad."
+                )
         try:
             return cls(r, unit_quaternion(q), shape)
         except ValueError:
@@ -329,8 +321,8 @@ class Goal:
         if not asked:
             raise GoalError("The goal pose is all NaN, which requests nothing.")
         made = cls.checked(
-            position if "position" in asked else [0.0, 0.0, 0.0],
-            quaternion if "attitude" in asked else [0.0, 0.0, 0.0, 1.0],
+            position if "position" in asked else None,
+            quaternion if "attitude" in asked else None,
             joint_positions,
         )
         return replace(made, asked=asked)
@@ -453,17 +445,16 @@ class Goal:
 
     def equals(self, other: Goal) -> bool:
         """Whether another goal has exactly the same poses and shape."""
-        mine, others = self.joint_positions, other.joint_positions
-        same_shape = (
-            mine is others if mine is None or others is None else np.array_equal(mine, others)
+        mine, others = (
+            (
+                each.base,
+                None if each.joint_positions is None else each.joint_positions.tolist(),
+                each.path_values.tolist(),
+                {hand.link: hand.path_values.tolist() for hand in each.end_effectors},
+            )
+            for each in (self, other)
         )
-        return (
-            bool(same_shape)
-            and self.base == other.base
-            and {each.link: each.path_values.tolist() for each in self.end_effectors}
-            == {each.link: each.path_values.tolist() for each in other.end_effectors}
-            and np.array_equal(self.path_values, other.path_values)
-        )
+        return mine == others
 
 
 def _displaced(waypoints: Array | None, by: Array) -> Array | None:
@@ -677,16 +668,11 @@ class Tolerance:
             ("position" not in controls or error.distance <= self.position)
             and ("attitude" not in controls or error.angle <= self.attitude)
             and ("shape" not in controls or error.max_joint_error <= self.shape)
+            # Unknown errors do not count as small.
+            and ("end_effectors" not in controls or bool(error.end_effectors))
             and (
                 "end_effectors" not in controls
-                # Unknown errors do not count as small.
-                or (
-                    bool(error.end_effectors)
-                    and all(
-                        each.distance <= self.position and each.angle <= self.attitude
-                        for each in error.end_effectors
-                    )
-                )
+                or all(self.admits(each) for each in error.end_effectors)
             )
         )
 

@@ -25,9 +25,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.state_average import MeasuredState
-from spacerobot_ros.planning.methods.optimal.end_effectors import (
-    EndEffectorRows,
-)
+from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
@@ -91,11 +89,8 @@ class TwistCommand:
         description = robot.description
         if link not in description.frames or link == description.base_link:
             raise PlanningError(f"Robot '{description.name}' has no end-effector '{link}'.")
-        frames: dict[str, TwistFrame] = {
-            world: "world",
-            description.base_link: "base",
-            link: "link",
-        }
+        frames: dict[str, TwistFrame]
+        frames = {world: "world", description.base_link: "base", link: "link"}
         # Frames of a robot may have a prefix.
         found = frames.get(frame) or frames.get(frame.rpartition("/")[2])
         if found is None:
@@ -377,10 +372,12 @@ class TwistFollower:
         if np.linalg.norm(motion) <= _ROUNDING:
             return np.zeros(len(q)), ""
         rates, progress = self._solution(q, motion)
-        factor, reason = 1.0, ""
-        if progress < _SLOW_PROGRESS_RATE and not self._moves_away_from_singularity(
-            q, motion, rates, progress
-        ):
+        factor, reason, ahead = 1.0, "", 0.0
+        if progress < _SLOW_PROGRESS_RATE and rates.any():
+            step = _LOOK_AHEAD * rates / np.abs(rates / self._weights).max()
+            ahead = self._solution(q + step, motion)[1]
+        # Rates that lead away from a singularity are not reduced.
+        if ahead <= progress < _SLOW_PROGRESS_RATE:
             factor = max(
                 0.0, (progress - MIN_PROGRESS_RATE) / (_SLOW_PROGRESS_RATE - MIN_PROGRESS_RATE)
             )
@@ -398,15 +395,6 @@ class TwistFollower:
             joint = self._robot.joint_names[nearest]
             reason = f"Joint '{joint}' reaches its limit of {q[nearest]:.4g}."
         return factor * rates, reason
-
-    def _moves_away_from_singularity(
-        self, q: Array, motion: Array, rates: Array, progress: float
-    ) -> bool:
-        """Whether rates (n,) lead away from a singularity."""
-        fastest = np.abs(rates / self._weights).max()
-        if fastest == 0.0:
-            return False
-        return self._solution(q + _LOOK_AHEAD * rates / fastest, motion)[1] > progress
 
     def _solution(self, q: Array, motion: Array) -> tuple[Array, float]:
         """Return the rates (n,) of a scaled motion, and the motion for a radian of the joints."""

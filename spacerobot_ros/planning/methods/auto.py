@@ -94,17 +94,22 @@ class AutoGait(GaitMethod):
         flying = "" if request.previous is None else request.previous.method
         results: dict[str, _MethodResult] = {}
         for name in sorted(names, key=lambda name: name != flying):
-            result = self._plan_by_method(name, request, refusals, cancellation)
-            if result is not None and name == flying:
+            try:
+                schedule = self._get_method(name).plan(request, cancellation)
+            except PlanningCancelled:
+                raise
+            except (ParameterError, PlanningError) as refusal:
+                refusals[name] = refusal
+                continue
+            results[name] = _MethodResult.of(self.robot, schedule, request)
+            if name == flying:
                 because = f"{flying} planned for this goal before."
-                return _add_notes(result.schedule, flying, because, {flying: result}, {})
-            if result is not None:
-                results[name] = result
+                return _add_notes(schedule, flying, because, results, {})
         if not results:
             raise self._refuse_goal(refusals)
-        for refusal in refusals.values():
-            if isinstance(refusal, UnreadMeshError):
-                warn_once(str(refusal))
+        for each in refusals.values():
+            if isinstance(each, UnreadMeshError):
+                warn_once(str(each))
         chosen = min(results, key=lambda name: results[name].rank(results.values()))
         because = f"{chosen} suits robot '{self.robot.description.name}' and " + (
             f"plans the shortest of {len(results)} manoeuvres to this goal."
@@ -149,23 +154,6 @@ class AutoGait(GaitMethod):
                     f"{name} does not control the {lost} of the base; another method does."
                 )
         return [name for name in pose if name not in refusals]
-
-    def _plan_by_method(
-        self,
-        name: str,
-        request: PlanRequest,
-        refusals: dict[str, SpaceRobotError],
-        cancellation: Cancellation,
-    ) -> _MethodResult | None:
-        """Return the result of one method; None for a refusal, which is added to ``refusals``."""
-        try:
-            schedule = self._get_method(name).plan(request, cancellation)
-        except PlanningCancelled:
-            raise
-        except (ParameterError, PlanningError) as refusal:
-            refusals[name] = refusal
-            return None
-        return _MethodResult.of(self.robot, schedule, request)
 
 
 @dataclass(frozen=True)

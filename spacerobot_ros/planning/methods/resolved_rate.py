@@ -48,9 +48,7 @@ from spacerobot_ros.planning.core.goal import (
 )
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
-from spacerobot_ros.planning.methods.optimal.end_effectors import (
-    EndEffectorRows,
-)
+from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
