@@ -13,12 +13,13 @@ from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.planned_reference import PlannedOptions, PlannedReference
+from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.reference import PROFILES
 from spacerobot_ros.control.wheels import WheelOptions
 from spacerobot_ros.errors import counted
 from spacerobot_ros.model.shared_parameters import CommanderConfig
 from spacerobot_ros.parameters import group, nonnegative, parameter, registered
+from spacerobot_ros.planning.methods.thrust.problem import ThrustOptions
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class ControllerConfig(CommanderConfig):
         "profile of goal references; planned: within the available thrust, around obstacles",
         choices=(*PROFILES, PlannedReference.name),
     )
-    plan: PlannedOptions = group(PlannedOptions())
+    plan: ThrustOptions = group(ThrustOptions())
     motion: MotionLimits = group(MotionLimits())
     use_thrusters: bool = parameter(
         True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar, NamedTuple, TypedDict
 
 import numpy as np
@@ -26,28 +26,15 @@ from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.target_motion import RelativeMotionOverTime
-from spacerobot_ros.model.thrusters import find_thrusters
-from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.methods.thrust.motion import Samples, ThrustMotion
-from spacerobot_ros.planning.methods.thrust.problem import Grapple, Propulsion, ThrustGoal
-from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, ThrustGoal, ThrustOptions
+from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 
 PLANNING_TIME = 2.0
 """Time after which a plan takes over from a moving reference, s; doubled if planning takes
 longer."""
-
-
-@dataclass(frozen=True)
-class PlannedOptions(ThrustOptions):
-    """Options of planned references."""
-
-    thrusters: str = parameter(
-        "",
-        "thruster table for plans: 'urdf' or a YAML file; '': any wrench within max_force and "
-        "max_torque",
-    )
 
 
 class PlannedReference(ReferenceProfile):
@@ -225,18 +212,15 @@ class ReferencePlanner:
         The model controlled by the law, without wheels: plans do not use wheel torque.
     outputs
         The outputs of the law.
-    limits
-        Thruster limits, used if there is no thruster table.
-    options
-        Plan options.
+    limits, options
+        See :class:`.ThrustPlanner`.
     in_background
         Whether plans are made in a thread while states are handled.
 
     Raises
     ------
     ParameterError
-        The thrust has no limits, the thrusters cannot produce every wrench, or an option is
-        invalid.
+        The base pose is not controlled; or see :class:`.ThrustPlanner`.
     """
 
     def __init__(
@@ -244,22 +228,19 @@ class ReferencePlanner:
         robot: SpaceRobot,
         outputs: OutputSelection,
         limits: ActuatorLimits,
-        options: PlannedOptions,
+        options: ThrustOptions,
         *,
         in_background: bool,
     ) -> None:
-        self._outputs, self.in_background = outputs, in_background
-        if options.thrusters:
-            table = find_thrusters(options.thrusters, robot.description)
-            propulsion = Propulsion.of_table(table, options.reserve)
-        else:
-            propulsion = Propulsion.within(limits.force, limits.torque, options.reserve)
         if not outputs.base:
             raise ParameterError(
                 "The profile 'planned' requires a controlled base pose: set base_outputs, or set "
                 "profile to quintic."
             )
-        self._planner = ThrustPlanner(robot, propulsion, options, outputs.end_effector_link)
+        self._outputs, self.in_background = outputs, in_background
+        self._planner = ThrustPlanner(
+            robot, options, outputs.end_effector_link, limits.force, limits.torque
+        )
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
         """Use other obstacles from the next plan on; None: around none."""

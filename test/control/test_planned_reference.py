@@ -53,8 +53,8 @@ def distance_from_panel(flight: Flight) -> float:
     distances = []
     for pose in flight.pose[::5]:
         at = coal.Transform3s(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
-        request, result = coal.DistanceRequest(), coal.DistanceResult()
-        distances.append(coal.distance(cube, at, panel, place, request, result))
+        asked = coal.DistanceRequest(), coal.DistanceResult()
+        distances.append(coal.distance(cube, at, panel, place, *asked))
     return float(min(distances))
 
 
@@ -143,6 +143,7 @@ class Follower:
         self.executive = ControlExecutive(build_controller(robot, self.config), self.config)
         self.time, self.places = 0.0, list[np.ndarray]()
         self.state = ControlState.at_rest(PLACE, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(0))
+        self.answer()
 
     def reference(self) -> PoseReference:
         base = self.executive.controller.reference_at(self.time, self.state).base
@@ -161,6 +162,14 @@ class Follower:
         self.executive.evaluate(self.time, result)
         self.time += 0.02
 
+    @property
+    def statuses(self) -> list[ControllerStatus]:
+        return [each for each in self.executive.outputs if isinstance(each, ControllerStatus)]
+
+    def pursue(self, goal: Goal, name: str = "") -> None:
+        self.executive.submit("base", IdentifiedGoal(goal, name))
+        self.answer()
+
     def fly(self, until: float = np.inf) -> ControllerState:
         """Answer states until the goal is decided, or a time; return the controller's state."""
         while self.executive.state is ControllerState.TRACKING and self.time < until:
@@ -171,7 +180,6 @@ class Follower:
 def test_states_are_answered_while_a_thread_plans() -> None:
     """``plan_in_background``: the robot holds its pose, and later goes on to its last goal."""
     rig = Follower(plan_in_background=True)
-    rig.answer()
     executive, first = rig.executive, Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0.1, 0.4])
     executive.submit("base", IdentifiedGoal(first, "first"))
     held, second = 0, Goal.from_rotvec([0.5, -0.9, 0.4], [-0.3, 0.2, 0.1])
@@ -182,8 +190,7 @@ def test_states_are_answered_while_a_thread_plans() -> None:
             executive.submit("base", IdentifiedGoal(second, "second"))
         np.testing.assert_allclose(rig.reference().position, PLACE, atol=1e-12)
         rig.answer()
-    statuses = [each for each in executive.outputs if isinstance(each, ControllerStatus)]
-    planned = {each.goal_id for each in statuses if "Planning a motion" in each.message}
+    planned = {each.goal_id for each in rig.statuses if "Planning a motion" in each.message}
     assert planned <= {"first", "second"}
     assert planned, "whoever has sent a goal learns that it is being planned"
     assert held > 5, "the test is sharp: planning takes longer than a state"
@@ -202,9 +209,7 @@ def test_motions_are_planned_anew_around_obstacles_that_come_in_flight() -> None
         (goal.position, ControllerState.ABORTED),
     ):
         rig = Follower()
-        rig.answer()
-        rig.executive.submit("base", IdentifiedGoal(goal))
-        rig.answer()
+        rig.pursue(goal)
         began = rig.time
         rig.fly(until=began + 6.0)
         # Something beside the way changes nothing.
@@ -214,20 +219,18 @@ def test_motions_are_planned_anew_around_obstacles_that_come_in_flight() -> None
         assert rig.executive.controller.profile is profile
         rig.executive.use_obstacles(ball(place))
         assert rig.fly() is state
-        statuses = [each for each in rig.executive.outputs if isinstance(each, ControllerStatus)]
         # The cube of 0.3 m contains a ball of 0.15 m.
         nearest = np.linalg.norm(np.array(rig.places) - place, axis=1).min()
         assert nearest > 0.15 + 0.1 + 0.01
         assert nearest < 1.0
         if state is ControllerState.ABORTED:
-            told = statuses[-1].message
+            told = rig.statuses[-1].message
             assert told.startswith("Aborted: ")
             assert "'ball'" in told
 
 
 def test_a_status_in_flight_says_for_what_another_motion_is_planned() -> None:
     rig = Follower(plan_in_background=True, status_period=0.02)
-    rig.answer()
     goal, other = (Goal.from_rotvec(x, [0.0] * 3) for x in ([1.3, 0.2, 0.1], [0.5, -0.9, 0.4]))
     rig.executive.submit("base", IdentifiedGoal(goal, "first"))
     while rig.executive.state is not ControllerState.TRACKING:
@@ -263,10 +266,8 @@ def ball(place: np.ndarray) -> RobotDescription:
 def test_a_motion_is_blocked_when_it_first_comes_too_near() -> None:
     """To a ball in the middle of its way, through which it flies half a metre deep."""
     rig = Follower(plan=load_scenario("free_flyer").controller.plan)
-    rig.answer()
     aim = PLACE + np.array([1.6, 0.3, -0.2])
-    rig.executive.submit("base", IdentifiedGoal(Goal.from_rotvec(aim, [0.2, 0.1, 0.4])))
-    rig.answer()
+    rig.pursue(Goal.from_rotvec(aim, [0.2, 0.1, 0.4]))
     controller, began = rig.executive.controller, rig.time
     profile, planner = controller.profile, controller.planner
     assert profile is not None
@@ -301,9 +302,8 @@ def stops(poses: np.ndarray, tick: float, within: float) -> list[int]:
     found = []
     for number, waypoint in enumerate(WAYPOINTS):
         away = np.linalg.norm(poses[:, :3] - waypoint[:3], axis=1)
-        apart = (
-            Rotation.from_quat(poses[:, 3:]).inv() * Rotation.from_quat(waypoint[3:])
-        ).magnitude()
+        turns = Rotation.from_quat(poses[:, 3:]).inv() * Rotation.from_quat(waypoint[3:])
+        apart = turns.magnitude()
         nearest = int(np.argmin(away + apart))
         if away[nearest] < within and apart[nearest] < 2 * within:
             assert speeds[max(nearest - 15, 0) : nearest + 15].min() < 5e-3
@@ -341,8 +341,7 @@ def test_a_robot_with_wheels_follows_a_plan_by_its_thrusters() -> None:
 
 def test_a_robot_that_is_brought_to_rest_keeps_to_its_limits_during_a_plan() -> None:
     rig = Follower(plan=replace(load_scenario("free_flyer").controller.plan, duration=0.0))
-    rig.answer()
-    rig.executive.submit("base", IdentifiedGoal(through_waypoints()))
+    rig.pursue(through_waypoints())
     rig.fly(until=1.0)
     rig.answer()
     controller = rig.executive.controller
@@ -355,10 +354,8 @@ def test_a_robot_that_is_brought_to_rest_keeps_to_its_limits_during_a_plan() -> 
 
 def test_waypoints_that_were_passed_are_not_passed_again() -> None:
     rig = Follower(plan=replace(load_scenario("free_flyer").controller.plan, duration=0.0))
-    rig.answer()
     goal = through_waypoints()
-    rig.executive.submit("base", IdentifiedGoal(goal, "path"))
-    rig.answer()
+    rig.pursue(goal, "path")
     profile = rig.executive.controller.profile
     while np.linalg.norm(rig.places[-1] - WAYPOINTS[0, :3]) > 1e-3:
         rig.answer()
@@ -383,10 +380,7 @@ def test_a_straight_profile_refuses_waypoints() -> None:
 
 def test_a_start_within_an_obstacle_is_refused() -> None:
     rig = Follower()
-    rig.answer()
     rig.executive.use_obstacles(ball(PLACE + np.array([0.2, 0.0, 0.0])))
-    rig.executive.submit("base", IdentifiedGoal(Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0, 0])))
-    rig.answer()
-    statuses = [each for each in rig.executive.outputs if isinstance(each, ControllerStatus)]
-    refused = [each.message for each in statuses if each.state is ControllerState.REFUSED]
+    rig.pursue(Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0, 0]))
+    refused = [each.message for each in rig.statuses if each.state is ControllerState.REFUSED]
     assert_one_sentence(refused[-1], "obstacle 'ball' touch at the start")

@@ -12,19 +12,16 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 from support.sentences import assert_one_sentence
-from support.thrust_flights import distance_from_target, tumbled
+from support.thrust_flights import FOLDED, configuration, distance_from_target, tumbled
 
 from spacerobot_ros import fly
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot, load_robot
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, TargetBody
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
-from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
-from spacerobot_ros.planning.methods.thrust.problem import Grapple, Propulsion
-from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, ThrustOptions
+from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 from spacerobot_ros.resources import robot_file, share_directory
 
 INERTIA = '<inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -43,13 +40,12 @@ SLAB = f"""<robot name="slab"><link name="slab"><inertial><origin xyz="0.02 0.01
 <parent link="slab"/><child link="grapple"/><origin xyz="-0.32 0.1 0"/></joint></robot>"""
 SATELLITE = share_directory() / "config" / "targets" / "satellite.urdf"
 HERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+REST, FOLDED_REST = (RobotMotion.at_rest(HERE, q) for q in (np.zeros(1), FOLDED))
 
 
 def boomed(**options: Any) -> ThrustPlanner:
-    robot = SpaceRobot.from_urdf(BOOMED)
-    propulsion = Propulsion.within(0.8, 0.1)
-    chosen = ThrustOptions(**{"intervals": 20, **options})
-    return ThrustPlanner(robot, propulsion, chosen, "end_effector")
+    chosen = ThrustOptions(intervals=20, **options)
+    return ThrustPlanner(SpaceRobot.from_urdf(BOOMED), chosen, "end_effector", 1.0, 0.125)
 
 
 def slab(place: tuple[float, ...], v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> BodyMotion:
@@ -65,12 +61,11 @@ def meeting(free: BodyMotion, clearance: float = 0.02) -> Grapple:
 
 def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> None:
     planner, free = boomed(), slab((2.5, 0.2, -0.1), (0.004, -0.003, 0.0))
-    start, target = RobotMotion.at_rest(HERE, np.zeros(1)), parse_robot(SLAB)
-    motion = planner.plan(start, meeting(free))
+    target = parse_robot(SLAB)
+    motion = planner.plan(REST, meeting(free))
     T, dt = motion.duration, 1e-3
     X, r = tumbled(target, free, np.array([0.0, T - dt, T, T + dt]))
     R, hand = Rotation.from_quat(X), motion.at(T).end_effector
-    assert hand is not None
     fixture = r + R.apply([-0.32, 0.1, 0.0])
     assert hand.position == pytest.approx(fixture[2], abs=1e-4)
     assert (R[2].inv() * Rotation.from_quat(hand.quaternion)).magnitude() < 1e-4
@@ -79,20 +74,20 @@ def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> Non
     assert hand.angular_velocity == pytest.approx(turned, abs=1e-4)
     robot = planner.robot.description
     assert distance_from_target(robot, target, motion, free) > 0.0199
-    careless = planner.plan(start, meeting(free, 0.0))
+    careless = planner.plan(REST, meeting(free, 0.0))
     assert distance_from_target(robot, target, careless, free) < 0
 
 
 def test_an_approach_stays_in_its_corridor_or_is_refused() -> None:
     planner, free, angle = boomed(), slab((2.5, 0.2, -0.1), (0.004, -0.003, 0.0)), 0.25
-    start, target = RobotMotion.at_rest(HERE, np.zeros(1)), parse_robot(SLAB)
+    target = parse_robot(SLAB)
     clear = replace(meeting(free), standoff=(-0.4, 0.0, 0.0))
     outside = []
     for length in (0.0, 0.6):
         asked = replace(clear, corridor_angle=angle, corridor_length=length)
-        motion = planner.plan(start, asked)
+        motion = planner.plan(REST, asked)
         times = np.linspace(0, motion.duration, 8000)
-        hand = np.array([planner_hand(motion, time) for time in times])
+        hand = np.array([motion.at(time).end_effector.position for time in times])
         X, r = tumbled(target, free, times)
         p = Rotation.from_quat(X).inv().apply(hand - r) - [-0.32, 0.1, 0.0]
         beyond = np.hypot(p[:, 1], p[:, 2]) - (0.02 - p[:, 0] * np.tan(angle))
@@ -101,7 +96,7 @@ def test_an_approach_stays_in_its_corridor_or_is_refused() -> None:
     assert outside[1] < 3e-4
     near = replace(clear, corridor_angle=angle, corridor_length=4.0)
     with pytest.raises(PlanningError) as refused:
-        planner.plan(start, near)
+        planner.plan(REST, near)
     assert_one_sentence(
         str(refused.value), "m outside its corridor", "corridor_angle = 0.25", "move the robot"
     )
@@ -114,25 +109,16 @@ def test_a_corridor_that_cannot_be_kept_is_refused_before_the_horizon() -> None:
     narrow = replace(clear, corridor_angle=0.1, corridor_length=2.0)
     began = time.process_time()
     with pytest.raises(PlanningError) as refused:
-        boomed().plan(RobotMotion.at_rest(HERE, np.zeros(1)), narrow)
+        boomed().plan(REST, narrow)
     assert time.process_time() - began < 60.0
     assert_one_sentence(str(refused.value), "m outside its corridor", "widen the corridor")
-
-
-def planner_hand(motion: ThrustMotion, time: float) -> Array:
-    hand = motion.at(time).end_effector
-    assert hand is not None
-    return hand.position
 
 
 @cache
 def servicer() -> ThrustPlanner:
     robot = SpaceRobot.from_file(robot_file("servicer"))
-    propulsion = Propulsion.of_table(thrusters_of_urdf(robot.description), 0.2)
-    return ThrustPlanner(robot, propulsion, ThrustOptions(intervals=15), "end_effector")
-
-
-FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+    options = ThrustOptions(intervals=15, thrusters="urdf")
+    return ThrustPlanner(robot, options, "end_effector")
 
 
 def satellite(quaternion: list[float], place: list[float], omega: list[float]) -> BodyMotion:
@@ -147,9 +133,8 @@ def test_a_fixture_that_faces_away_is_met_when_it_has_turned() -> None:
     planner, target = servicer(), load_robot(SATELLITE)
     free = satellite([0.254, 0.691, -0.641, -0.216], [-2.38, 1.2, 3.88], [-5.93, 0.91, 0.0])
     motion = TorqueFreeMotion(TargetBody.of(target, "grapple"), free)
-    start = RobotMotion.at_rest(HERE, FOLDED)
     clear, careless = (
-        planner.plan(start, Grapple(motion, target, distance)) for distance in (0.02, 0.0)
+        planner.plan(FOLDED_REST, Grapple(motion, target, distance)) for distance in (0.02, 0.0)
     )
     robot = planner.robot.description
     assert distance_from_target(robot, target, careless, free) < -0.1
@@ -158,28 +143,22 @@ def test_a_fixture_that_faces_away_is_met_when_it_has_turned() -> None:
 
 
 def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
-    planner = servicer()
-    target = load_robot(SATELLITE)
+    planner, target = servicer(), load_robot(SATELLITE)
     body = TargetBody.of(target, "grapple")
     free = satellite([-0.04, -0.62, 0.59, 0.51], [3.9, 0.4, 0.6], [0.0, 2.0, -2.0])
     R, omega = free.R_WT, free.omega
     grapple = Grapple(TorqueFreeMotion(body, free))
-    start = RobotMotion.at_rest(HERE, FOLDED)
     totals, durations = [], []
     for detumbles in (False, True):
         asked = replace(grapple, detumbles=detumbles)
-        motion = planner.plan(start, asked)
+        motion = planner.plan(FOLDED_REST, asked)
         model = pin.buildModelFromXML(planner.robot.description.urdf, pin.JointModelFreeFlyer())
         data, last = model.createData(), motion.at(motion.duration)
-        q, v = pin.neutral(model), np.zeros(model.nv)
-        base = Rotation.from_quat(last.base.quaternion)
-        q[:7] = [*last.base.position, *last.base.quaternion]
-        v[:3] = base.inv().apply(last.base.velocity)
-        v[3:6] = base.inv().apply(last.base.angular_velocity)
-        for name, position, rate in zip(planner.robot.joint_names, last.q, last.qdot, strict=True):
-            joint = model.joints[model.getJointId(name)]
-            turns = [position] if joint.nq == 1 else [np.cos(position), np.sin(position)]
-            q[joint.idx_q : joint.idx_q + joint.nq], v[joint.idx_v] = turns, rate
+        pose, v = np.concatenate(last.base[:2]), np.zeros(model.nv)
+        q = configuration(model, planner.robot, pose, last.q)
+        v[:6] = Rotation.from_quat(pose[3:]).inv().apply(last.base[2:4]).ravel()
+        for name, rate in zip(planner.robot.joint_names, last.qdot, strict=True):
+            v[model.joints[model.getJointId(name)].idx_v] = rate
         h = pin.computeCentroidalMomentum(model, data, q, v)
         X, r = tumbled(target, free, np.array([0.0, motion.duration]))
         inertia, m = body.inertia, data.mass[0]
@@ -198,11 +177,9 @@ def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
 
 
 def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
-    start = RobotMotion.at_rest(HERE, np.zeros(1))
-
     def refusal(free: BodyMotion, **options: Any) -> str:
         with pytest.raises(PlanningError) as refused:
-            boomed(**options).plan(start, meeting(free))
+            boomed(**options).plan(REST, meeting(free))
         return str(refused.value)
 
     # From rest to 6 m/s takes 17 kg 128 s by 0.8 N.
@@ -213,7 +190,7 @@ def test_meetings_that_cannot_be_are_refused_in_a_sentence() -> None:
     short = refusal(slab((2.5, 0.2, -0.1)), duration=3.0)
     assert_one_sentence(short, "s at least", "plan.duration is 3 s")
     with pytest.raises(PlanningError) as late:
-        boomed().plan(start, replace(meeting(slab((2.5, 0.2, -0.1))), horizon=14.0))
+        boomed().plan(REST, replace(meeting(slab((2.5, 0.2, -0.1))), horizon=14.0))
     assert_one_sentence(str(late.value), "takes at least", "target.horizon is 14 s: increase it")
 
 

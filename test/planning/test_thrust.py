@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import cache
 from typing import Any
 
@@ -9,7 +10,7 @@ import coal
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.thrust_flights import beyond, flown_by_pinocchio
+from support.thrust_flights import FOLDED, beyond, flown_by_pinocchio
 
 from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
@@ -17,8 +18,8 @@ from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
-from spacerobot_ros.planning.methods.thrust.problem import Propulsion, ThrustGoal
-from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
+from spacerobot_ros.planning.methods.thrust.problem import Propulsion, ThrustGoal, ThrustOptions
+from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 from spacerobot_ros.resources import robot_file
 
 MASS, INERTIA, FORCE, TORQUE = 16.0, np.array([0.3, 0.35, 0.4]), 0.5, 0.05
@@ -27,19 +28,19 @@ CUBE = f"""<robot name="cube"><link name="base_link"><inertial><mass value="{MAS
 </inertial><collision><geometry><box size="0.4 0.3 0.2"/></geometry></collision></link></robot>"""
 
 START = np.array([0.4, -1.3, 0.7, *Rotation.from_rotvec([0.5, -0.3, 1.1]).as_quat()])
-FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+REST = RobotMotion.at_rest(START, np.zeros(0))
 
 
 def cube_planner(robot: SpaceRobot | None = None, **options: Any) -> ThrustPlanner:
+    chosen = ThrustOptions(reserve=0.0, **options)
     robot = robot or SpaceRobot.from_urdf(CUBE)
-    return ThrustPlanner(robot, Propulsion.within(FORCE, TORQUE), ThrustOptions(**options))
+    return ThrustPlanner(robot, chosen, force=FORCE, torque=TORQUE)
 
 
 @cache
 def servicer() -> ThrustPlanner:
     robot = SpaceRobot.from_file(robot_file("servicer"))
-    propulsion = Propulsion.of_table(thrusters_of_urdf(robot.description), 0.2)
-    return ThrustPlanner(robot, propulsion, ThrustOptions(), "end_effector")
+    return ThrustPlanner(robot, ThrustOptions(thrusters="urdf"), "end_effector")
 
 
 def coasting(time: float, distance: float, acceleration: float) -> float:
@@ -52,12 +53,11 @@ def test_shortest_times_and_least_impulses_are_those_of_closed_forms(rotates: bo
     way, turn = np.array([0.0, 1.2, 0.0]), np.array([0.0, 0.0, 1.1])
     displacement, rotvec = (0 * way, turn) if rotates else (way, 0 * turn)
     distance, limit, inertia = (1.1, TORQUE, INERTIA[2]) if rotates else (1.2, FORCE, MASS)
-    start = RobotMotion.at_rest(START, np.zeros(0))
     goal = ThrustGoal(beyond(START, displacement, rotvec))
-    fastest = cube_planner(time_factor=1.0).plan(start, goal)
+    fastest = cube_planner(time_factor=1.0).plan(REST, goal)
     shortest = 2 * np.sqrt(distance * inertia / limit)
     assert fastest.duration == pytest.approx(shortest, rel=1e-3)
-    cheapest = cube_planner(time_factor=1.5).plan(start, goal)
+    cheapest = cube_planner(time_factor=1.5).plan(REST, goal)
     burn = coasting(1.5 * shortest, distance, limit / inertia)
     assert cheapest.duration == pytest.approx(1.5 * shortest, rel=1e-3)
     assert cheapest.spent == pytest.approx(2 * limit * burn, rel=5e-3)
@@ -69,8 +69,8 @@ def test_a_cube_turns_on_the_way_where_that_lets_more_thrusters_push() -> None:
     # Along an axis of the body; other thrusters push along a diagonal.
     along = float(np.maximum(table.wrenches[0], 0.0).sum())
     straight = 2 * np.sqrt(1.2 * robot.total_mass / along)
-    options = ThrustOptions(time_factor=1.0, clearance=0.0)
-    planner = ThrustPlanner(robot, Propulsion.of_table(table), options)
+    options = ThrustOptions(time_factor=1.0, clearance=0.0, reserve=0.0, thrusters="urdf")
+    planner = ThrustPlanner(robot, options)
     upright = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     goal = ThrustGoal(upright + np.eye(7)[0] * 1.2)
     motion = planner.plan(RobotMotion.at_rest(upright, np.zeros(0)), goal)
@@ -114,7 +114,6 @@ def test_hand_and_base_reach_their_poses_together() -> None:
     hand = np.array([2.28, 1.85, 0.79, *Rotation.from_rotvec([-0.56, 0.95, 1.05]).as_quat()])
     motion = planner.plan(RobotMotion.at_rest(pose, FOLDED), ThrustGoal(base, hand))
     last = motion.at(motion.duration)
-    assert last.end_effector is not None
     for frame, goal in ((last.base, base), (last.end_effector, hand)):
         assert frame.position == pytest.approx(goal[:3], abs=1e-4)
         apart = Rotation.from_quat(goal[3:]).inv() * Rotation.from_quat(frame.quaternion)
@@ -128,9 +127,6 @@ def test_accelerations_are_the_derivatives_of_velocities() -> None:
     time, dt = 7.37 * motion.step, 1e-4
     before, at, after = (motion.at(time + by) for by in (-dt, 0.0, dt))
     for one, frame, other in zip(before[:2], at[:2], after[:2], strict=True):
-        assert one is not None
-        assert frame is not None
-        assert other is not None
         assert frame.velocity == pytest.approx((other.position - one.position) / (2 * dt), abs=1e-7)
         slope = (other.velocity - one.velocity) / (2 * dt)
         assert frame.acceleration == pytest.approx(slope, abs=1e-7)
@@ -150,53 +146,33 @@ def test_a_box_in_the_way_is_passed_clear_of_it() -> None:
         "</robot>"
     )
     robot = SpaceRobot(with_world(SpaceRobot.from_urdf(CUBE).description, world))
-    start = RobotMotion.at_rest(START, np.zeros(0))
-    motion = cube_planner(robot).plan(start, ThrustGoal(goal))
-    free = cube_planner().plan(start, ThrustGoal(goal))
+    motion = cube_planner(robot).plan(REST, ThrustGoal(goal))
+    free = cube_planner().plan(REST, ThrustGoal(goal))
     body, box = coal.Box(0.4, 0.3, 0.2), coal.Box(*size)
     placed = coal.Transform3s(Rotation.from_euler("xyz", rpy).as_matrix(), middle)
-    distances = []
-    for flight in (motion, free):
-        nearest = np.inf
-        for time in np.linspace(0, flight.duration, 400):
-            frame = flight.at(time).base
-            R = Rotation.from_quat(frame.quaternion).as_matrix()
-            result = coal.DistanceResult()
-            nearest = min(
-                nearest,
-                coal.distance(
-                    body,
-                    coal.Transform3s(R, frame.position),
-                    box,
-                    placed,
-                    coal.DistanceRequest(),
-                    result,
-                ),
-            )
-        distances.append(nearest)
-    assert distances[0] >= 0.01 - 1e-6
-    assert distances[1] < 0
+    asked = coal.DistanceRequest(), coal.DistanceResult()
+
+    def nearest(flight: ThrustMotion) -> float:
+        frames = [flight.at(time).base for time in np.linspace(0, flight.duration, 400)]
+        turns = Rotation.from_quat([each.quaternion for each in frames]).as_matrix()
+        places = [coal.Transform3s(R, x.position) for R, x in zip(turns, frames, strict=True)]
+        return float(min(coal.distance(body, at, box, placed, *asked) for at in places))
+
+    assert nearest(motion) >= 0.01 - 1e-6
+    assert nearest(free) < 0
     assert motion.spent < 1.4 * free.spent
 
 
 def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
-    start = RobotMotion.at_rest(START, np.zeros(0))
     goal = ThrustGoal(beyond(START, np.array([1.0, 0.0, 0.0]), np.zeros(3)))
     with pytest.raises(UnreachableError, match=r"takes at least 11\.3\d* s, but plan\.duration"):
-        cube_planner(duration=5.0).plan(start, goal)
+        cube_planner(duration=5.0).plan(REST, goal)
     table = thrusters_of_urdf(servicer().robot.description)
-    one_way = ThrusterTable(
-        table.names[:1],
-        table.r_B[:1],
-        table.direction_B[:1],
-        table.force[:1],
-        table.min_on_time[:1],
-        table.isp[:1],
-    )
+    one_way = ThrusterTable(*(getattr(table, each.name)[:1] for each in fields(table)))
     with pytest.raises(ParameterError, match="cannot produce"):
-        Propulsion.of_table(one_way)
+        Propulsion.of_table(one_way, 0.0)
     with pytest.raises(ParameterError, match="set max_force"):
-        Propulsion.within(np.inf, 1.0)
+        ThrustPlanner(SpaceRobot.from_urdf(CUBE), ThrustOptions(), torque=1.0)
     far = np.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     with pytest.raises(NotFoundError, match="No joint positions were found that put"):
         servicer().plan(RobotMotion.at_rest(START, FOLDED), ThrustGoal(START, far))
@@ -219,7 +195,7 @@ def test_options_bound_the_motion_of_joints_and_the_levels() -> None:
 
     def planned(**options: Any) -> ThrustMotion:
         given = ThrustOptions(**{"time_factor": 1.0, "clearance": 0.0, "intervals": 16, **options})
-        return ThrustPlanner(robot, Propulsion.within(3.0, 1.0), given).plan(start, goal)
+        return ThrustPlanner(robot, given, force=3.75, torque=1.25).plan(start, goal)
 
     def fastest(motion: ThrustMotion) -> tuple[float, float, float]:
         times = np.linspace(0, motion.duration, 500, endpoint=False)

@@ -12,21 +12,18 @@ import time
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from support.thrust_flights import beyond, flown_by_pinocchio
+from support.thrust_flights import FOLDED, beyond, flown_by_pinocchio
 
 from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import RobotMotion
-from spacerobot_ros.model.thrusters import thrusters_of_urdf
 from spacerobot_ros.model.urdf import parse_world
-from spacerobot_ros.planning.methods.thrust.problem import Propulsion, ThrustGoal
-from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
+from spacerobot_ros.planning.methods.thrust.problem import ThrustGoal, ThrustOptions
+from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 from spacerobot_ros.resources import robot_file
 
 ROBOTS = ("jet_cube", "free_flyer", "servicer", "servicer_wheels")
-FOLDED = [0.0, -1.2, 2.0, 0.0, 0.8, 0.0]
-"""Joint positions of the arm of a servicer, whose wheels come after it."""
 
 
 def box(number: int, place: np.ndarray, rng: np.random.Generator, size: float) -> str:
@@ -43,15 +40,13 @@ def box(number: int, place: np.ndarray, rng: np.random.Generator, size: float) -
 def measure(name: str, count: int, boxes: int, seed: int) -> str:
     """Return a line about goals of one robot."""
     free = SpaceRobot.from_file(robot_file(name))
-    if name == "free_flyer":
-        propulsion = Propulsion.within(0.5, 0.05, 0.2)
-    else:
-        propulsion = Propulsion.of_table(thrusters_of_urdf(free.description), 0.2)
     folded = np.zeros(free.n)
     if name.startswith("servicer"):
-        folded[:6] = FOLDED
+        folded[:6] = FOLDED  # Its wheels come after the arm.
     far, size = (8.0, 0.7) if name.startswith("servicer") else (3.0, 0.35)
-    planner = ThrustPlanner(free, propulsion, ThrustOptions(clearance=0.0 if not boxes else 0.01))
+    table = "" if name == "free_flyer" else "urdf"
+    options = ThrustOptions(clearance=0.01 if boxes else 0.0, thrusters=table)
+    planner = ThrustPlanner(free, options, force=0.5, torque=0.05)
     rng = np.random.default_rng(seed)
     cpu, nearest, planned, error = [], [], 0, np.nan
     for _ in range(count):
@@ -65,9 +60,7 @@ def measure(name: str, count: int, boxes: int, seed: int) -> str:
         bend = 0.0 if boxes else rng.uniform(-1, 1, free.n)
         shape = np.clip(folded + bend, free.lower, free.upper)
         if boxes:
-            middle = [
-                begin[:3] + (goal[:3] - begin[:3]) * (k + 1) / (boxes + 1) for k in range(boxes)
-            ]
+            middle = np.linspace(begin[:3], goal[:3], boxes + 2)[1:-1]
             links = "".join(box(k, at, rng, size) for k, at in enumerate(middle))
             world = parse_world(f'<robot name="world"><link name="w"/>{links}</robot>')
             planner.use_obstacles(world)

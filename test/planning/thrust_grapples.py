@@ -14,21 +14,19 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from support.thrust_flights import distance_from_target, tumbled
+from support.thrust_flights import FOLDED, distance_from_target, tumbled
 
 from spacerobot_ros import fly
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, TargetBody
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
-from spacerobot_ros.model.thrusters import thrusters_of_urdf
-from spacerobot_ros.planning.methods.thrust.problem import Grapple, Propulsion
-from spacerobot_ros.planning.methods.thrust.search import ThrustOptions, ThrustPlanner
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, ThrustOptions
+from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 from spacerobot_ros.resources import robot_file, share_directory
 
 TARGET = share_directory() / "config" / "targets" / "satellite.urdf"
 SENSORS = ("position", "attitude", "velocity", "angular_velocity")
-FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
 
 
 def tumbling(rate: float, rng: np.random.Generator) -> BodyMotion:
@@ -45,8 +43,7 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
     robot = SpaceRobot.from_file(robot_file("servicer"))
     target = load_robot(TARGET)
     body = TargetBody.of(target, "grapple")
-    table = thrusters_of_urdf(robot.description)
-    planner = ThrustPlanner(robot, Propulsion.of_table(table, 0.2), ThrustOptions(), "end_effector")
+    planner = ThrustPlanner(robot, ThrustOptions(thrusters="urdf"), "end_effector")
     start = RobotMotion.at_rest(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), FOLDED)
     rng, cpu, nearest, missed, left = np.random.default_rng(seed), [], [], [], []
     longer, touching = [], 0
@@ -55,17 +52,14 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
         grapple = Grapple(TorqueFreeMotion(body, free), target, 0.02)
         began = time.process_time()
         try:
-            plain = planner.plan(start, grapple)
+            motion = plain = planner.plan(start, grapple)
             if detumbles:
                 began = time.process_time()
-                asked = replace(grapple, detumbles=True)
-                motion = planner.plan(start, asked)
+                motion = planner.plan(start, replace(grapple, detumbles=True))
                 longer.append(motion.duration / plain.duration)
                 spins = np.linalg.norm(body.inertia.about_com @ free.R_WT.T @ free.omega)
                 joined = motion.joined_momentum(grapple.motion)
                 left.append(float(np.linalg.norm(joined) / spins))
-            else:
-                motion = plain
         except PlanningError as refusal:
             print(f"{number}: {refusal}", flush=True)
             continue
@@ -73,11 +67,8 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
             cpu.append(time.process_time() - began)
         nearest.append(distance_from_target(robot.description, target, motion, free))
         X, r = tumbled(target, free, np.array([0.0, motion.duration]))
-        hand = motion.at(motion.duration).end_effector
-        assert hand is not None
-        missed.append(
-            np.linalg.norm(r[1] + Rotation.from_quat(X[1]).apply(body.grapple.r) - hand[0])
-        )
+        fixture = r[1] + Rotation.from_quat(X[1]).apply(body.grapple.r)
+        missed.append(np.linalg.norm(motion.at(motion.duration).end_effector.position - fixture))
         if bare:
             careless = planner.plan(start, replace(grapple, clearance=0.0))
             touching += distance_from_target(robot.description, target, careless, free) <= 0
@@ -123,7 +114,6 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
         capture = flight.capture
         print(f"{number}: {flight.message} {capture.get('time_s')}", flush=True)
         if capture["captured"]:
-            assert flight.propellant is not None
             captured += 1
             propellant.append(flight.propellant or 0.0)
             left.append(float(np.linalg.norm(capture["angular_momentum_Nms"])))
@@ -149,11 +139,8 @@ def main() -> None:
         if given.only not in ("", f"{rate:g}"):
             continue
         if given.flown:
-            for profile, detumble in (
-                ("planned", "before"),
-                ("planned", "after"),
-                ("quintic", "after"),
-            ):
+            ways = ("planned", "before"), ("planned", "after"), ("quintic", "after")
+            for profile, detumble in ways:
                 print(flown(rate, given.goals, given.seed, profile, detumble), flush=True)
         else:
             asked = {"detumbles": given.detumbles, "bare": given.bare}

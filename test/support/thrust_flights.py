@@ -15,6 +15,9 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 
+FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+"""Joint positions of the arm of a servicer."""
+
 
 def beyond(start: Array, displacement: Array, rotvec: Array) -> Array:
     """Return the pose that is displaced and rotated from one, in the components of its frame."""
@@ -23,19 +26,25 @@ def beyond(start: Array, displacement: Array, rotvec: Array) -> Array:
     return np.concatenate([start[:3] + R.apply(displacement), turned.as_quat()])
 
 
+def configuration(model: pin.Model, robot: SpaceRobot, pose: Array, q: Array) -> Array:
+    """Return the configuration of a model at a base pose (7,) and a shape (n,)."""
+    found = pin.neutral(model)
+    found[:7] = pose
+    for name, value in zip(robot.joint_names, q, strict=True):
+        joint = model.joints[model.getJointId(name)]
+        found[joint.idx_q : joint.idx_q + joint.nq] = (
+            [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+        )
+    return np.asarray(found)
+
+
 def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: RobotMotion) -> Array:
     """Return where Pinocchio ends under the wrenches and efforts of a motion: q of its model."""
     model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
     model.gravity = pin.Motion.Zero()
     data = model.createData()
-    ids = [model.getJointId(name) for name in robot.joint_names]
-    q0 = pin.neutral(model)
-    q0[:7] = start.pose
-    for index, value in zip(ids, start.q, strict=True):
-        joint = model.joints[index]
-        q0[joint.idx_q : joint.idx_q + joint.nq] = (
-            [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-        )
+    places = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names]
+    q0 = configuration(model, robot, start.pose, start.q)
 
     def rate(time: float, y: Array) -> Array:
         # On the tangent space of the start: its displacement moves with the velocity.
@@ -43,8 +52,7 @@ def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: RobotMoti
         q = pin.normalize(model, q)
         sample = motion.at(time)
         efforts = np.zeros(model.nv)
-        for index, tau in zip(ids, sample.tau, strict=True):
-            efforts[model.joints[index].idx_v] = tau
+        efforts[places] = sample.tau
         external = [pin.Force.Zero() for _ in range(model.njoints)]
         external[1] = pin.Force(sample.wrench_B[:3], sample.wrench_B[3:])
         a = pin.aba(model, data, q, v, efforts, external)

@@ -173,7 +173,7 @@ class ThrustMotion:
         # Knots satisfy the program with their own defects: this is the remaining difference.
         turn = quaternion_multiply(quaternion_inverse(states[1:, :4]), ends[:, :4])
         rest = np.hstack([rotvecs_from_quaternions(turn), ends[:, 4:13] - states[1:, 4:13]])
-        return rest if self._knots.defects is None else self._knots.defects + rest
+        return np.asarray(self._knots.defects + rest)
 
     def at(self, time: float) -> MotionSample:
         """Return the motion at a time since its start, s; after its end, the final state."""

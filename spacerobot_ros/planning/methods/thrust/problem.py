@@ -1,4 +1,4 @@
-"""Goals of motions under thrust, and the propulsion of the base."""
+"""Options and goals of motions under thrust, and the propulsion of the base."""
 
 from __future__ import annotations
 
@@ -14,7 +14,52 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.rotations import compose_poses, relative_pose
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.model.thrusters import ThrusterTable
+from spacerobot_ros.parameters import parameter
+from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE
 from spacerobot_ros.planning.core.goal import end_effector_pose
+from spacerobot_ros.planning.methods.optimal.problem import MotionOptions
+
+
+@dataclass(frozen=True)
+class ThrustOptions(MotionOptions):
+    """Options of motions planned under thrust."""
+
+    time_factor: float = parameter(
+        1.5,
+        "duration of a least-propellant motion, relative to the shortest motion; 1: the shortest "
+        "motion",
+        minimum=1.0,
+        maximum=1e3,
+    )
+    duration: float = parameter(
+        0.0,
+        "duration of a motion; 0: determined by time_factor",
+        unit="s",
+        minimum=0.0,
+        maximum=1e5,
+    )
+    reserve: float = parameter(
+        0.2,
+        "fraction of thrust and joint efforts reserved for the controller's feedback",
+        minimum=0.0,
+        maximum=0.9,
+    )
+    intervals: int = parameter(30, "steps of the problem", minimum=10, maximum=1000)
+    iterations: int = parameter(
+        300, "largest number of solver steps from one guess", minimum=1, maximum=100000
+    )
+    clearance: float = parameter(
+        DEFAULT_CLEARANCE,
+        "smallest distance between links, and between links and obstacles; 0: contacts are ignored",
+        unit="m",
+        minimum=0.0,
+        maximum=1e3,
+    )
+    thrusters: str = parameter(
+        "",
+        "thruster table for plans: 'urdf' or a YAML file; '': any wrench within max_force and "
+        "max_torque",
+    )
 
 
 @dataclass(frozen=True)
@@ -44,7 +89,7 @@ class Propulsion:
         return 0.0 if self.is_table else -1.0
 
     @classmethod
-    def of_table(cls, table: ThrusterTable, reserve: float = 0.0) -> Propulsion:
+    def of_table(cls, table: ThrusterTable, reserve: float) -> Propulsion:
         """Return the propulsion for a thruster table, with a fraction of the levels reserved for
         feedback.
 
@@ -63,7 +108,7 @@ class Propulsion:
         return cls(share * table.wrenches, share * table.mass_flow, is_table=True)
 
     @classmethod
-    def within(cls, force: float, torque: float, reserve: float = 0.0) -> Propulsion:
+    def within(cls, force: float, torque: float, reserve: float) -> Propulsion:
         """Return the propulsion for a largest force (N) and torque (N m), each in Euclidean norm.
 
         Raises

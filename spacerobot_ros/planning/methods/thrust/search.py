@@ -33,25 +33,27 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     quaternions_from_rotvecs,
 )
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import with_world
 from spacerobot_ros.model.wheels import ReactionWheels
-from spacerobot_ros.parameters import parameter
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
-from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
 from spacerobot_ros.planning.methods.optimal.initial_guesses import rates_between
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
-from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, MotionOptions
+from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.thrust.bodies import Bodies
 from spacerobot_ros.planning.methods.thrust.motion import MotionFunctions, ThrustMotion, base_poses
 from spacerobot_ros.planning.methods.thrust.problem import (
     Grapple,
     Propulsion,
     ThrustGoal,
+    ThrustOptions,
     base_for_hand,
 )
 from spacerobot_ros.planning.methods.thrust.transcription import (
+    DEFECT_SIZE,
     EndKind,
     KeptPlaces,
     ThrustBoundary,
@@ -107,45 +109,6 @@ _BOW_SHARES, _BOW_DIRECTIONS = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0), 12
 """Heights of bends away from a straight line, relative to the smallest height worth trying, and
 number of directions."""
 
-_FREE_TIME = DurationBounds(1e-3, 1e5)
-
-
-@dataclass(frozen=True)
-class ThrustOptions(MotionOptions):
-    """Options of motions planned under thrust."""
-
-    time_factor: float = parameter(
-        1.5,
-        "duration of a least-propellant motion, relative to the shortest motion; 1: the shortest "
-        "motion",
-        minimum=1.0,
-        maximum=1e3,
-    )
-    duration: float = parameter(
-        0.0,
-        "duration of a motion; 0: determined by time_factor",
-        unit="s",
-        minimum=0.0,
-        maximum=1e5,
-    )
-    reserve: float = parameter(
-        0.2,
-        "fraction of thrust and joint efforts reserved for the controller's feedback",
-        minimum=0.0,
-        maximum=0.9,
-    )
-    intervals: int = parameter(30, "steps of the problem", minimum=10, maximum=1000)
-    iterations: int = parameter(
-        300, "largest number of solver steps from one guess", minimum=1, maximum=100000
-    )
-    clearance: float = parameter(
-        DEFAULT_CLEARANCE,
-        "smallest distance between links, and between links and obstacles; 0: contacts are ignored",
-        unit="m",
-        minimum=0.0,
-        maximum=1e3,
-    )
-
 
 class ThrustPlanner:
     """Plans base and joint motions of one robot.
@@ -154,35 +117,41 @@ class ThrustPlanner:
     ----------
     robot
         The model, including its world, if any.
-    propulsion
-        Base propulsion, reduced by the reserve.
     options
         The options.
     link
         End-effector link; empty: none.
+    force, torque
+        Largest force (N) and torque (N m) on the base, used if there is no thruster table.
 
     Raises
     ------
     ParameterError
-        An option does not fit the robot, or there is neither a base nor an end-effector to move.
+        An option does not fit the robot, the thrusters cannot produce every wrench, or, without a
+        table, the thrust has no limits.
     """
 
     def __init__(
         self,
         robot: SpaceRobot,
-        propulsion: Propulsion,
-        options: ThrustOptions = ThrustOptions(),
+        options: ThrustOptions,
         link: str = "",
+        force: float = math.inf,
+        torque: float = math.inf,
     ) -> None:
-        self.robot, self.propulsion, self.options, self.link = robot, propulsion, options, link
+        self.robot, self.options, self.link = robot, options, link
+        if options.thrusters:
+            table = find_thrusters(options.thrusters, robot.description)
+            self.propulsion = Propulsion.of_table(table, options.reserve)
+        else:
+            self.propulsion = Propulsion.within(force, torque, options.reserve)
         self.limits = MotionLimits.of(robot, options, "plan")
         self.clearance = Clearance.wanted(robot.description, options.clearance, "plan.clearance")
-        wheels = ReactionWheels.of(robot.description)
         self._wheels = np.zeros(robot.n, dtype=bool)
-        self._wheels[wheels.index] = True
+        self._wheels[ReactionWheels.of(robot.description).index] = True
         self.effort_limit = (1.0 - options.reserve) * robot.effort_limit
         """(n,) efforts that a plan may use."""
-        self._stages = cache(partial(thrust_stages, robot, len(propulsion.cost)))
+        self._stages = cache(partial(thrust_stages, robot, len(self.propulsion.cost)))
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
@@ -365,7 +334,8 @@ class ThrustPlanner:
         change = np.diff(v, axis=0) / h
         most = float(np.max(np.abs(change) / self.limits.acceleration, initial=0.0))
         time = max(speed, math.sqrt(most), math.sqrt(float(np.abs(wanted).max())), 1e-3)
-        knots = ThrustKnots(h, np.hstack([X, L, r, V, q, v]), change, wanted).stretched(time)
+        states = np.hstack([X, L, r, V, q, v])
+        knots = ThrustKnots(h, states, change, wanted, np.zeros((N, DEFECT_SIZE))).stretched(time)
         return replace(knots, levels=np.clip(knots.levels, self.propulsion.lowest, 1.0))
 
 
@@ -544,7 +514,7 @@ class _Search:
         self.stop.cancellation.raise_if_requested()
         duration = DurationBounds(guess.duration, guess.duration)
         if not self.is_timed:
-            duration = _FREE_TIME
+            duration = DurationBounds(1e-3, 1e5)
         elif self.grapple is not None and center is None and not self.bodies.kept:
             duration = DurationBounds(self.earliest, self.latest)
         boundary = self.boundary._replace(goals=self._goals(guess.duration))
@@ -619,10 +589,10 @@ class _Search:
             solved = self._solve(at, self._weights(at, _ROUNDINGS[0]))
             if solved is None:
                 return None
-            if self._solver.lack > _LARGEST_LACK:
-                if self._solver.lack > lack / 2:
+            if solved.lack > _LARGEST_LACK:
+                if solved.lack > lack / 2:
                     return None
-                at, lack = solved, self._solver.lack
+                at, lack = solved, solved.lack
                 continue
             motion = self.planner.motion(solved)
             near, solved = bodies.approaches(motion), replace(solved, defects=motion.defects())

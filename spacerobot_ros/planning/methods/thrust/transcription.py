@@ -121,16 +121,17 @@ class ThrustKnots:
     ``states`` (N + 1, 13 + 2 n) are ``[X; L; r; V; q; qdot]``: the quaternion of R_WB, the angular
     momentum about the centre of mass, N m s, its position and velocity, all in W, and positions and
     velocities of the joints. ``accelerations`` (N, n) are joint accelerations, ``levels`` (N, m)
-    propulsion levels. A solution has the multipliers of its variables and of its rows. ``defects``
-    (N, 12) are the interval defects; None: zero.
+    propulsion levels, and ``defects`` (N, 12) the interval defects. A solution has the multipliers
+    of its variables and of its rows; its pairs are closer than required by at most ``lack``, m.
     """
 
     step: float
     states: Array
     accelerations: Array
     levels: Array
+    defects: Array
     multipliers: tuple[Array, Array] | None = None
-    defects: Array | None = None
+    lack: float = 0.0
 
     @property
     def duration(self) -> float:
@@ -145,6 +146,7 @@ class ThrustKnots:
             np.hstack([X, L / factor, r, V / factor, q, qdot / factor]),
             self.accelerations / factor**2,
             self.levels / factor**2,
+            np.zeros_like(self.defects),
         )
 
 
@@ -350,12 +352,10 @@ class ThrustSolver:
         propulsion: Propulsion,
         intervals: int,
         acceleration: Array,
-        pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]] = (),
+        pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]],
     ) -> None:
         self.end = stages[2]
         """Rows of the last knot."""
-        self.lack = 0.0
-        """Distance by which pairs are closer than required in the last solution, m."""
         self._propulsion, self._acceleration = propulsion, acceleration
         n, m = len(acceleration), len(propulsion.cost)
         self._layout = Layout((13 + 2 * n,), (n, m), intervals, bool(pairs))
@@ -455,13 +455,11 @@ class ThrustSolver:
             begin["lam_g0"] = np.append(of_rows[:same], np.zeros(rows - same))
         elif layout.has_lack:
             begins = "clear"
-        defects, centers = np.zeros(DEFECT_SIZE * N), np.zeros(sum(layout.controls) * N)
-        if guess.defects is not None:
-            defects = guess.defects.ravel()
+        centers = np.zeros((N, sum(layout.controls)))
         if center is not None:
-            centers = np.hstack([center.accelerations, center.levels]).ravel()
-        shape = state_parts(boundary.start)[4]
-        parameters = (shape, boundary.goals, defects, weights, centers, planes.ravel())
+            centers = np.hstack([center.accelerations, center.levels])
+        shape, goals, defects = state_parts(boundary.start)[4], boundary.goals, guess.defects
+        parameters = (shape, goals, defects.ravel(), weights, centers.ravel(), planes.ravel())
         least, largest = (
             pack_knots(layout, span / N, bounds, acceleration, np.array(level))
             for span, bounds, acceleration, level in (
@@ -481,7 +479,7 @@ class ThrustSolver:
             if self._monitor.best is None:
                 return None
             x = self._monitor.best
-        step, (states, accelerations, levels) = float(x[0]), (x[at] for at in layout.knots())
+        step, lack = float(x[0]), float(x[-1]) * layout.has_lack
+        states, accelerations, levels = (x[at] for at in layout.knots())
         states = with_joints_moved(states, -step / 2)
-        self.lack = float(x[-1]) if layout.has_lack else 0.0
-        return ThrustKnots(step, states, accelerations, levels, multipliers, guess.defects)
+        return ThrustKnots(step, states, accelerations, levels, defects, multipliers, lack)
