@@ -19,11 +19,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from support.hostile import containers, contents
+from support.hostile import cases  # noqa: F401  It fills CASES.
 from support.hostile.records import CASES, GIB, MOST
-
-MAKERS = (containers, contents)
-"""What fills the cases when it is imported."""
 
 TIME_LIMIT = 10.0
 MEMORY_LIMIT_MB = 500.0

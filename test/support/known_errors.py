@@ -15,9 +15,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -25,8 +24,6 @@ from queue import SimpleQueue
 from typing import Any
 
 import yaml
-from support.fork_server import ForkServer, How, environment_of, write_source
-from support.forked import NotExchangedError
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "test" / "known_errors"
@@ -38,9 +35,6 @@ _COPIED = (
 _AT_ONCE = 2
 _TIME_LIMIT = 240.0
 """Wall time for the tests of one error, s."""
-
-_LIMITS = (60.0, _TIME_LIMIT)
-"""CPU and wall time of a test in a fork, s."""
 
 _KEEPS_RESULTS = ("spacerobot_ros/model/", "spacerobot_ros/planning/")
 """What is planned here is kept in a cache: an error in it gets a cache of its own, without plans.
@@ -167,58 +161,26 @@ class Outcome(Enum):
 class Workplace:
     """A copy of the project, in which one error is tried at a time.
 
-    Most errors are tried in a fork of a process that has collected the tests already, where the
-    functions that differ are exchanged. An error in what is executed while its file is imported,
-    and one that is not noticed so, is tried by a pytest of its own.
-
     Parameters
     ----------
     folder
         That of the copy, which is made.
     shared_cache
         What is compiled is kept there.
-    project
-        Where the original is.
-    files
-        Files with tests that the process with the forks collects; none: there is no such process.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        shared_cache: Path,
-        project: Path = ROOT,
-        files: Iterable[str] = (),
-    ) -> None:
+    def __init__(self, folder: Path, shared_cache: Path) -> None:
         self._folder, self._cache = folder, shared_cache
         self._own_cache = folder / "own_cache"
+        self._changes = 0
         ignored = shutil.ignore_patterns("__pycache__", ".*")
         folder.mkdir(parents=True)
         shared_cache.mkdir(exist_ok=True, mode=0o700)
-        for path in project.iterdir():
+        for path in ROOT.iterdir():
             if path.is_file():
                 shutil.copy(path, folder)
             elif path.name in _COPIED:
                 shutil.copytree(path, folder / path.name, ignore=ignored)
-        named = tuple(files)
-        self._server = self._serve(named) if named else None
-
-    def _serve(self, files: Sequence[str]) -> ForkServer:
-        server = ForkServer(self._folder / "forks", self._folder, self._environment(), files)
-        if not server.ready:
-            output = (self._folder / "forks" / "output").read_text("utf-8")
-            raise RuntimeError(f"The tests cannot be collected:\n{output}")
-        return server
-
-    def close(self) -> None:
-        """End the process with the forks."""
-        if self._server is not None:
-            self._server.close()
-
-    def failing(self, tests: Iterable[str]) -> str:
-        """Return the first test that fails in a fork though there is no error; "": none does."""
-        assert self._server is not None
-        return self._server.run(dict.fromkeys(tests, _LIMITS))[0]
 
     def try_error(self, error: KnownError) -> tuple[Outcome, str]:
         """Return what its tests make of an error, and their output where they did not run."""
@@ -228,81 +190,54 @@ class Workplace:
             changed = error.put_into(text)
         except ValueError as problem:
             return Outcome.NOT_RUN, str(problem)
-        own = error.file.startswith(_KEEPS_RESULTS)
-        write_source(path, changed)
+        self._write(path, changed)
         try:
-            if own:
+            if error.file.startswith(_KEEPS_RESULTS):
                 # Plans of the code as it is, under the names of those that it would make now.
                 shutil.copytree(
                     self._cache, self._own_cache, ignore=shutil.ignore_patterns("plans")
                 )
-            if self._noticed_in_a_fork(error, path, text):
-                return Outcome.NOTICED, ""
-            code, output = self._pytest(error.noticed_by)
+            code, output = self.test(error.noticed_by)
         finally:
-            write_source(path, text)
+            self._write(path, text)
             shutil.rmtree(self._own_cache, ignore_errors=True)
         match code:
             case 0:
                 return Outcome.NOT_NOTICED, ""
             case 1:
                 return Outcome.NOTICED, ""
-            case None:
-                return Outcome.NOT_RUN, f"They took longer than {_TIME_LIMIT:g} s."
         return Outcome.NOT_RUN, output
 
-    def _noticed_in_a_fork(self, error: KnownError, path: Path, text: str) -> bool:
-        if self._server is None:
-            return False
-        exchange = (str(path), text) if path.suffix == ".py" else None
-        limits = dict.fromkeys(error.noticed_by, _LIMITS)
-        cache = {"SPACEROBOT_CACHE_DIR": str(self._cache_in_use)}
-        try:
-            return self._server.run(limits, exchange, **cache)[1] is How.FAILED
-        except NotExchangedError:
-            return False
+    def _write(self, path: Path, text: str) -> None:
+        path.write_text(text, "utf-8")
+        # A compiled module is taken for up to date by the second in which its source changed.
+        self._changes += 1
+        os.utime(path, (self._changes, self._changes))
 
-    def _pytest(self, words: Iterable[str]) -> tuple[int | None, str]:
+    def test(
+        self, tests: Iterable[str], time_limit: float | None = _TIME_LIMIT
+    ) -> tuple[int | None, str]:
         """Run tests in the copy; return pytest's exit code, None out of time, and its output."""
         # Some of the tests that are named have become slow.
         options = ("-q", "-x", "-p", "no:cacheprovider", "--tb=line", "-m", "slow or not slow")
+        paths = os.pathsep.join((str(self._folder), str(self._folder / "test")))
+        cache = self._own_cache if self._own_cache.exists() else self._cache
         process = subprocess.Popen(
-            [sys.executable, "-m", "pytest", *options, *words],
+            [sys.executable, "-m", "pytest", *options, *tests],
             cwd=self._folder,
-            env=self._environment(),
+            env=os.environ | {"PYTHONPATH": paths, "SPACEROBOT_CACHE_DIR": str(cache)},
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             start_new_session=True,
         )
         try:
-            output, _ = process.communicate(timeout=_TIME_LIMIT)
+            output, _ = process.communicate(timeout=time_limit)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             output, _ = process.communicate()
-            return None, output
+            return None, f"{output}\nThe tests took longer than {_TIME_LIMIT:g} s."
         return process.returncode, output
-
-    @property
-    def _cache_in_use(self) -> Path:
-        return self._own_cache if self._own_cache.exists() else self._cache
-
-    def _environment(self) -> dict[str, str]:
-        # A compiled module is taken for up to date by the second in which its source changed.
-        return environment_of(self._folder, self._cache_in_use) | {"PYTHONDONTWRITEBYTECODE": "1"}
-
-
-@contextmanager
-def _workplaces(files: Sequence[str]) -> Iterator[list[Workplace]]:
-    with tempfile.TemporaryDirectory(prefix="spacerobot_ros_known_errors_") as folder:
-        root, places = Path(folder), list[Workplace]()
-        try:
-            for i in range(_AT_ONCE):
-                places.append(Workplace(root / str(i), root / f"cache{i}", files=files))
-            yield places
-        finally:
-            for place in places:
-                place.close()
 
 
 def main(words: list[str]) -> int:
@@ -319,12 +254,16 @@ def main(words: list[str]) -> int:
         print("No known error is called so.")
         return 2
     tests = sorted({test for error in errors for test in error.noticed_by})
-    files = sorted({test.split("::")[0] for test in tests})
-    with _workplaces(files) as workplaces, ThreadPoolExecutor(_AT_ONCE) as pool:
-        shares = [tests[i::_AT_ONCE] for i in range(_AT_ONCE)]
-        for failing in pool.map(Workplace.failing, workplaces, shares):
-            if failing:
-                print(f"Without any error in the package this test does not pass: {failing}")
+    with (
+        tempfile.TemporaryDirectory(prefix="spacerobot_ros_known_errors_") as folder,
+        ThreadPoolExecutor(_AT_ONCE) as pool,
+    ):
+        root = Path(folder)
+        workplaces = [Workplace(root / str(i), root / f"cache{i}") for i in range(_AT_ONCE)]
+        shares = [share for i in range(_AT_ONCE) if (share := tests[i::_AT_ONCE])]
+        for code, output in pool.map(Workplace.test, workplaces, shares, [None] * len(shares)):
+            if code != 0:
+                print(f"Without any error in the package the tests do not pass:\n{output}")
                 return 1
         free: SimpleQueue[Workplace] = SimpleQueue()
         for workplace in workplaces:

@@ -32,15 +32,6 @@ CASES: dict[str, Callable[[], bytes]] = {}
 """Makers of bags by name."""
 
 
-def case(name: str) -> Callable[[Callable[[], bytes]], Callable[[], bytes]]:
-    def register(make: Callable[[], bytes]) -> Callable[[], bytes]:
-        assert name not in CASES
-        CASES[name] = make
-        return make
-
-    return register
-
-
 # -- records ----------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""Files whose schemas, qualities of service, messages and robots were made to harm their reader."""
+"""Files that were made to harm their reader, by name: chunks, places, contents, whole flights."""
 
 from __future__ import annotations
 
@@ -8,24 +8,162 @@ from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 
+import lz4.frame
+import zstandard
 from mcap.reader import make_reader
 from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Chunk,
+    Footer,
+    Header,
+    McapRecord,
+    MetadataIndex,
     Schema,
 )
-from mcap.writer import CompressionType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from support.hostile.records import (
     CASES,
+    GIB,
     GOOD,
+    MOST,
     SEPARATOR,
     STRING,
+    Part,
     bag,
-    case,
     channel,
     encoded,
+    lz4_zeros,
     message,
     plain,
+    raw,
     string,
+    zstd_zeros,
 )
+
+# -- chunks that inflate ---------------------------------------------------------------------
+
+TEXT = message(string("x"))
+MUCH = zstd_zeros(6 * GIB, claims=6 * GIB)
+"""6 GiB in 197 kB."""
+ALLOWED = Part("zstd", zstd_zeros(60 * 2**20, claims=60 * 2**20), 60 * 2**20)
+
+CHUNKS = {
+    "zstd: 6 GiB in 197 kB, claimed": Part("zstd", MUCH, 6 * GIB),
+    "zstd: 6 GiB in 197 kB, claimed by the chunk alone": Part("zstd", zstd_zeros(6 * GIB), 6 * GIB),
+    "zstd: 6 GiB in 197 kB, 1000 bytes claimed": Part("zstd", zstd_zeros(6 * GIB), 1000),
+    "zstd: 6 GiB claimed by the frame, 1000 bytes by the chunk": Part("zstd", MUCH, 1000),
+    "zstd: 6 GiB claimed by the chunk, 1000 bytes by its index": Part("zstd", MUCH, 6 * GIB, 1000),
+    "zstd: a frame that claims 2^62 bytes": Part("zstd", zstd_zeros(GIB, claims=2**62), 2**62),
+    "zstd: 60 MB of zeros, which is allowed": ALLOWED,
+    "lz4: 1 GiB in 4 MB, claimed": Part("lz4", lz4_zeros(GIB), GIB),
+    "lz4: 1 GiB in 4 MB, 1000 bytes claimed": Part("lz4", lz4_zeros(GIB), 1000),
+    "a compression of no name": Part("\u202erar", TEXT, 100),
+    "a chunk of noise": Part("zstd", bytes(range(256)), 1000),
+    "an empty chunk": Part("zstd", b"", 0),
+    "chunks in a chunk": plain(TEXT, encoded(Chunk("zstd", MUCH, 5, 5, 0, 6 * GIB))),
+    "messages at byte 2^64 - 1 of a chunk": plain(TEXT, entries=[(5, MOST), (5, 0)]),
+    "one message, half a million times in the index": plain(
+        message(string("x" * 1_000_000)), entries=[(5, 0)] * 500_000
+    ),
+    "a message that reaches out of its chunk": plain(raw(0x05, bytes(22), MOST)),
+    "a message shorter than its header": plain(raw(0x05, b"xy"), bytes(60)),
+}
+for _size in (MOST, 2**63, 2**63 - 1, 2**40):
+    for _name, _data in (
+        ("zstd", zstandard.compress(TEXT)),
+        ("lz4", lz4.frame.compress(TEXT)),
+        ("", TEXT),
+    ):
+        title = f"{_name or 'no compression'}: a chunk claims {_size} bytes"
+        CHUNKS[title] = Part(_name, _data, _size)
+for _title, _part in CHUNKS.items():
+    CASES[_title] = lambda part=_part: bag(part)  # type: ignore[misc]
+
+
+def nested() -> bytes:
+    """Return a bag with messages inside of messages."""
+    count, size = 30_000, 31
+    records = [
+        struct.pack("<BQHIQQ", 5, 22 + size * (count - k - 1), 1, 0, 5, 5) for k in range(count)
+    ]
+    return bag(plain(*records, entries=[(5, size * k) for k in range(count)]))
+
+
+def apart() -> bytes:
+    """Return a bag with messages 292 years apart."""
+    last, one = 2**63 - 1, message(string("x"), 0)
+    entries = [(0, 0), (last, len(one))]
+    part = plain(one, message(string("y"), last), entries=entries, times=(0, last))
+    return bag(part, statistics={"message_count": 2, "message_end_time": last})
+
+
+# -- places and lengths -----------------------------------------------------------------------
+
+FIRST_RECORD = len(MCAP0_MAGIC + encoded(Header("ros2", "hostile")))
+
+
+def with_record(record: bytes, index: McapRecord, repeat: int = 1) -> bytes:
+    """Return a bag with a record before its chunk, and the index of that record in its summary."""
+    return bag(GOOD, records=record, summary=encoded(index) * repeat)
+
+
+_LONG = bytes(24) + struct.pack("<Q", MOST) + b"abcd"
+_LARGE = encoded(Attachment(0, 0, "a.urdf", "", bytes(5_000_000)))
+_METADATA = struct.pack("<I", 1) + b"a" + struct.pack("<I", 2**32 - 1) + bytes(50)
+_COUNTS = ("message_count", "message_start_time", "message_end_time")
+
+CASES |= {
+    "zstd: two hundred chunks of 60 MB": lambda: bag(*[ALLOWED] * 200),
+    "one chunk, a thousand times in the index": lambda: bag(ALLOWED, repeat=1000),
+    "one small chunk, ten thousand times in the index": lambda: bag(
+        plain(message(string("x" * 50_000))), repeat=10_000
+    ),
+    "a record of 2^64 - 1 bytes": lambda: bag(GOOD, records=raw(0x0C, b"xyz", MOST)),
+    "a record of 2^63 bytes in the summary": lambda: bag(GOOD, summary=raw(0x04, b"xyz", 2**63)),
+    "a chunk at byte 2^64 - 1": lambda: bag(GOOD, chunk_offset=MOST),
+    "a message index at byte 2^64 - 1": lambda: bag(GOOD, index_offset=MOST),
+    "a message index of 4 GiB": lambda: bag(GOOD, index_size=2**32 - 16),
+    "messages inside of messages": nested,
+    "a footer that names byte 2^64 - 1": lambda: bag(GOOD, footer=Footer(MOST, MOST, 0)),
+    "a footer that names a chunk as the summary": lambda: bag(
+        Part("zstd", MUCH, 6 * GIB), footer=Footer(8, 0, 0)
+    ),
+    "an attachment of 2^64 - 1 bytes": lambda: with_record(
+        raw(0x09, _LONG), AttachmentIndex(FIRST_RECORD, len(_LONG) + 9, 0, 0, 4, "a.urdf", "")
+    ),
+    "attachments and metadata at byte 2^64 - 1": lambda: bag(
+        GOOD,
+        summary=encoded(AttachmentIndex(MOST, MOST, 0, 0, MOST, "a.urdf", ""))
+        + encoded(MetadataIndex(MOST, MOST, "a")),
+    ),
+    "an attachment of 5 MB, ten thousand times in the index": lambda: with_record(
+        _LARGE,
+        AttachmentIndex(FIRST_RECORD, len(_LARGE), 0, 0, 5_000_000, "a.urdf", ""),
+        repeat=10_000,
+    ),
+    "metadata of 4 GiB": lambda: with_record(
+        raw(0x0C, _METADATA), MetadataIndex(FIRST_RECORD, len(_METADATA) + 9, "a")
+    ),
+    "a channel with a name of 4 GiB": lambda: bag(
+        GOOD, summary=raw(0x04, struct.pack("<HHI", 3, 1, 2**32 - 1) + b"x")
+    ),
+    "65534 channels": lambda: bag(GOOD, channels=[channel(k + 1, f"/t{k}") for k in range(65_534)]),
+    "65534 channels of one topic": lambda: bag(
+        GOOD, channels=[channel(k + 1, "/a") for k in range(65_534)]
+    ),
+    "statistics of 2^64 - 1": lambda: bag(
+        GOOD, statistics=dict.fromkeys(_COUNTS, MOST) | {"channel_message_counts": {1: MOST}}
+    ),
+    "statistics of messages that are not there": lambda: bag(
+        statistics={"message_count": 10, "channel_message_counts": {1: 10}}
+    ),
+    "messages at 2^64 - 1 ns": lambda: bag(
+        plain(message(string("x"), MOST), entries=[(MOST, 0)], times=(5, MOST)),
+        statistics={"message_end_time": MOST},
+    ),
+    "messages 292 years apart": apart,
+}
 
 # -- schemas -----------------------------------------------------------------------------------
 
@@ -81,24 +219,20 @@ for _title, (_text, _type) in SCHEMAS.items():
     CASES[f"schema: {_title}"] = lambda text=_text, name=_type: of_type(text, name)  # type: ignore[misc]
 
 
-@case("schema: empty lists in lists")
-def _() -> bytes:
+LIST = f"C[] x\n{INNER}"
+CASES |= {
     # Were elements without bytes believed, this would be 1e11 of them.
-    text = f"C[] x\n{INNER}D[] y\n{SEPARATOR}MSG: a/D\nuint8[0] z\n"
-    count = 200_000
-    data = b"\0\1\0\0" + struct.pack("<I", count) + struct.pack("<I", 400_000) * count
-    return of_type(text, data=data)
-
-
-@case("schema: a list of 4e9 messages")
-def _() -> bytes:
-    text = f"C[] x\n{INNER}float64 y\n"
-    return of_type(text, data=b"\0\1\0\0" + struct.pack("<I", 2**32 - 1) + bytes(100))
-
-
-@case("schema: two definitions of one type")
-def _() -> bytes:
-    return bag(GOOD, summary=encoded(Schema(2, b"int32 x\n", "ros2msg", STRING.name)))
+    "schema: empty lists in lists": lambda: of_type(
+        f"{LIST}D[] y\n{SEPARATOR}MSG: a/D\nuint8[0] z\n",
+        data=struct.pack("<II", 256, 200_000) + struct.pack("<I", 400_000) * 200_000,
+    ),
+    "schema: a list of 4e9 messages": lambda: of_type(
+        f"{LIST}float64 y\n", data=struct.pack("<II", 256, 2**32 - 1) + bytes(100)
+    ),
+    "schema: two definitions of one type": lambda: bag(
+        GOOD, summary=encoded(Schema(2, b"int32 x\n", "ros2msg", STRING.name))
+    ),
+}
 
 
 # -- quality of service ------------------------------------------------------------------------
@@ -220,82 +354,54 @@ for _title, _number in NUMBERS.items():
     )
 
 
-@case("flight: cut messages")
-def _() -> bytes:
-    return flight(lambda topic, number, data: data[: number % 40])
+NESTED = "[" * 100_000
+_PAIR = struct.pack("<IBxxx", 1, 0)
+"""An empty text, padded."""
+_STATUS_HEAD = b"\0\1\0\0" + bytes(4) + _PAIR * 3 + struct.pack("<I", 3_000_000)
 
-
-@case("flight: empty messages")
-def _() -> bytes:
-    return flight(lambda topic, number, data: b"")
-
-
-@case("flight: messages of 0xFF")
-def _() -> bytes:
-    return flight(lambda topic, number, data: data[:4] + b"\xff" * (len(data) - 4))
-
-
-@case("flight: frames that are no text")
-def _() -> bytes:
-    return flight(on("/odom", lambda n, data: data.replace(b"world", b"\xff\xfe\xfd\xfc\xfb")))
-
-
-@case("flight: a state in 2038")
-def _() -> bytes:
-    return flight(on("/joint_states", lambda n, data: stamped(data, 2**31 - 1) if n == 9 else data))
-
-
-@case("flight: a state in 1901")
-def _() -> bytes:
-    return flight(on("/odom", lambda n, data: stamped(data, -(2**31)) if n == 9 else data))
-
-
-@case("flight: 20000 joints")
-def _() -> bytes:
-    return flight(on("/joint_states", lambda n, data: joint_state(20_000) if n == 0 else data))
-
-
-@case("flight: 3000 joints in every state")
-def _() -> bytes:
-    return flight(on("/joint_states", lambda n, data: joint_state(3_000)))
-
-
-@case("flight: a status of three million values")
-def _() -> bytes:
-    pair = struct.pack("<I", 1) + bytes(4) + struct.pack("<I", 1) + bytes(4)
-    count = 3_000_000
-    head = b"\0\1\0\0" + b"\0" + bytes(3) + (struct.pack("<I", 1) + bytes(4)) * 3
-    data = head + struct.pack("<I", count) + pair * count
-    return flight(more=[("/planner/status", 10, data)])
-
-
-@case("flight: log times up to 2^63")
-def _() -> bytes:
-    return flight(times=lambda time_ns: min(time_ns * 10**11, 2**63 - 1))
-
-
-@case("flight: parameters nested 100000 deep")
-def _() -> bytes:
-    return flight(metadata={"parameters/plant": {"tick_rate": "[" * 100_000}})
-
-
-@case("flight: parameters of 1e400 and 10^5000")
-def _() -> bytes:
-    given = {"tick_rate": "1e400", "position_mass": "1" + "0" * 5000}
-    return flight(metadata={"parameters/plant": given})
-
-
-@case("flight: a tick rate of 1e-3 and 1e5")
-def _() -> bytes:
-    return flight(metadata={"parameters/plant": {"tick_rate": "100000.0"}})
-
-
-@case("flight: a scenario nested 100000 deep")
-def _() -> bytes:
-    nested = "[" * 100_000 + "]" * 100_000
-    return flight(
-        metadata={"scenario": {"published": nested}, "parameters/planner": {"method": nested}}
-    )
+CASES |= {
+    "flight: cut messages": lambda: flight(lambda topic, number, data: data[: number % 40]),
+    "flight: empty messages": lambda: flight(lambda topic, number, data: b""),
+    "flight: messages of 0xFF": lambda: flight(
+        lambda topic, number, data: data[:4] + b"\xff" * (len(data) - 4)
+    ),
+    "flight: frames that are no text": lambda: flight(
+        on("/odom", lambda n, data: data.replace(b"world", b"\xff\xfe\xfd\xfc\xfb"))
+    ),
+    "flight: a state in 2038": lambda: flight(
+        on("/joint_states", lambda n, data: stamped(data, 2**31 - 1) if n == 9 else data)
+    ),
+    "flight: a state in 1901": lambda: flight(
+        on("/odom", lambda n, data: stamped(data, -(2**31)) if n == 9 else data)
+    ),
+    "flight: 20000 joints": lambda: flight(
+        on("/joint_states", lambda n, data: joint_state(20_000) if n == 0 else data)
+    ),
+    "flight: 3000 joints in every state": lambda: flight(
+        on("/joint_states", lambda n, data: joint_state(3_000))
+    ),
+    "flight: a status of three million values": lambda: flight(
+        more=[("/planner/status", 10, _STATUS_HEAD + _PAIR * 2 * 3_000_000)]
+    ),
+    "flight: log times up to 2^63": lambda: flight(
+        times=lambda time_ns: min(time_ns * 10**11, 2**63 - 1)
+    ),
+    "flight: parameters nested 100000 deep": lambda: flight(
+        metadata={"parameters/plant": {"tick_rate": NESTED}}
+    ),
+    "flight: parameters of 1e400 and 10^5000": lambda: flight(
+        metadata={"parameters/plant": {"tick_rate": "1e400", "position_mass": "1" + "0" * 5000}}
+    ),
+    "flight: a tick rate of 1e-3 and 1e5": lambda: flight(
+        metadata={"parameters/plant": {"tick_rate": "100000.0"}}
+    ),
+    "flight: a scenario nested 100000 deep": lambda: flight(
+        metadata={
+            "scenario": {"published": NESTED + "]" * 100_000},
+            "parameters/planner": {"method": NESTED + "]" * 100_000},
+        }
+    ),
+}
 
 
 def robot(joints: int, *, chain: bool = True) -> bytes:
