@@ -167,24 +167,11 @@ def test_a_mesh_that_is_missing_is_named() -> None:
     assert [each.link for each in geometry.solids] == ["a", "c"]
 
 
-def test_a_flat_open_mesh_counts_as_its_hull(tmp_path: Path) -> None:
-    (tmp_path / "plate.obj").write_text("v 0 0 0\nv 2 0 0\nv 2 1 0\nv 0 1 0\nf 1 2 3\n")
-    plate = f'<collision><geometry><mesh filename="{tmp_path}/plate.obj"/></geometry></collision>'
-    other = '<collision><origin xyz="0 0 0"/><geometry><sphere radius="0.25"/></geometry>'
-    text = chain((plate,), (), (f"{other}</collision>",)).replace("0.1 0 0.2", "0 0 0")
-    geometry = CollisionGeometry(parse_robot(text))
-    # The ball is at (2, 0, 0.2), above a corner of the plate.
-    distance, _ = geometry.nearest(np.zeros(2)) or (np.nan, 0)
-    assert distance == pytest.approx(0.2 - 0.25, abs=1e-5)
-    distance, _ = geometry.nearest(np.array([-1.0, 1.0])) or (np.nan, 0)
-    assert distance > 0.3
-
-
 def test_a_tilted_flat_mesh_lies_where_its_corners_are(tmp_path: Path) -> None:
-    """Against the distance from a ball to the parallelogram of the corners, by least squares."""
+    """Its hull is the parallelogram of the corners: the distance from a ball by least squares."""
     corners = np.array([[0, 0, 0], [2, 0, 0.8], [2, 1, 0.8], [0, 1, 0]])
     lines = "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
-    (tmp_path / "plate.obj").write_text(f"{lines}f 1 2 3 4\n")
+    (tmp_path / "plate.obj").write_text(f"{lines}f 1 2 3\n")
     plate = f'<collision><geometry><mesh filename="{tmp_path}/plate.obj"/></geometry></collision>'
     other = '<collision><origin xyz="-1 0.5 1"/><geometry><sphere radius="0.25"/></geometry>'
     text = chain((plate,), (), (f"{other}</collision>",))

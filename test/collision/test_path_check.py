@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.crossing import HEIGHT, RADII, URDF
 
 from spacerobot_ros.collision import (
     BasePoses,
@@ -59,24 +60,11 @@ def test_the_nearest_approach_is_that_of_dense_samples(name: str) -> None:
         assert all(each.distance < 0.03 for each in found)
 
 
-CROSSING = """<robot name="crossing">
-<link name="base"><inertial><mass value="9"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
- iyz="0"/></inertial></link>
-<link name="left"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
- iyz="0"/></inertial><collision><geometry><sphere radius="0.05"/></geometry></collision></link>
-<link name="right"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
- iyz="0"/></inertial><collision><geometry><sphere radius="0.07"/></geometry></collision></link>
-<joint name="x" type="prismatic"><parent link="base"/><child link="left"/><axis xyz="1 0 0"/>
-<limit lower="-2" upper="2" velocity="9" effort="1"/></joint>
-<joint name="y" type="prismatic"><parent link="base"/><child link="right"/>
-<origin xyz="0 0 0.15"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" velocity="9" effort="1"/>
-</joint></robot>"""
-
-
 def test_a_contact_between_two_ticks_is_found() -> None:
-    geometry = CollisionGeometry(parse_robot(CROSSING))
-    # Both balls pass the middle at 1.4 ticks, 0.15 m apart, and are far away at every tick.
-    positions = np.array([[-1.4, -0.7], [-0.4, -0.2], [0.6, 0.3], [0.7, 0.3]])
+    geometry = CollisionGeometry(parse_robot(URDF))
+    # One ball passes the other at 1.4 ticks, 0.15 m apart, and is far away at every tick.
+    beside = math.sqrt(0.15**2 - HEIGHT**2)
+    positions = np.array([[beside, -1.4], [beside, -0.4], [beside, 0.6], [beside, 0.7]])
     found = nearest_approaches(geometry, positions, np.array([0.05]))
     assert [str(each) for each in found] == ["links 'left' and 'right' come within 30 mm"]
     assert found[0].distance == pytest.approx(0.15 - 0.12, abs=1e-5)
@@ -85,22 +73,26 @@ def test_a_contact_between_two_ticks_is_found() -> None:
 
 
 def test_a_single_shape_is_a_path() -> None:
-    geometry = CollisionGeometry(parse_robot(CROSSING))
+    geometry = CollisionGeometry(parse_robot(URDF))
     (found,) = nearest_approaches(geometry, np.zeros((1, 2)), np.array([0.05]))
-    assert found.distance == pytest.approx(0.03, abs=1e-6)
+    assert found.distance == pytest.approx(HEIGHT - sum(RADII), abs=1e-6)
     assert nearest_approaches(geometry, np.ones((1, 2)), np.array([0.05])) == []
+
+
+INERTIA = (
+    '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="2" ixy="0" ixz="0" iyz="0"/>'
+    "</inertial>"
+)
 
 
 def telescope() -> RobotDescription:
     """Return a ball on a slider on a turntable, and another ball on the base, 2 m from its axis."""
-    inertial = CROSSING.split("<inertial>")[1].split("</inertial>")[0]
-    body = f"<inertial>{inertial}</inertial>"
     ball = '<collision><origin xyz="{}"/><geometry><sphere radius="0.1"/></geometry></collision>'
     post = ball.format(f"{2 * math.cos(0.3)} {2 * math.sin(0.3)} 0")
     limit = '<limit lower="-3" upper="3" velocity="9" effort="1"/>'
     return parse_robot(
-        f"""<robot name="telescope"><link name="base">{body}{post}</link>
-<link name="table">{body}</link><link name="ball">{body}{ball.format("0 0 0")}</link>
+        f"""<robot name="telescope"><link name="base">{INERTIA}{post}</link>
+<link name="table">{INERTIA}</link><link name="ball">{INERTIA}{ball.format("0 0 0")}</link>
 <joint name="turn" type="revolute"><parent link="base"/><child link="table"/>
 <axis xyz="0 0 1"/>{limit}</joint>
 <joint name="slide" type="prismatic"><parent link="table"/><child link="ball"/>
@@ -142,12 +134,6 @@ def test_obstacles_are_met_between_ticks_where_the_base_moves_or_turns(
 
 
 # -- bodies of revolution that spin in place, such as reaction wheels, come no nearer to ---------
-
-
-INERTIA = (
-    '<inertial><mass value="2"/><inertia ixx="1" iyy="1" izz="2" ixy="0" ixz="0" iyz="0"/>'
-    "</inertial>"
-)
 
 
 def robot(origin: str = "0 0 0.2", rpy: str = "0 0 0", shape: str = "") -> RobotDescription:

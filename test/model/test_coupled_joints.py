@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 
-import casadi as ca
 import numpy as np
 import pytest
 from support.oracles import Array, Motion, PinocchioOracle, assert_agrees, random_motion
-from support.oracles.barycentric import barycentric_inertia
 from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot, parse_robot
-from spacerobot_ros.model.composite_rigid_body import composites
-from spacerobot_ros.model.kinematics import ForwardKinematics, tree_kinematics
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 
 SEEDS = range(5)
@@ -130,15 +127,6 @@ def test_efforts_of_a_motion_at_zero_momentum_are_those_that_cause_it(case: Coup
     tau = case.robot.joint_efforts(m.q, m.qdot, qddot)
     caused = case.robot.forward_dynamics(m.q, zero, omega_WB_B, m.qdot, np.zeros(6), tau)
     assert_agrees(caused[6:], qddot)
-
-
-def test_both_forms_of_the_inertia_agree(case: Coupled) -> None:
-    kin = tree_kinematics(case.robot.description)
-    paper, fast = barycentric_inertia(kin), composites(kin)
-    evaluate = ca.Function("f", [kin.q], [paper.D_q, fast.D_q, paper.D_qq, fast.D_qq])
-    values = [value.full() for value in evaluate(case.motion.q)]
-    assert_agrees(values[0], values[1])
-    assert_agrees(values[2], values[3])
 
 
 def test_limits_of_joints_that_follow_are_kept() -> None:

@@ -1,9 +1,8 @@
-"""Curvature, derivatives of the momentum, and rates that leave the base still."""
+"""Curvature, numbers of the papers, derivatives of momenta, rates that leave the base still."""
 
 from __future__ import annotations
 
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import casadi as ca
@@ -11,15 +10,16 @@ import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.linalg import logm
+from planning.sliding_robots import random_sliding_robot
 from scipy.spatial.transform import Rotation
 from support.oracles import Array, PinocchioOracle, assert_agrees
+from support.planar_manoeuvres import closed_forms, phase_density
 from support.random_robots import random_robot_urdf
 from support.slow import some_fast
 
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.model.description import Inertia, RobotDescription
+from spacerobot_ros.model.external_loads import mean_motion_at
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.resources import robot_file
 
@@ -58,8 +58,11 @@ def branched_robot(folder: Path) -> RobotDescription:
     return load_robot(path)
 
 
-SLIDING_MASSES = Path(__file__).parents[2] / "urdf" / "sliding_masses.urdf"
 SEEDS = range(20, 24)
+
+
+def of_package(name: str) -> SpaceRobot:
+    return SpaceRobot.from_file(robot_file(name))
 
 
 @cache
@@ -107,87 +110,12 @@ def test_curvature_is_the_derivative_and_bracket_of_the_connection(seed: int) ->
     assert_agrees(robot.curvature(q), expected, tolerance=1e-10)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_curvature_is_antisymmetric(seed: int) -> None:
-    robot, _, q = random_case(seed)
-    K = robot.curvature(q)
-    assert_agrees(K, -K.transpose(0, 2, 1), tolerance=0.0)
-    assert np.linalg.norm(K) > 1e-3
-
-
-# -- loops of the shape -----------------------------------------------------------------------
-
-
-def displacement(oracle: PinocchioOracle, corners: list[Array]) -> Array:
-    """Return the pose (4, 4), in the starting one, after straight legs of the shape at rest."""
-
-    def rate(s: float, pose: Array, start: Array, leg: Array) -> Array:
-        twist = oracle.base_twist(start + s * leg, leg)
-        return (pose.reshape(4, 4) @ twist_matrix(twist)).ravel()
-
-    pose = np.eye(4).ravel()
-    for start, end in pairwise(corners):
-        pose = solve_ivp(
-            rate, (0, 1), pose, "DOP853", args=(start, end - start), rtol=1e-13, atol=1e-15
-        ).y[:, -1]
-    return np.asarray(pose.reshape(4, 4))
-
-
-def square(q: Array, i: int, j: int, side: float, *, centred: bool) -> list[Array]:
-    """Return the corners of a square loop, counter-clockwise in (q_i, q_j): from and to q as its
-    first corner, or as its centre by the half diagonal there and back.
-    """
-    e_i, e_j = side * np.eye(q.size)[[i, j]]
-    first = q - (e_i + e_j) / 2 if centred else q
-    loop = [first, first + e_i, first + e_i + e_j, first + e_j, first]
-    return [q, *loop, q] if centred else loop
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("centred", "order"), [(False, 3), (True, 4)])
-@pytest.mark.parametrize("pair", [(0, 1), (2, 0)])
-@pytest.mark.parametrize("seed", SEEDS[:2])
-def test_a_small_loop_displaces_the_base_by_curvature_times_area(
-    seed: int, pair: tuple[int, int], centred: bool, order: int
-) -> None:
-    robot, oracle, q = random_case(seed)
-    K = robot.curvature(q)[:, pair[0], pair[1]]
-    errors = []
-    for side in (0.04, 0.02):
-        pose = displacement(oracle, square(q, *pair, side, centred=centred))
-        errors.append(np.linalg.norm(twist_of(np.real(logm(pose))) - K * side**2))
-    # Round a corner the next term is of third order; round the centre symmetry removes it.
-    assert abs(np.log2(errors[0] / errors[1]) - order) < 0.2
-    assert errors[1] < 0.1 * np.linalg.norm(K) * 0.02**2
-
-
-def test_the_loop_backwards_undoes_the_loop() -> None:
-    _, oracle, q = random_case(20)
-    corners = square(q, 0, 1, 0.3, centred=False)
-    there, back = displacement(oracle, corners), displacement(oracle, corners[::-1])
-    assert_agrees(there @ back, np.eye(4), tolerance=1e-11)
-    assert np.linalg.norm(there - np.eye(4)) > 1e-3
-
-
-def test_curvature_of_the_compiled_connection(compiled_code: Path) -> None:
-    description = random_case(20)[0].description
-    robot, (_, oracle, q) = SpaceRobot(description), random_case(20)
-    assert_agrees(robot.connection(q), oracle.connection(q))
-    assert robot.function("connection").class_name() == "External"
-    # Curvature is always interpreted; it goes with the compiled connection.
-    e = 1e-4 * np.eye(robot.n)
-    dA = [(robot.connection(q + d) - robot.connection(q - d)) / 2e-4 for d in e]
-    F_0, F_1 = (twist_matrix(column) for column in -robot.connection(q).T[:2])
-    expected = twist_of(F_0 @ F_1 - F_1 @ F_0) - dA[0][:, 1] + dA[1][:, 0]
-    assert_agrees(robot.curvature(q)[:, 0, 1], expected, tolerance=1e-6)
-
-
 # -- paper 1 ----------------------------------------------------------------------------------
 
 
 def test_brackets_of_centred_slots_at_the_origin() -> None:
     """``2 m_i m_j / M J^-1 (R_j(1) x R_i(1))`` at z = 0 without offsets."""
-    robot = SpaceRobot.from_file(SLIDING_MASSES)
+    robot = of_package("sliding_masses")
     J, axes = np.diag([1.0, 1.5, 1.5]), np.eye(3)
     expected = np.zeros((3, 3, 3))
     for i in range(3):
@@ -199,7 +127,7 @@ def test_brackets_of_centred_slots_at_the_origin() -> None:
 
 
 def test_alpha_of_the_published_manoeuvre() -> None:
-    robot = SpaceRobot.from_file(SLIDING_MASSES)
+    robot = of_package("sliding_masses")
     w = -robot.curvature([-2.378408, 1.687252, -1.377082])[3:]
     columns = np.column_stack([w[:, 0, 1], w[:, 1, 2], w[:, 0, 2]])
     alpha = np.linalg.solve(columns, [0.5, -0.15, 0.1])
@@ -209,103 +137,124 @@ def test_alpha_of_the_published_manoeuvre() -> None:
     assert abs(alpha[2] - -18.8194) < 1e-4
 
 
-class SlidingMasses:
-    """Paper 1, eqs (3), (8) and the appendix, word by word: point masses on slots with offsets."""
-
-    def __init__(self, rng: np.random.Generator, sliders: int) -> None:
-        self.base_mass, self.m = 10.0, rng.uniform(1.0, 3.0, sliders)
-        second = rng.uniform(0.3, 1.0, 3)
-        turn = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
-        self.I_b = turn @ np.diag(second.sum() - second) @ turn.T
-        self.l = rng.uniform(0.1, 0.6, sliders)
-        self.R = [Rotation.from_rotvec(rng.normal(size=3)).as_matrix() for _ in range(sliders)]
-        self.base_com = rng.uniform(-0.3, 0.3, 3)
-        self.M = self.base_mass + float(self.m.sum())
-        self.n = sliders
-
-    def urdf(self) -> str:
-        """Return the robot; its base frame is not at the base's centre of mass."""
-        I_b = self.I_b
-        moments = " ".join(
-            f'i{"xyz"[i]}{"xyz"[j]}="{I_b[i, j]:.17g}"' for i in range(3) for j in range(i, 3)
-        )
-        com = " ".join(f"{x:.17g}" for x in self.base_com)
-        text = (
-            f'<link name="base"><inertial><origin xyz="{com}"/><mass value="{self.base_mass}"/>'
-            f"<inertia {moments}/></inertial></link>"
-        )
-        for i, R in enumerate(self.R):
-            slot = self.base_com + R @ [0, self.l[i], 0]
-            xyz = " ".join(f"{x:.17g}" for x in slot)
-            rpy = " ".join(f"{x:.17g}" for x in Rotation.from_matrix(R).as_euler("xyz"))
-            text += (
-                f'<link name="mass_{i}"><inertial><mass value="{self.m[i]:.17g}"/></inertial>'
-                f"</link>"
-                f'<joint name="slider_{i}" type="prismatic">'
-                f'<parent link="base"/><child link="mass_{i}"/>'
-                f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="1 0 0"/>'
-                '<limit lower="-2" upper="2" velocity="1" effort="1"/></joint>'
-            )
-        return f'<robot name="sliders">{text}</robot>'
-
-    def _in_slot(self, i: int, z: Array) -> Array:
-        return np.array([z[i], self.l[i], 0.0])
-
-    def B(self, i: int, j: int, z: Array) -> Array:
-        return -np.cross(self.R[j][:, 0], self.R[i] @ self._in_slot(i, z))
-
-    def I_tilde(self, i: int, j: int, z: Array) -> Array:
-        p_i, p_j = self._in_slot(i, z), self._in_slot(j, z)
-        inner = p_i @ self.R[i].T @ self.R[j] @ p_j
-        return inner * np.eye(3) - self.R[j] @ np.outer(p_j, p_i) @ self.R[i].T
-
-    def J(self, z: Array) -> Array:
-        total = self.I_b.copy()
-        for i in range(self.n):
-            total += (1 - self.m[i] / self.M) * self.m[i] * self.I_tilde(i, i, z)
-            for j in range(self.n):
-                if j != i:
-                    total -= self.m[i] * self.m[j] / self.M * self.I_tilde(i, j, z)
-        return total
-
-    def F(self, i: int, z: Array) -> Array:
-        own = -(1 - self.m[i] / self.M) * self.m[i] * self.B(i, i, z)
-        others = [self.m[i] * self.m[j] / self.M * self.B(j, i, z) for j in range(self.n) if j != i]
-        return np.asarray(own + sum(others))
-
-    def bracket(self, i: int, j: int, z: Array) -> Array:
-        """Return ``omega_[Fi, Fj]``, eq. (8)."""
-        e = np.eye(self.n)
-
-        # J and F are polynomials of degree two: central differences of step one are exact.
-        def dJ(k: int) -> Array:
-            return (self.J(z + e[k]) - self.J(z - e[k])) / 2
-
-        def dF(a: int, k: int) -> Array:
-            return (self.F(a, z + e[k]) - self.F(a, z - e[k])) / 2
-
-        J, F_i, F_j = self.J(z), self.F(i, z), self.F(j, z)
-        J_inverse = np.linalg.inv(J)
-        return np.asarray(
-            J / np.linalg.det(J) @ np.cross(F_j, F_i)
-            - J_inverse @ (dJ(j) @ J_inverse @ F_i - dJ(i) @ J_inverse @ F_j)
-            + J_inverse @ (dF(i, j) - dF(j, i))
-        )
-
-
 @pytest.mark.parametrize("seed", [30, 31, 32])
-def test_brackets_and_connection_of_sliders_with_offsets(seed: int) -> None:
+def test_brackets_and_connection_of_sliders_anywhere(seed: int) -> None:
+    """Eqs (3) and (7), the derivatives by central differences of fourth order."""
     rng = np.random.default_rng(seed)
-    paper = SlidingMasses(rng, sliders=3)
-    robot = SpaceRobot.from_urdf(paper.urdf())
-    assert robot.joint_names == ("slider_0", "slider_1", "slider_2")
-    z = rng.uniform(-1.5, 1.5, 3)
-    F_tilde = np.column_stack([np.linalg.solve(paper.J(z), paper.F(i, z)) for i in range(3)])
-    assert_agrees(-robot.connection(z)[3:], F_tilde)
-    expected = np.stack([[paper.bracket(i, j, z) for j in range(3)] for i in range(3)]).transpose(
-        2, 0, 1
-    )
+    paper = random_sliding_robot(rng, 3)
+    robot = SpaceRobot.from_urdf(paper.urdf)
+    z, step = rng.uniform(-1.5, 1.5, 3), 2e-3
+
+    def F(z: Array) -> Array:
+        return paper.base_rate(np.tile(z, (3, 1)), np.eye(3))
+
+    assert_agrees(-robot.connection(z)[3:], F(z).T)
+    dF = [
+        (8 * (F(z + e) - F(z - e)) - (F(z + 2 * e) - F(z - 2 * e))) / (12 * step)
+        for e in step * np.eye(3)
+    ]
+    expected = np.empty((3, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            expected[:, i, j] = np.cross(F(z)[j], F(z)[i]) + dF[j][i] - dF[i][j]
     assert_agrees(-robot.curvature(z)[3:], expected)
+
+
+PAPERS = ("planar_chain", "planar_manipulator", "sliding_masses", "three_joint_arm")
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_robots_of_the_papers_have_limits_shapes_and_the_connection_of_pinocchio(name: str) -> None:
+    robot = of_package(name)
+    assert robot.description.name == name
+    assert all(link.shapes or link.name == "end_effector" for link in robot.description.links)
+    assert np.all(np.isfinite(robot.velocity_limit) & (robot.velocity_limit > 0))
+    assert np.all(np.isfinite(robot.effort_limit) & (robot.effort_limit > 0))
+    assert np.all(robot.lower < robot.upper)
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    for q in np.random.default_rng(40).uniform(-1.5, 1.5, (5, robot.n)):
+        assert_agrees(robot.connection(q), oracle.connection(q))
+
+
+# -- paper 2: a three-joint arm turns the spacecraft ------------------------------------------
+
+
+def test_curvature_of_the_representative_arm_is_well_conditioned() -> None:
+    K = of_package("three_joint_arm").curvature(np.radians([0.0, -45.0, 90.0]))
+    M = np.column_stack([K[3:, 0, 1], K[3:, 1, 2], K[3:, 2, 0]])
+    assert round(float(np.linalg.cond(M)), 2) == 3.60
+
+
+# -- paper 3: a planar chain ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("psi", np.random.default_rng(41).uniform(-np.pi, np.pi, (8, 2)))
+def test_connection_of_the_planar_chain_is_the_printed_one(psi: Array) -> None:
+    robot = of_package("planar_chain")
+    A = robot.connection(psi)
+    # theta1dot = -s' psidot, about z and nothing else.
+    assert_agrees(A[5], closed_forms(psi))
+    assert_agrees(A[2:5], np.zeros((3, 2)))
+    # The base's centre of mass is its origin: the system's stays where it is.
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    assert_agrees(A, oracle.connection(psi))
+
+
+@pytest.mark.parametrize(
+    ("psi", "height"),
+    [
+        (np.array([5 * np.pi / 6, 2 * np.pi / 3]), 0.5357),
+        (np.array([2 * np.pi / 3, 5 * np.pi / 6]), 0.3003),
+        (np.radians([153.0, 121.0]), 0.5376),
+        (np.radians([-153.0, -121.0]), -0.5376),
+    ],
+)
+def test_phase_density_of_the_planar_chain(psi: Array, height: float) -> None:
+    H = phase_density(psi)
+    assert round(float(H), 4) == height
+    K = of_package("planar_chain").curvature(psi)[:, 0, 1]
+    # In a plane rotations commute, and the curvature is the phase density alone: the base turns by
+    # minus the integral of s' dpsi.
+    assert_agrees(K[5], -H, tolerance=1e-8)
+    assert_agrees(K[2:5], np.zeros(3))
+
+
+# -- paper 4: spacecraft and manipulator ------------------------------------------------------
+
+
+def test_start_of_the_planar_manipulator() -> None:
+    robot = of_package("planar_manipulator")
+    theta, q = np.radians(21.0), np.radians([-58.0, 60.3])
+    R_WB = np.array(
+        [
+            [np.cos(theta), -np.sin(theta), 0.0],
+            [np.sin(theta), np.cos(theta), 0.0],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    # The system's centre of mass is the origin of the world.
+    spacecraft = -R_WB @ robot.center_of_mass(q)
+    end_effector = spacecraft + R_WB @ robot.link_pose("end_effector", q)[1]
+    assert np.round(spacecraft, 5).tolist() == [-0.18380, 0.02471, 0.0]
+    assert np.round(end_effector, 5).tolist() == [2.00008, -0.00237, 0.0]
+
+
+def test_table_of_the_planar_manipulator() -> None:
+    robot = of_package("planar_manipulator")
+    bodies = robot.description.bodies
+    assert [body.inertia.mass for body in bodies] == [40.0, 4.0, 3.0]
+    assert [body.inertia.about_com[2, 2] for body in bodies] == [6.667, 0.333, 0.250]
+    # Stretched out: spacecraft, its end, the joints and the end-effector half a metre from each
+    # centre of mass.
+    for link, x in (("link_1", 0.5), ("link_2", 1.5), ("end_effector", 2.5)):
+        assert_agrees(robot.link_pose(link, [0.0, 0.0])[1], [x, 0.0, 0.0])
+    for body in bodies[1:]:
+        assert body.inertia.com.tolist() == [0.5, 0.0, 0.0]
+
+
+def test_the_period_of_low_and_geosynchronous_orbits() -> None:
+    assert 2 * np.pi / mean_motion_at(400e3) == pytest.approx(5553.6, abs=0.1)
+    assert 2 * np.pi / mean_motion_at(35786e3) == pytest.approx(86164.0, abs=1.0)
 
 
 # -- derivatives of the angular momentum in closed form against those by CasADi ------------------

@@ -25,7 +25,6 @@ from spacerobot_ros.model.grasp import (
     grasp_impact,
     separated_momenta,
 )
-from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.resources import robot_file
 
 TUMBLER = Inertia(
@@ -158,19 +157,6 @@ def test_momentum_is_conserved_energy_is_not_gained_and_both_move_as_one(seed: i
     np.testing.assert_allclose(impact.impulse[:3], of_body[:3] - carried[:3], rtol=0, atol=1e-11)
 
 
-def test_a_body_that_moves_with_the_link_is_grasped_without_an_impulse() -> None:
-    rng = np.random.default_rng(7)
-    robot = robot_named("planar_manipulator")
-    motion = random_motion(rng, robot)
-    offset = Pose(Rotation.from_euler("xyz", [0.3, 0.2, -0.4]).as_matrix(), np.array([0.1, 0, 0.2]))
-    body = frame_motion(robot, "end_effector", motion).at(offset)
-    impact = grasp_impact(robot, "end_effector", motion, body, TUMBLER)
-    np.testing.assert_allclose(impact.twist, motion.twist, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(impact.qdot, motion.qdot, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(impact.impulse, 0.0, rtol=0, atol=1e-12)
-    assert impact.energy_lost == pytest.approx(0.0, abs=1e-14)
-
-
 def test_the_motion_of_a_frame_is_the_change_of_its_pose() -> None:
     rng = np.random.default_rng(11)
     robot = robot_named("planar_manipulator")
@@ -242,12 +228,3 @@ def test_momenta_of_two_systems_are_about_the_common_centre() -> None:
     np.testing.assert_allclose(together, [0.0, 6.0, 0.0, 0.1, 0.2, 6.5], rtol=1e-15)
     parted = separated_momenta(masses, centers, together, moving)
     np.testing.assert_allclose(parted, still, rtol=0, atol=1e-15)
-
-
-def test_pose_of_a_motion() -> None:
-    quaternion = np.array([0.1, -0.2, 0.3, 0.9])
-    quaternion /= np.linalg.norm(quaternion)
-    motion = RobotMotion(
-        np.concatenate([[1, 2, 3], quaternion]), np.zeros(6), np.zeros(0), np.zeros(0)
-    )
-    np.testing.assert_array_equal(motion.R_WB, matrix_from_quaternion(quaternion))

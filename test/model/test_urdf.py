@@ -15,18 +15,17 @@ from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
-from spacerobot_ros.model.description import Array, Inertia, JointKind, Shape
+from spacerobot_ros.model.description import Array, Inertia, Shape
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_of
 from spacerobot_ros.model.urdf import (
     links_with_shapes,
-    load_world,
     obstacles_from_topic,
     parse_world,
     with_srdf,
     with_world,
 )
-from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.resources import robot_file
 
 BODY = """
   <inertial><mass value="2"/>
@@ -282,26 +281,6 @@ def test_fixed_joints_are_welded_as_pinocchio_welds_them(seed: int) -> None:
         assert_agrees(pose.r, frame.placement.translation)
 
 
-def test_bodies_are_in_topological_order() -> None:
-    for seed in range(60, 66):
-        found = parse_robot(random_robot_urdf(np.random.default_rng(seed), joints=5))
-        assert found.bodies[0].joint is None
-        assert found.bodies[0].parent == -1
-        for index, body in enumerate(found.bodies[1:], start=1):
-            assert 0 <= body.parent < index
-        assert all(joint.kind is not JointKind.FIXED for joint in found.movable_joints)
-
-
-def test_compiled_robot_with_welded_links(compiled_code: Path) -> None:
-    urdf = random_robot_urdf(np.random.default_rng(60), joints=3)
-    found = SpaceRobot.from_urdf(urdf)
-    q = np.array([0.3, -0.8, 0.5])
-    assert_agrees(
-        found.center_of_mass(q), PinocchioOracle(urdf, found.joint_names).center_of_mass(q)
-    )
-    assert found.function("center_of_mass").class_name() == "External"
-
-
 # -- obstacles in the world: URDF files without moving joints, carried by the text of a ----------
 
 
@@ -350,19 +329,6 @@ def test_obstacles_disabled_pairs_and_comments_get_along(
     assert len(pin.buildModelFromXML(robot.urdf).names) - 1 == len(again.joint_names)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (('name="b" type="fixed"', 'name="b" type="continuous"'), "joint 'b' is continuous"),
-        ((BALL, ""), "The world 'station' has no obstacle"),
-        (("</robot>", ""), "is not XML"),
-    ],
-)
-def test_a_world_that_is_none_is_refused(change: tuple[str, str], message: str) -> None:
-    with pytest.raises(RobotDescriptionError, match=message):
-        parse_world(WORLD.replace(*change))
-
-
 def test_a_node_has_the_world_of_its_parameter(tmp_path: Path) -> None:
     file = tmp_path / "station.urdf"
     file.write_text(WORLD, "utf-8")
@@ -371,11 +337,6 @@ def test_a_node_has_the_world_of_its_parameter(tmp_path: Path) -> None:
     assert robot.description.world is not None
     with pytest.raises(ParameterError, match=r"Parameter 'world' is invalid: .* cannot be read"):
         robot_of(RobotConfig(robot_description=URDF, world=str(tmp_path / "none.urdf")))
-
-
-def test_the_package_has_a_world() -> None:
-    world = load_world(share_directory() / "config" / "worlds" / "strut.urdf")
-    assert [link.name for link in world.links if link.collisions] == ["strut"]
 
 
 # -- obstacles in texts from topics, and robots among others than so far -------------------------

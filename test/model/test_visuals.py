@@ -200,11 +200,6 @@ f 4 1 5 8
 """
 
 
-def enclosed_volume(mesh: TriangleMesh) -> float:
-    """Return what a closed surface encloses, negative if it is inside out."""
-    return float(np.linalg.det(mesh.vertices[mesh.faces]).sum() / 6)
-
-
 def stl_text(vertices: Any, faces: Any) -> bytes:
     lines = ["solid wedge"]
     for face in faces:
@@ -214,8 +209,8 @@ def stl_text(vertices: Any, faces: Any) -> bytes:
 
 
 def stl_binary(vertices: Any, faces: Any, header: bytes = b"") -> bytes:
-    rows = np.zeros(len(faces), module._STL_TRIANGLE)
-    rows["corners"] = np.asarray(vertices, dtype=float)[faces]
+    rows = np.zeros(len(faces), "3<f4, (3,3)<f4, <u2")
+    rows["f1"] = np.asarray(vertices, dtype=float)[faces]
     return header.ljust(80) + len(faces).to_bytes(4, "little") + rows.tobytes()
 
 
@@ -240,14 +235,14 @@ def test_stl_is_read_whether_text_or_binary(tmp_path: Path, data: bytes) -> None
     mesh = read_mesh(written(tmp_path, "wedge.STL", data))
     assert mesh.vertices.shape == (4, 3)  # Corners that triangles share are one vertex.
     assert sorted(mesh.vertices.tolist()) == sorted(WEDGE.tolist())
-    assert enclosed_volume(mesh) == pytest.approx(WEDGE_VOLUME, rel=1e-6)
+    assert volume(mesh) == pytest.approx(WEDGE_VOLUME, rel=1e-6)
 
 
 def test_obj_faces_of_many_corners_are_triangles_that_look_the_same_way(tmp_path: Path) -> None:
     mesh = read_mesh(written(tmp_path, "cube.obj", OBJ))
     assert mesh.vertices.shape == (8, 3)
     assert mesh.faces.shape == (12, 3)
-    assert enclosed_volume(mesh) == pytest.approx(1.0)
+    assert volume(mesh) == pytest.approx(1.0)
 
 
 CORNERS = b"v 0 0 0\nv 1 0 0 1.0\nv 1 1 0\n\nv 0 1 0\n# no corner\nv 0.5 0.5 1\n"
@@ -277,7 +272,7 @@ def test_other_kinds_are_read_by_trimesh(tmp_path: Path, suffix: str) -> None:
     solid = trimesh.Trimesh(WEDGE, WEDGE_FACES, process=False)
     data: Any = solid.export(file_type=suffix[1:])
     mesh = read_mesh(written(tmp_path, f"wedge{suffix}", data))
-    assert enclosed_volume(mesh) == pytest.approx(WEDGE_VOLUME, rel=1e-6)
+    assert volume(mesh) == pytest.approx(WEDGE_VOLUME, rel=1e-6)
 
 
 def test_collada_in_millimetres_becomes_metres(tmp_path: Path) -> None:
@@ -386,7 +381,7 @@ def test_origin_and_scale_of_the_visual_are_applied_and_outside_stays_outside(
     path = written(tmp_path, "wedge.stl", stl_binary(WEDGE, WEDGE_FACES))
     pose = Pose(matrix_from_rpy([0.3, -0.2, 1.1]), np.array([5.0, 6.0, 7.0]))
     mesh = shape_mesh(Shape("mesh", (0.1, -0.2, 0.5), pose, resource=str(path)))
-    assert enclosed_volume(mesh) == pytest.approx(WEDGE_VOLUME * 0.01)
+    assert volume(mesh) == pytest.approx(WEDGE_VOLUME * 0.01)
     tip = pose.r + pose.R @ np.array([0.0, -0.6, 0.0])
     assert np.abs(mesh.vertices - tip).max(axis=1).min() < 1e-6
 
@@ -399,7 +394,7 @@ def test_a_coarser_mesh_keeps_form_and_size(most: int) -> None:
     assert len(fine.faces) == 1280
     assert 0 < len(coarse.faces) <= most
     assert np.linalg.norm(coarse.vertices, axis=1).max() <= 2.0 + 1e-9
-    assert enclosed_volume(coarse) > (0.3 if most < 100 else 0.75) * enclosed_volume(fine)
+    assert volume(coarse) > (0.3 if most < 100 else 0.75) * volume(fine)
     if most >= 1280:
         assert coarse is fine
 

@@ -1,4 +1,4 @@
-"""Inertia and dynamics by the barycentric vectors of paper 4, eqs (1) to (3) and (14) to (21).
+"""The inertia by the barycentric vectors of paper 4, eqs (1) to (3) and (14) to (17).
 
 The paper writes barycentric vectors for a chain of revolute joints. Here they stand for any tree:
 the vector from the mass centre of body i to its joint *towards body k* takes the place of the
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from spacerobot_ros.model.dynamics import bias, point_jacobian, solve_positive_definite
 from spacerobot_ros.model.kinematics import TreeKinematics
 
 
@@ -121,21 +120,6 @@ def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
             D_qq[a - 1, b - 1] = reduced * ca.dot(kin.axis[a], kin.axis[b])
     D_q, D_qq = kin.gather(D_q.T).T, kin.gather(kin.gather(D_qq).T)
     return BarycentricInertia(M, D, D_q, D_qq, v)
-
-
-def forward_dynamics(kin: TreeKinematics) -> ca.Function:
-    """Return ``z0ddot = H+^-1 (Q - C+)`` (6 + n,), eqs (18), (19) and (21).
-
-    It takes ``q, v_cm_B, omega_WB_B, qdot``, a wrench on the base at its origin, and joint efforts.
-    """
-    sizes = {"v": 3, "omega": 3, "qdot": kin.n, "wrench_B": 6, "tau": kin.n}
-    symbols = [ca.SX.sym(name, size) for name, size in sizes.items()]
-    *velocities, wrench_B, tau = symbols
-    J_base, inertia = point_jacobian(kin, kin.robot.base_link), barycentric_inertia(kin)
-    force = J_base.T @ wrench_B + ca.vertcat(ca.SX(6, 1), tau) - bias(kin, *velocities)
-    H = ca.blockcat([[inertia.D, inertia.D_q], [inertia.D_q.T, inertia.D_qq]])
-    z0ddot = ca.vertcat(force[:3] / inertia.mass, solve_positive_definite(H, force[3:]))
-    return ca.Function("barycentric", [kin.q, *symbols], [z0ddot])
 
 
 def _outboard(kin: TreeKinematics, j: int) -> list[int]:
