@@ -382,25 +382,6 @@ def test_status_has_the_smallest_singular_value() -> None:
         assert law.status.smallest_singular_value == pytest.approx(expected, rel=1e-9)
 
 
-def test_eq_12_has_the_third_angle_in_its_second_column() -> None:
-    """``omega = S d(Theta)/dt`` of the 321 sequence; the paper prints the first angle there."""
-    first, second, third = angles = np.array([0.4, -0.3, 1.1])
-
-    def rotation(angles: Array) -> Array:
-        return np.asarray(Rotation.from_euler("ZYX", angles[::-1]).as_matrix())
-
-    step, columns = 1e-6, []
-    for axis in np.eye(3):
-        rate = (rotation(angles + step * axis) - rotation(angles - step * axis)) / (2 * step)
-        spin = rate @ rotation(angles).T
-        columns.append([spin[2, 1], spin[0, 2], spin[1, 0]])
-    S = np.array(columns).T
-    np.testing.assert_allclose(S[:, 1], [-np.sin(third), np.cos(third), 0.0], atol=1e-9)
-    roll = [np.cos(second) * np.cos(third), np.cos(second) * np.sin(third), -np.sin(second)]
-    np.testing.assert_allclose(S[:, 0], roll, atol=1e-9)
-    assert np.abs(S[:, 1] - [-np.sin(first), np.cos(first), 0.0]).max() > 0.4
-
-
 # -- arms stretched out or folded (paper 4: sin q2 = 0), and goals out of reach ------------------
 
 
@@ -431,19 +412,6 @@ def test_singular_arm(elbow: float) -> None:
     for law in (transposed, model_based):
         assert law.status.singular
         assert law.status.smallest_singular_value < 0.02
-
-
-def test_eq_27_as_printed_fails_at_a_singularity() -> None:
-    """Its ``Htilde = J_z^-T H+ J_z^-1`` has no bound there, so neither has the command."""
-    robot = load("planar_manipulator")
-    law = law_of("transposed_jacobian", robot, PLANAR_GAINS)
-    H = robot.inertia_matrix(np.array([0.3, 1.0]))[np.ix_([0, 1, 5, 6, 7], [0, 1, 5, 6, 7])]
-    sizes = []
-    for elbow in (1.0, 1e-3, 1e-6):
-        law.command(stretched(elbow), GOAL)
-        inverse = np.linalg.inv(law._out["J_z"][:, [0, 1, 5, 6, 7]])
-        sizes.append(float(np.linalg.norm(H @ inverse @ law.error)))
-    assert sizes[2] > 900.0 * sizes[1] > 900.0 * 50.0 * sizes[0]
 
 
 def test_damping_sets_in_smoothly() -> None:

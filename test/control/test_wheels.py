@@ -128,14 +128,18 @@ def test_what_wheels_do_not_give_is_told() -> None:
 
 
 def test_a_wheel_reaches_its_largest_rate_in_two_periods_at_the_earliest() -> None:
-    wheels = control()
+    wheels, inverse = control(), np.linalg.inv(WHEELS.axes_B)
+
+    def strongest(sign: float) -> list[float]:
+        """Return the torques for a demand so large that every wheel gives all it may."""
+        wheels.command_torque(-1e6 * sign * inverse.T @ np.ones(3))
+        return wheels.torque.tolist()
+
     observe(wheels, [199.9, -299.98, 0.0])
-    lower, upper = wheels._bounds()
-    np.testing.assert_allclose(upper, [0.03 * 0.1 / 0.04, 0.2, 0.3], rtol=1e-6)
-    np.testing.assert_allclose(lower, [-0.3, -0.03 * 0.02 / 0.04, -0.3], rtol=1e-6)
+    assert strongest(1.0) == pytest.approx([0.03 * 0.1 / 0.04, 0.2, 0.3], rel=1e-6)
+    assert strongest(-1.0) == pytest.approx([-0.3, -0.03 * 0.02 / 0.04, -0.3], rel=1e-6)
     observe(wheels, [200.5, -301.0, 0.0])
-    lower, upper = wheels._bounds()
-    assert (upper[0], lower[1]) == (0.0, 0.0)
+    assert (strongest(1.0)[0], strongest(-1.0)[1]) == pytest.approx((0.0, 0.0), abs=1e-12)
 
 
 def test_excluded_wheels_give_no_torque() -> None:

@@ -126,17 +126,6 @@ def test_brackets_of_centred_slots_at_the_origin() -> None:
     assert_agrees(-robot.curvature(np.zeros(3))[3:], expected)
 
 
-def test_alpha_of_the_published_manoeuvre() -> None:
-    robot = of_package("sliding_masses")
-    w = -robot.curvature([-2.378408, 1.687252, -1.377082])[3:]
-    columns = np.column_stack([w[:, 0, 1], w[:, 1, 2], w[:, 0, 2]])
-    alpha = np.linalg.solve(columns, [0.5, -0.15, 0.1])
-    # The shape has seven digits; alpha is held to the digits given of it.
-    assert abs(alpha[0] - -0.84377) < 1e-5
-    assert abs(alpha[1] - -61.0928) < 1e-4
-    assert abs(alpha[2] - -18.8194) < 1e-4
-
-
 @pytest.mark.parametrize("seed", [30, 31, 32])
 def test_brackets_and_connection_of_sliders_anywhere(seed: int) -> None:
     """Eqs (3) and (7), the derivatives by central differences of fourth order."""

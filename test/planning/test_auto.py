@@ -311,16 +311,6 @@ def test_only_methods_that_start_in_motion_are_asked_for_moving_joints() -> None
         choice_of(rests)[0].method.plan(request)
 
 
-def test_a_refused_goal_does_not_change_what_a_schedule_controls() -> None:
-    turns = made("turns", controls=ATTITUDE)
-    method, _ = choice_of(turns)
-    schedule = method.plan(at(np.zeros(2)), goal_of([0, 0, 1]))
-    turns.refusal = "Too far."
-    with pytest.raises(PlanningError):
-        method.plan(at(np.zeros(2)), goal_of([0, 0, 2]))
-    assert schedule.controls == ATTITUDE
-
-
 def test_every_method_of_the_registry_is_built_with_its_defaults() -> None:
     robot = robot_named("three_joint_arm")
     for name, entry in METHODS.items():

@@ -157,11 +157,12 @@ def test_the_momentum_in_the_base_turns_against_it() -> None:
 
 
 def test_all_places_of_a_goal_are_displaced() -> None:
-    hand = EndEffectorGoal("hand", np.array([1.0, 2.0, 3.0]))
+    hand = EndEffectorGoal.along("hand", [[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]])
     goal = Goal.of_end_effectors([hand], position=[0.5, 0.25, -1.0])
     moved = goal.displaced(np.array([0.1, -0.2, 0.4]))
     np.testing.assert_allclose(moved.position, [0.6, 0.05, -0.6])
-    np.testing.assert_allclose(moved.end_effectors[0].position, [1.1, 1.8, 3.4])
+    way = moved.end_effectors[0].path_values
+    np.testing.assert_allclose(way, [[0.2, 0.0, 0.7], [1.1, 1.8, 3.4]])
     np.testing.assert_array_equal(moved.quaternion, goal.quaternion)
 
 

@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod, goal_at
+from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.planning import GaitSchedule, RobotState
-from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
+from spacerobot_ros.planning import GaitSchedule
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.simulation import InitialState
 
 Array = npt.NDArray[np.float64]
 
@@ -33,13 +32,6 @@ COARSE = {
 
 
 # -- reached, or refused with the true reason -------------------------------------------------
-
-
-def test_goals_are_pursued_one_after_the_other() -> None:
-    loop = Loop()
-    for place in (NEAR, TURNED, HERE):
-        assert loop.decide(place).state is PlannerState.REACHED
-        assert max(loop.error_to(place)) <= 1e-3
 
 
 def test_the_pose_that_is_already_there_is_reached() -> None:
@@ -62,29 +54,6 @@ def test_the_measured_error_is_reported() -> None:
     assert status.position_error_m == pytest.approx(distance, rel=1e-3, abs=1e-9)
     assert status.attitude_error_rad == pytest.approx(angle, rel=1e-3, abs=1e-9)
     assert loop.states == ["executing", "reached"]
-
-
-@pytest.mark.parametrize(
-    ("momenta", "mentions"),
-    [
-        ({"linear_momentum": np.array([0.3, -0.4, 0.0])}, ("drifts", "momentum", "0.5 kg m/s")),
-        ({"angular_momentum": np.array([0.0, 0.0, 0.25])}, ("momentum", "0.25 kg m^2/s")),
-    ],
-)
-def test_a_robot_with_momentum_is_refused_with_the_true_reason(
-    momenta: dict[str, Array], mentions: tuple[str, ...]
-) -> None:
-    loop = Loop(initial=InitialState(**momenta))
-    status = loop.decide(NEAR)
-    assert loop.states == ["refused"]
-    assert_one_sentence(status.message, *mentions)
-
-
-def test_a_robot_that_the_method_cannot_steer_is_refused() -> None:
-    loop = Loop(robot="planar_chain")
-    status = loop.decide(TURNED)
-    assert loop.states == ["refused"]
-    assert_one_sentence(status.message, "three sliders", "planar_chain")
 
 
 def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
@@ -330,16 +299,3 @@ def test_a_defect_of_a_method_is_seen(background: bool) -> None:
     goal_id = loop.propose_goal(NEAR)
     with pytest.raises(ZeroDivisionError, match="a defect"):
         wait(loop, goal_id)
-
-
-def test_the_search_of_the_optimal_method_is_cancelled() -> None:
-    loop = Loop({"method": "optimal", "optimal.cache": 0})
-    cancellation = Cancellation()
-    cancellation.cancel()
-    goal = goal_at(([0.0, 0.0, 0.0], [0.05, -0.03, 0.02]))
-    state = RobotState(loop.plant.pose[:3], loop.plant.pose[3:], loop.plant.q)
-    request = PlanRequest(state, goal, loop.config.tolerance)
-    began = time.monotonic()
-    with pytest.raises(PlanningCancelled):
-        loop.method.plan(request, cancellation)
-    assert time.monotonic() - began < 1.6

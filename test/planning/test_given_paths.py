@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from spacerobot_ros.planning import Goal, RobotState, Tolerance, build_method, p
 from spacerobot_ros.planning.core.goal import MAX_PATH_POSES, EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
-from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal, PursuedGoals
+from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 from spacerobot_ros.planning.methods.registry import method_options
@@ -323,18 +322,6 @@ def test_paths_that_are_none_are_refused(path: Any, message: str) -> None:
         EndEffectorGoal.along("hand", path)
 
 
-def test_quaternions_of_any_length_are_scaled_to_one() -> None:
-    rng = np.random.default_rng(4)
-    turns, lengths = Rotation.random(60, random_state=4), np.repeat([1e-5, 0.5, 1.0, 3.0, 1e9], 12)
-    places = rng.normal(size=(60, 3))
-    path = np.hstack([places, turns.as_quat() * lengths[:, np.newaxis]])
-    found = EndEffectorGoal.along("hand", path)
-    np.testing.assert_array_equal(found.path_values[:, :3], places)
-    np.testing.assert_allclose(found.path_values[:, 3:], turns.as_quat(), atol=1e-15)
-    assert found.waypoints is not None
-    assert len(found.waypoints) == 59
-
-
 # -- one place ----------------------------------------------------------------------------------
 
 
@@ -360,26 +347,11 @@ def test_a_path_is_a_goal_with_waypoints() -> None:
         assert status.end_effector_waypoints == counts
 
 
-def test_files_of_goals_keep_paths(tmp_path: Any) -> None:
-    path = tmp_path / "goal.json"
-    poses: Any = [[1, 2, 3, 0, 0, 0.6, 0.8], [4, 5, 6, 0, 0, 0, 1]]
-    goal = Goal.of_end_effectors(
-        [EndEffectorGoal.along("hand", poses), EndEffectorGoal.checked("foot", [7, 8, 9])]
-    )
-    GoalFile(str(path)).pursue(PursuedGoals({"base": IdentifiedGoal(goal, "4.2")}))
-    loaded = GoalFile(str(path)).load()["base"]
-    assert loaded.goal.equals(goal)
-    assert loaded.goal.has_path
-
-
-def test_a_path_of_the_base_is_saved_and_displaced(tmp_path: Path) -> None:
+def test_a_path_of_the_base_is_displaced() -> None:
     values = np.hstack([CORNER, TURNS.as_quat()])
     goal = Goal.through(values * [1, 1, 1, 2, 2, 2, 2])
     np.testing.assert_allclose(goal.path_values, values, atol=1e-15)
     assert not goal.equals(Goal.through(values[1:]))
-    GoalFile(str(tmp_path / "goal")).pursue(PursuedGoals({"base": IdentifiedGoal(goal, "4.2")}))
-    loaded = GoalFile(str(tmp_path / "goal")).load()["base"].goal
-    np.testing.assert_allclose(loaded.path_values, values, atol=1e-15)
     moved = goal.displaced(np.array([0.1, 0.2, -0.3])).path_values
     np.testing.assert_allclose(moved - values, [[0.1, 0.2, -0.3, 0, 0, 0, 0]] * 4, atol=1e-15)
 
@@ -402,13 +374,6 @@ def test_methods_for_the_joints_alone_refuse_waypoints() -> None:
     goal = Goal.through(np.hstack([CORNER, TURNS.as_quat()]))
     with pytest.raises(PlanningError, match="does not stop at waypoints"):
         plan("three_joint_arm", goal, method="optimal", control_period=PERIOD)
-
-
-def test_statuses_tell_the_number_of_waypoints() -> None:
-    status = PlannerStatus(PlannerState.EXECUTING, end_effector_waypoints={"hand": 12})
-    values = status.to_values()
-    assert values["waypoints_of_hand"] == "12"
-    assert PlannerStatus.from_values(values).end_effector_waypoints == {"hand": 12}
 
 
 # -- as far as possible -------------------------------------------------------------------------
@@ -437,11 +402,3 @@ def test_a_path_is_followed_until_shortly_before_a_limit(start: Array) -> None:
     request = PlanRequest(state, schedule.goal, NEAR, correction=True, previous=schedule)
     with pytest.raises(PlanningError, match=r"optimal may reach"):
         method.plan(request)
-
-
-def test_a_goal_with_a_path_is_displaced_with_its_waypoints() -> None:
-    way = [[0.1, 0.2, 0.3, 0.0, 0.6, 0.0, 0.8], [1.0, -2.0, 3.0, 0.0, 0.0, 0.0, 1.0]]
-    goal = Goal.of_end_effectors([EndEffectorGoal.along("tip", way)])
-    (moved,) = goal.displaced(np.array([1.0, 10.0, -100.0])).end_effectors
-    assert moved.path_values[:, :3].tolist() == [[1.1, 10.2, -99.7], [2.0, 8.0, -97.0]]
-    assert moved.path_values[:, 3:].tolist() == [row[3:] for row in way]

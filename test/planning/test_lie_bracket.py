@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -92,34 +91,10 @@ def null_space(A: Array) -> Array:
     return np.linalg.svd(A)[2][np.linalg.matrix_rank(A) :].T
 
 
-def first_order_brackets(robot: SlidingRobot, z: Array) -> Array:
-    """Return ``w[:, i, j] = omega_[Fi,Fj]`` of eq. (7), its derivatives by central differences."""
-    n, h = len(z), 1e-5
-    unit = np.eye(n)
-    Ft = np.array([robot.base_rate(z, unit[i]) for i in range(n)])
-    slope = np.array(
-        [
-            [
-                (
-                    robot.base_rate(z + h * unit[j], unit[i])
-                    - robot.base_rate(z - h * unit[j], unit[i])
-                )
-                / (2 * h)
-                for j in range(n)
-            ]
-            for i in range(n)
-        ]
-    )
-    w = np.empty((3, n, n))
-    for i, j in itertools.product(range(n), repeat=2):
-        w[:, i, j] = np.cross(Ft[j], Ft[i]) + slope[i, j] - slope[j, i]
-    return w
-
-
 def test_alpha_solves_for_the_attitude_that_is_missing() -> None:
     robot, state, goal, z_f = random_case(3, 8)
     schedule = planner(robot, Tolerance(1.0, 1.0)).plan(state, goal)
-    w = first_order_brackets(robot, z_f)
+    w = -SpaceRobot.from_urdf(robot.urdf).curvature(z_f)[3:]
     matrix = np.column_stack([w[:, 0, 1], w[:, 1, 2], w[:, 0, 2]])
     slide = schedule.positions[: round(5.0 / PERIOD) + 1]
     after = robot.attitudes(slide, PERIOD, Rotation.from_quat(state.quaternion))[-1]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +15,10 @@ from support.oracles.pinocchio_oracle import PinocchioOracle
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.controllability import shape_box
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
-from spacerobot_ros.planning.methods.optimal.method import OptimalGait
 from spacerobot_ros.planning.methods.optimal.motion_bounds import (
     ConnectionBounds,
     DurationBound,
@@ -31,75 +27,9 @@ from spacerobot_ros.planning.methods.optimal.motion_bounds import (
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
-    OptimalOptions,
 )
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.resources import robot_file
-
-_MIN_GOAL_ANGLE = 0.05
-"""Smallest rotation of a goal, rad."""
-
-_START_SCATTER = 0.3
-"""Largest difference of a start's joint position from the case's, m or rad."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """A robot's start, options, and kind of goals.
-
-    Attributes
-    ----------
-    start
-        Joint positions, m or rad, near which the plans start.
-    options
-        Options of the method.
-    angle
-        Largest rotation of a goal, rad.
-    planar
-        Whether goals are rotated about the third axis only.
-    sliding
-        Whether the position of a goal counts as well.
-    """
-
-    start: tuple[float, ...]
-    options: dict[str, Any]
-    angle: float = 1.0
-    planar: bool = False
-    sliding: bool = False
-
-
-CASES = {
-    "planar_chain": Case((0.0, 0.0), {}, angle=3.0, planar=True),
-    "sliding_masses": Case(
-        (0.0, 0.0, 0.0),
-        {"max_velocity": (0.0647, 0.1871, 0.6550), "max_acceleration": (0.228, 0.643, 3.564)},
-        sliding=True,
-    ),
-    "three_joint_arm": Case((0.0, -math.pi / 4, math.pi / 2), {}),
-    "servicer": Case((0.0, -1.2, 2.0, 0.0, 0.8, 0.0), {}),
-}
-"""Cases by the names of their robots."""
-
-
-def requests(robot: SpaceRobot, case: Case, count: int, seed: int) -> Iterator[PlanRequest]:
-    """Yield random plan requests of a case; the same seed gives the same ones."""
-    rng = np.random.default_rng(seed)
-    for _ in range(count):
-        scattered = np.array(case.start) + rng.uniform(-_START_SCATTER, _START_SCATTER, robot.n)
-        q = np.clip(scattered, robot.lower, robot.upper)
-        axis = rng.normal(size=3)
-        if case.planar:
-            axis = np.array([0.0, 0.0, axis[2]])
-        angle = rng.uniform(_MIN_GOAL_ANGLE, case.angle)
-        turn = quaternion_from_rotvec(axis / np.linalg.norm(axis) * angle)
-        position = np.zeros(3)
-        if case.sliding:
-            last = np.clip(q + rng.uniform(-1.0, 1.0, robot.n), robot.lower, robot.upper)
-            there = matrix_from_quaternion(turn) @ robot.center_of_mass(last)
-            position = robot.center_of_mass(q) - there
-        state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
-        yield PlanRequest(state, Goal.checked(position, turn), Tolerance(2e-3, 2e-3))
-
 
 Array = npt.NDArray[np.float64]
 
@@ -328,28 +258,6 @@ def test_ends_in_motion_and_a_drift_shorten_the_bound() -> None:
     # A turn about another axis than the only one is no part of the goal.
     along = bound_of(robot, rest, **limits, axes=np.array([[1.0, 0.0, 0.0]]))
     assert along == DurationBound(0.0, "")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(CASES))
-def test_no_plan_is_faster_than_the_bound(name: str) -> None:
-    case, robot = CASES[name], SpaceRobot.from_file(robot_file(name))
-    options = OptimalOptions(**case.options, cache=0, starts=6, answers=1, intervals=30)
-    method = OptimalGait(robot, PERIOD, options=options)
-    (request,) = requests(robot, case, 1, seed=1)
-    schedule = method.plan(request)
-    # Within a time that is a little shorter than the bound, the goal is refused with that bound.
-    bound = bound_by_refusal(method, request)
-    assert 0 < bound <= schedule.duration + 1e-9
-
-
-def bound_by_refusal(method: OptimalGait, request: Any) -> float:
-    """Return the bound with which a goal is refused that is asked for in one tick, s."""
-    asked = replace(method.options, duration=1e-9)
-    gait = OptimalGait(method.robot, PERIOD, options=asked)
-    with pytest.raises(PlanningError, match=r"takes less than") as refusal:
-        gait.plan(request)
-    return float(str(refusal.value).split("takes less than ")[1].split(" s,")[0])
 
 
 # -- refusals ---------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from planning.flown import STEP, plant_at
 from planning.sliding_robots import paper_robot, random_sliding_robot
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
+from support.planar_manoeuvres import closed_forms
 from support.planner_loop import robot_of
 from support.planners import planner_of
 from support.urdf_text import link
@@ -157,19 +158,9 @@ def test_a_chain_turns_in_its_plane_and_ends_in_a_shape(final: list[float] | Non
     if final is not None:
         np.testing.assert_allclose(psi[-1], final, atol=1e-9)
     middle, move = (psi[1:] + psi[:-1]) / 2, np.diff(psi, axis=0)
-    turn = 0.0
     # Gauss points along every straight piece.
-    for offset in np.array([-0.5, 0.5]) / np.sqrt(3):
-        one, two = (middle + offset * move).T
-        both = one + two
-        N = np.array(
-            [
-                17.5 + 7.5 * np.cos(one) + 10.5 * np.cos(two) + 2.5 * np.cos(both),
-                3.75 + 5.25 * np.cos(two) + 2.5 * np.cos(both),
-            ]
-        )
-        D = 32.5 + 15 * np.cos(one) + 10.5 * np.cos(two) + 5 * np.cos(both)
-        turn -= float(np.sum(N.T / D[:, np.newaxis] * move)) / 2
+    points = [middle + offset * move for offset in np.array([-0.5, 0.5]) / np.sqrt(3)]
+    turn = -sum(float(np.sum(closed_forms(each) * move)) for each in points) / 2
     assert abs((turn - wanted + np.pi) % (2 * np.pi) - np.pi) <= 1e-5
 
 

@@ -195,17 +195,6 @@ def test_what_was_planned_with_all_joints_is_not_gone_on_with_without_some() -> 
     assert content(without.plan(replace(request, previous=of_all))) == content(alone)
 
 
-def test_auto_goes_on_with_the_method_of_the_schedule_before() -> None:
-    case = CASES["area_loop"]
-    robot, request = robot_named(case.robot), requests(case)[0]
-    options = {"optimal": method_options("optimal", FEW_STARTS)}
-    by_loops = build_method("area_loop", robot, PERIOD, STEP, options).plan(request)
-    auto = build_method("auto", robot, PERIOD, STEP, options)
-    assert auto.plan(request).method == "optimal"
-    assert auto.plan(replace(request, previous=by_loops)).method == "area_loop"
-    assert auto.plan(request).method == "optimal"
-
-
 # -- cancellation -----------------------------------------------------------------------------
 
 

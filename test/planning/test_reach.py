@@ -104,10 +104,6 @@ KINDS = ["tree", "chain", "planar", "sliders"]
 @given(seed=SEEDS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_many_random_motions_reach_is_never_called_unreachable(kind: str, seed: int) -> None:
-    check_what_a_random_motion_reaches(kind, seed)
-
-
-def check_what_a_random_motion_reaches(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     urdf = urdf_of(kind, rng)
     robot = SpaceRobot.from_urdf(urdf)

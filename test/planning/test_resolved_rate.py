@@ -383,21 +383,6 @@ def test_paper_4_the_path_ends_at_the_singularity(
     assert hand[:2] == pytest.approx([1.622675, 1.131448], abs=2e-6)
 
 
-@pytest.mark.parametrize("first_step", [0.02, 0.9])
-def test_a_singularity_is_not_stepped_over(
-    manipulator: tuple[SpaceRobot, RobotState], monkeypatch: pytest.MonkeyPatch, first_step: float
-) -> None:
-    robot, state = manipulator
-    module = "spacerobot_ros.planning.methods.resolved_rate."
-    monkeypatch.setattr(module + "_TRACE_STEP", first_step)
-    monkeypatch.setattr(module + "_MIN_TRACE_STEPS", 2)
-    monkeypatch.setattr(module + "_SINGULARITY_STEP_SHARE", 1.0)
-    method = build_method("resolved_rate", robot, 0.01, 0.01, {})
-    assert isinstance(method, ResolvedRateGait)
-    path = method.path(request_b(state))
-    assert 1.583415 * path.path_fractions[-1] == pytest.approx(1.194983, abs=0.01)
-
-
 def test_paper_4_the_line_is_followed_until_shortly_before_the_singularity(
     manipulator: tuple[SpaceRobot, RobotState],
 ) -> None:

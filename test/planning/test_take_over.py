@@ -16,11 +16,11 @@ from support.planner_loop import (
     TURNED,
     Loop,
     MovingStub,
-    Place,
     StubMethod,
     goal_at,
     robot_of,
 )
+from support.planner_phases import FAR, OTHER, stub_of
 
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
@@ -31,8 +31,6 @@ from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
 from spacerobot_ros.times import SECOND
 
-OTHER: Place = ([-0.04, 0.0, 0.01], [0.0, 0.0, 0.0])
-FAR: Place = ([50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 AHEAD = 6
 """Ticks from the request to the take-over."""
 
@@ -48,11 +46,6 @@ def flying(ticks: int = 40, *, held: bool = False, **parameters: Any) -> Loop:
         loop.tick()
     loop.tick(10)
     return loop
-
-
-def stub_of(loop: Loop) -> MovingStub:
-    assert isinstance(loop.method, MovingStub)
-    return loop.method
 
 
 def tracker_of(loop: Loop) -> TrajectoryTracker:
@@ -219,7 +212,7 @@ def test_a_plan_for_an_earlier_goal_is_cancelled_at_once() -> None:
     loop = flying(held=True, ticks=80)
     loop.propose_goal(([0.01, 0.02, 0.0], [0.0, 0.0, 0.0]))
     loop.tick(2)
-    assert loop.executive.phase is Phase.REPLANNING
+    assert phase_of(loop) is Phase.REPLANNING
     assert not loop.held.cancelled
     loop.propose_goal(OTHER)
     assert loop.held.cancelled
@@ -312,8 +305,7 @@ def test_methods_that_plan_from_rest_are_not_asked_in_motion() -> None:
     loop.tick(10)
     loop.propose_goal(OTHER)
     loop.until(PlannerState.REACHED)
-    assert isinstance(loop.method, StubMethod)
-    assert [request.motion for request in loop.method.requests] == [None, None]
+    assert [request.motion for request in stub_of(loop).requests] == [None, None]
 
 
 # -- events -----------------------------------------------------------------------------------

@@ -33,14 +33,8 @@ LINEAR, ANGULAR = np.array([0.02, -0.03, 0.025]), np.array([0.01, 0.02, -0.015])
 
 
 def loop_of(robot: str = "three_joint_arm", initial: InitialState = START, **given: Any) -> Loop:
-    parameters = {
-        "resolved_rate.max_acceleration": [0.6, 0.8, 1.0][: robot_of(robot).n] + [1.0] * 4,
-        **given,
-    }
-    count = robot_of(robot).n
-    parameters["resolved_rate.max_acceleration"] = parameters["resolved_rate.max_acceleration"][
-        :count
-    ]
+    most = [0.6, 0.8, 1.0, *4 * [1.0]][: robot_of(robot).n]
+    parameters = {"resolved_rate.max_acceleration": most, **given}
     loop = Loop({"method": "resolved_rate", **parameters}, robot=robot, initial=initial)
     loop.tick(2)
     return loop
