@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.executive_loop import SHAPE, TIP, UPRIGHT, planar_manipulator
+from support.oracles.integrated import tumbled_body
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.control import ControlState, MotionLimits, PoseReference
@@ -217,35 +217,12 @@ START = BodyMotion(
 TIMES = np.array([0.0, 0.7, 13.3, 61.9, 140.0])
 
 
-def integrated(times: Array) -> tuple[Array, Array, Array]:
-    """Return centre of mass, attitude and angular velocity (T) by scipy's DOP853."""
-
-    def rate(_: float, x: Array) -> Array:
-        R, w = x[:9].reshape(3, 3), x[9:]
-        cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-        return np.concatenate(
-            [(R @ cross).ravel(), np.linalg.solve(INERTIA, np.cross(INERTIA @ w, w))]
-        )
-
-    R0 = START.R_WT
-    begin = np.concatenate([R0.ravel(), R0.T @ START.omega])
-    found = solve_ivp(rate, (0, 150), begin, "DOP853", t_eval=times, rtol=1e-11, atol=1e-13).y.T
-    arm = R0 @ TUMBLER.inertia.com
-    velocity = START.v + np.cross(START.omega, arm)
-    return (
-        START.r_WT + arm + times[:, None] * velocity,
-        found[:, :9].reshape(-1, 3, 3),
-        found[:, 9:],
-    )
-
-
 def test_the_grapple_frame_moves_as_an_independent_integration_has_it() -> None:
-    centre, R, omega_T = integrated(TIMES)
+    R, r, omega_T = tumbled_body(TUMBLER.inertia, START, TIMES)
     motion = TorqueFreeMotion(TUMBLER, START).grapple(TIMES)
-    arm = TUMBLER.grapple.r - TUMBLER.inertia.com
-    np.testing.assert_allclose(motion.R, R @ GRAPPLE_R.as_matrix(), atol=2e-8)
-    np.testing.assert_allclose(motion.r, centre + R @ arm, atol=2e-8)
-    np.testing.assert_allclose(motion.omega, np.einsum("kij,kj->ki", R, omega_T), atol=1e-9)
+    np.testing.assert_allclose(motion.R, (R * GRAPPLE_R).as_matrix(), atol=2e-8)
+    np.testing.assert_allclose(motion.r, r + R.apply(TUMBLER.grapple.r), atol=2e-8)
+    np.testing.assert_allclose(motion.omega, R.apply(omega_T), atol=1e-9)
     np.testing.assert_allclose(motion.body_motion().v, START.at(TUMBLER.grapple).v, atol=1e-14)
     turned = np.linalg.norm(motion.R[3] - motion.R[0])
     assert turned > 1.0, "the target tumbles on the way"

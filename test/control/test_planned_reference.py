@@ -85,6 +85,7 @@ def test_a_planned_docking_takes_less_propellant_in_the_same_time() -> None:
         assert flight.clearance.nearest.distance == pytest.approx(0.69 - edges.max(), abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_goal_behind_a_panel_is_reached_round_it() -> None:
     planned, straight = docked(BEHIND), docked(BEHIND, **STRAIGHT)
     assert planned.outcome is Outcome.REACHED, planned.message
@@ -113,8 +114,12 @@ def test_a_robot_that_touches_a_panel_from_the_start_fails_on_its_way() -> None:
     flight = fly_scenario(scenario.with_overrides("plant", at_panel).with_other_goal(goal))
     assert np.linalg.norm(flight.pose[-1, :3] - goal.position) < 5e-3
     assert flight.outcome is Outcome.FAILED
-    touched = "link 'base_link' and obstacle 'panel' touched at 0 s"
-    assert touched in flight.message
+    told = (
+        "The goal is not reached without contact, as link 'base_link' and obstacle 'panel' touched "
+        "at 0 s: "
+    )
+    assert flight.message.startswith(told)
+    assert flight.verdict.sentence.startswith(told)
 
 
 def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:
@@ -327,7 +332,7 @@ def test_a_robot_with_wheels_follows_a_plan_by_its_thrusters() -> None:
     """The plan's thrust is beyond ``max_force``, and no wheel gives a part of it."""
     shape = [*[0.0] * 4, 0.0, -1.2, 2.0, 0.0, 0.8, 0.0]
     plant = {"robot": "servicer_wheels", "initial_joint_positions": shape}
-    limits = {"max_force": 8.0, "max_torque": 4.0, "plan.time_factor": 1.2}
+    limits = {"max_force": 8.0, "max_torque": 4.0, "plan.time_factor": 1.2, "plan.intervals": 10}
     scenario = load_scenario("servicer_thrusters").with_overrides("plant", plant)
     controller = {"robot": "servicer_wheels", **limits}
     flight = fly_scenario(scenario.with_overrides("coordinated_control", controller))

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from planning.flown import STEP, fly, measured, plant_at
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.decided_clearance import DecidedClearance
 from support.oracles import PinocchioOracle
+from support.oracles.integrated import IDENTITY, carried
 from support.planar_manoeuvres import goal_of
 from support.planners import Planner, planner_of
 from support.random_robots import random_robot_urdf
@@ -56,18 +56,10 @@ def integrated(oracle: PinocchioOracle, corners: Array) -> Array:
     """Return the rotation vector (3,) of the base along straight legs of the shape (V, n), by
     Pinocchio's base rate at zero momentum and DOP853.
     """
-    attitude = Rotation.identity()
+    pose = IDENTITY
     for a, b in itertools.pairwise(corners):
-
-        def rate(t: float, q: Array, a: Array = a, b: Array = b) -> Array:
-            omega = oracle.base_twist(a + t * (b - a), b - a)[3:]
-            scalar = -q[:3] @ omega
-            return 0.5 * np.append(q[3] * omega + np.cross(q[:3], omega), scalar)
-
-        start = [0.0, 0.0, 0.0, 1.0]
-        end = solve_ivp(rate, (0, 1), start, "DOP853", rtol=1e-12, atol=1e-15).y[:, -1]
-        attitude = attitude * Rotation.from_quat(end)
-    return np.asarray(attitude.as_rotvec())
+        pose = carried(oracle, a, b - a, 1.0, pose)
+    return np.asarray(Rotation.from_quat(pose[3:]).as_rotvec())
 
 
 def around(nominal: NominalShape, areas: Array) -> Array:

@@ -34,7 +34,7 @@ from spacerobot_ros.model.integration import repeat_step
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation import EffortPlant, InitialState
+from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
@@ -350,13 +350,14 @@ def test_motion_beyond_numbers_is_refused_and_undone() -> None:
     assert plant.pose.tolist() == before
 
 
+@pytest.mark.parametrize("plant", [EffortPlant, VelocityPlant])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
-def test_durations_must_be_positive(value: float) -> None:
+def test_durations_must_be_positive(plant: Any, value: float) -> None:
     robot = robot_of(random_urdf(0))
     with pytest.raises(ParameterError, match="control period must be positive"):
-        EffortPlant(robot, value)
+        plant(robot, value)
     with pytest.raises(ParameterError, match="integration step must be positive"):
-        EffortPlant(robot, TICK, integration_step=value)
+        plant(robot, TICK, integration_step=value)
 
 
 # -- reaction wheels of a plant under efforts: at their largest rate, at rest, and their ---------

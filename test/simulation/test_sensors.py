@@ -7,23 +7,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
-from std_msgs.msg import Float64MultiArray
 from support.effort_flights import robot_of
 from support.oracles import Array, PinocchioOracle
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.nodes.plant.publisher import StatePublisher
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
 from spacerobot_ros.simulation.sensors import NormalNumbers, ReportedState, Sensors, TargetSensors
-from spacerobot_ros.topics import TOPICS, StateField, Topic
 
 TICK = 0.05
 URDF = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
@@ -501,45 +497,3 @@ def test_named_links_are_where_pinocchio_sees_them_in_the_measured_state() -> No
         reported(ARM, end_effectors=("link_1", "claw"))
     with pytest.raises(ParameterError, match="name only one of them"):
         reported(ARM, end_effectors=("link_1", "link_1"))
-
-
-class _Streams:
-    """In place of a node: keeps what is published."""
-
-    def __init__(self) -> None:
-        self.sent: dict[str, list[bytes]] = {}
-
-    def create_publisher(self, kind: type[Any], topic: str, qos: Any) -> Any:
-        sent = self.sent.setdefault(topic, [])
-        return type("Publisher", (), {"publish": staticmethod(sent.append)})()
-
-
-def test_a_new_topic_is_an_entry_in_the_table_and_a_quantity(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    entry = Topic(
-        "energy",
-        "std_msgs/msg/Float64MultiArray",
-        "kinetic energy (J)",
-        state=(StateField("data", "kinetic_energy", array_entry_names=("kinetic_energy",)),),
-    )
-    monkeypatch.setitem(TOPICS, "energy", entry)
-    quantities = ReportedState._quantities
-    monkeypatch.setattr(
-        ReportedState,
-        "_quantities",
-        lambda self: {**quantities(self), "kinetic_energy": self._plant.momentum[6:7]},
-    )
-    config = PlantConfig(angular_momentum=(0.0, 0.0, 2.0))
-    plant = build_plant(SLIDERS, config)
-    state = ReportedState(plant, config)
-    streams: Any = _Streams()
-    publisher = StatePublisher(streams, SLIDERS, state, PlantConfig())
-    publisher.publish(0, all_topics=True)
-    plant.step(np.array([0.1, 0.0, 0.0]))
-    publisher.publish(50_000_000, all_topics=False)
-    messages = [deserialize_message(raw, Float64MultiArray) for raw in streams.sent["energy"]]
-    assert messages[-1].data[0] == plant.momentum[6] > messages[0].data[0] > 0.0
-    assert messages[0].layout.dim[0].label == "kinetic_energy"
-    assert len(streams.sent["base_pose"]) == 1, "not in every tick"
-    assert len(streams.sent["odom"]) == 2

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from support.oracles.integrated import tumbled_body
 
 from spacerobot_ros.collision import BasePoses, CollisionGeometry
 from spacerobot_ros.model import SpaceRobot
@@ -70,23 +71,8 @@ def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: RobotMoti
 
 def tumbled(target: RobotDescription, motion: BodyMotion, times: Array) -> tuple[Array, Array]:
     """Return quaternions (K, 4) and positions (K, 3) of a free body's frame, by scipy."""
-    inertia = target.bodies[0].inertia
-    J, com = inertia.about_com, inertia.com
-    start = motion.R_WT @ com
-    v = motion.v + np.cross(motion.omega, start)
-
-    def rate(_: float, y: Array) -> Array:
-        R, omega = y[:9].reshape(3, 3), y[9:]
-        alpha = -np.linalg.solve(J, np.cross(omega, J @ omega))
-        # R hat(omega): omega crosses the rows of R.
-        return np.concatenate([np.cross(R, omega).ravel(), alpha])
-
-    y = np.concatenate([motion.R_WT.ravel(), motion.R_WT.T @ motion.omega])
-    ends = (0.0, float(times[-1]) + 1e-9)
-    found = solve_ivp(rate, ends, y, t_eval=times, rtol=1e-10, atol=1e-12).y.T
-    R = Rotation.from_matrix(found[:, :9].reshape(-1, 3, 3))
-    r = motion.r_WT + start + times[:, np.newaxis] * v
-    return R.as_quat(), r - R.apply(com)
+    R, r, _ = tumbled_body(target.bodies[0].inertia, motion, times)
+    return np.asarray(R.as_quat()), r
 
 
 def distance_from_target(
