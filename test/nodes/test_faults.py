@@ -10,25 +10,21 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
-from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from support.control_loop import Loop
 from support.odometry import pose_of
-from support.planner_flight import NEAR, TURNED, Flight, Place, goal_at, values_of
+from support.planner_flight import NEAR, Flight, values_of
 from support.plant_rig import TICK, Rig
 from support.ros_harness import Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
-from support.slow import some_fast
 from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.model.urdf import load_robot
-from spacerobot_ros.nodes import CoordinatedControlNode, PlannerNode, PlantNode
+from spacerobot_ros.nodes import PlannerNode, PlantNode
 from spacerobot_ros.resources import robot_file
 
 Array = npt.NDArray[np.float64]
@@ -300,166 +296,3 @@ def test_a_driver_that_publishes_with_best_effort_is_heard(harness: Harness, cho
             break
     assert heard == (choice != "reliable")
     assert planner.is_active
-
-
-NOISE = {"sensors.position_noise": 1e-3, "sensors.attitude_noise": 8.7e-4}
-WITHIN = {"position_tolerance": 3e-3, "attitude_tolerance": 2.6e-3}
-
-
-def sliders(harness: Harness, *faults: str, **parameters: Any) -> Flight:
-    """Return a flight whose plant has the faults, and the parameters of its sensors."""
-    sensors = {k: parameters.pop(k) for k in list(parameters) if k.startswith("sensors.")}
-    return Flight(harness, {**WITHIN, **parameters}, {"faults": list(faults), **sensors})
-
-
-def true_error(plant: PlantNode, place: Place) -> tuple[float, float]:
-    """Return how far the plant's true base is from a pose: m, rad."""
-    pose = plant.plant.pose
-    turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_rotvec(place[1])
-    return float(np.linalg.norm(pose[:3] - place[0])), float(turn.magnitude())
-
-
-def assert_met(flight: Flight, status: DiagnosticStatus) -> None:
-    assert values_of(status)["state"] == "reached", status.message
-    distance, angle = true_error(flight.plant, TURNED)
-    assert distance <= WITHIN["position_tolerance"]
-    assert angle <= WITHIN["attitude_tolerance"]
-
-
-# -- noise ------------------------------------------------------------------------------------
-
-
-def test_noisy_joints_are_not_shaken_and_noisy_rates_are_no_drift(harness: Harness) -> None:
-    rates = dict.fromkeys(
-        ("sensors.velocity_noise", "sensors.angular_velocity_noise", "sensors.joint_rate_noise"),
-        1e-3,
-    )
-    flight = sliders(
-        harness,
-        averaging=25,
-        rest_tolerance=2e-3,
-        shape_deadband=4e-3,
-        **NOISE,
-        **rates,
-        **{"sensors.joint_noise": 1e-3},
-    )
-    assert_met(flight, flight.decide(TURNED))
-    # What is commanded is the gait alone: no velocity is an answer to noise.
-    (schedule,) = flight.probe.messages["gait_schedule"][:1]
-    planned = [point.velocities for point in schedule.points[:-1]]
-    commanded = [m.velocity for m in flight.probe.messages["joint_commands"] if any(m.velocity)]
-    np.testing.assert_allclose(commanded[: len(planned)], planned, atol=1e-12)
-
-
-def test_without_a_tolerance_noisy_rates_are_taken_for_drift(harness: Harness) -> None:
-    flight = sliders(harness, **{"sensors.velocity_noise": 1e-3})
-    status = flight.decide(TURNED)
-    assert values_of(status)["state"] == "refused"
-    assert_one_sentence(status.message, "drifts")
-
-
-# -- faults that the planner flies through ----------------------------------------------------
-
-SURVIVED = {
-    "a slow joint": "joint_slow slider_1 0.5 at 1",
-    "a very slow joint": "joint_slow slider_2 0.1 at 1 until 4",
-    "a joint that sticks for less than a second": "joint_stuck slider_1 at 2 until 2.5",
-    "a biased actuator": "actuator_bias slider_2 0.002 at 0.5",
-    "a noisy actuator": "actuator_noise slider_3 0.01",
-    "no pose in flight": "sensor_dropout odom at 0.5 until 10",
-    "no pose when the gait ends": "sensor_dropout odom at 10 until 20",
-    "a shift of the joint sensor": "sensor_bias slider_1 0.001 at 1",
-    "noise for a while": "sensor_noise attitude 0.05 at 1 until 9",
-}
-
-
-@pytest.mark.parametrize("fault", some_fast(SURVIVED, "no pose in flight"))
-def test_the_goal_is_met_in_spite_of(harness: Harness, fault: str) -> None:
-    flight = sliders(harness, fault, averaging=15, max_corrections=6)
-    assert_met(flight, flight.decide(TURNED))
-    assert not any("stuck" in s.message for s in flight.probe.messages["planner/status"])
-
-
-@pytest.mark.parametrize("seed", some_fast({str(k): k for k in range(4)}, "0"))
-def test_wrong_masses_cost_corrections_and_not_the_goal(harness: Harness, seed: int) -> None:
-    flight = sliders(
-        harness,
-        model_error=0.1,
-        model_error_seed=seed,
-        max_corrections=6,
-        position_tolerance=1e-3,
-        attitude_tolerance=1e-3,
-    )
-    status = flight.decide(TURNED)
-    assert_met(flight, status)
-    assert int(values_of(status)["corrections"]) >= 1
-    assert flight.plant.plant.robot.total_mass == 16.0, "the plant knows its masses"
-
-
-# -- coordinated control ----------------------------------------------------------------------
-
-THERE = ([0.1, 0.05, 0.0], [0.0, 0.0, 0.1])
-
-
-def controlled(harness: Harness, fault: str, **control: Any) -> tuple[PlantNode, DiagnosticStatus]:
-    """Fly a planar arm whose plant has a fault; return the plant, and the status that decides."""
-    shared = {"robot": "planar_manipulator", "tick_rate": 50.0}
-    plant = {
-        **shared,
-        "time_mode": "lockstep",
-        "actuation": "effort",
-        "initial_joint_positions": [-1.0, 1.0],
-        "faults": [fault],
-    }
-    within = {"position_tolerance": 5e-3, "attitude_tolerance": 5e-3, "settle_time": 0.5}
-    nodes = [
-        harness.make(PlantNode, plant, autostart=False),
-        harness.make(CoordinatedControlNode, {**shared, **within, **control}, autostart=False),
-    ]
-    probe = harness.probe({"controller/status": DiagnosticStatus})
-    goals = probe.create_publisher(PoseStamped, "goal_pose", 10)
-    for node in nodes:
-        assert node.trigger_configure() is TransitionCallbackReturn.SUCCESS
-    harness.connect()
-    assert nodes[1].trigger_activate() is TransitionCallbackReturn.SUCCESS
-    goals.publish(goal_at(THERE))
-    assert nodes[0].trigger_activate() is TransitionCallbackReturn.SUCCESS
-    decided = ("reached", "reached_partly", "failed", "refused", "aborted")
-    harness.spin_until(
-        lambda: (
-            probe.count("controller/status")
-            and values_of(probe.last("controller/status"))["state"] in decided
-        ),
-        "the goal is decided",
-        60.0,
-    )
-    return nodes[0], probe.last("controller/status")
-
-
-CONTROLLED = {
-    "weak thrusters": "thruster_weak all 0.5",
-    "thrusters off for a while": "thruster_off all at 1 until 3",
-    "a thruster stuck on for a while": "thruster_stuck force_y 5 at 1 until 3",
-    "a weak joint motor": "joint_slow shoulder 0.3",
-    "a noisy motor": "actuator_noise elbow 0.2",
-    "a jammed joint": "joint_stuck elbow at 1 until 4",
-    "no pose for a while": "sensor_dropout odom at 1 until 1.6",
-    "a short delay": "sensor_delay odom 0.04",
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", some_fast(CONTROLLED, "no pose for a while"))
-def test_control_holds_in_spite_of(harness: Harness, fault: str) -> None:
-    plant, status = controlled(harness, fault, time_limit=60.0)
-    assert values_of(status)["state"] == "reached", status.message
-    assert max(true_error(plant, THERE)) <= 0.02
-    gone = plant.plant.momentum[:6] - plant.plant.expected_momenta
-    assert np.abs(gone).max() < 1e-8
-
-
-@pytest.mark.slow
-def test_a_thruster_that_stays_on_is_too_much_and_said(harness: Harness) -> None:
-    _, status = controlled(harness, "thruster_stuck force_y 3", time_limit=8.0)
-    assert values_of(status)["state"] == "aborted"
-    assert_one_sentence(status.message, "control is lost")

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.slow import some_fast
 
 from spacerobot_ros import fly
 from spacerobot_ros.bag import Bag, read_bag
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.verification import verify_bag
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.resources import robot_file
@@ -336,3 +339,138 @@ def test_mujoco_flies_the_same_flight_from_its_commands(flight: Flight) -> None:
         left = np.abs(flown["momentum"] - flown["expected"])[:, part].max() / largest
         print(f"momentum: {left:.1e} of the largest")
         assert left < 1e-6
+
+
+# -- faults and noise that planners and controllers fly through --------------------------------
+
+WITHIN = 3e-3, 2.6e-3
+"""Tolerances of the base, m and rad."""
+
+TURNED = [0.02, -0.03, 0.01], [0.01, -0.005, 0.015]
+SLIDE = {
+    "plant.tick_rate": 20.0,
+    "planner.tick_rate": 20.0,
+    "planner.lie_bracket.t1": 2.0,
+    "planner.lie_bracket.n1": 1,
+    "planner.lie_bracket.cycle_period": 1.0,
+    "planner.position_tolerance": WITHIN[0],
+    "planner.attitude_tolerance": WITHIN[1],
+}
+
+
+def slide(*faults: str, **planner: Any) -> Flight:
+    """Return a flight of sliding masses with faults, parameters of the planner, and others."""
+    robot = SpaceRobot.from_file(robot_file("sliding_masses"))
+    given = {name if "." in name else f"planner.{name}": value for name, value in planner.items()}
+    parameters = {**SLIDE, "plant.faults": list(faults), **given}
+    return fly(robot, TURNED[0], rotvec=TURNED[1], method="lie_bracket", parameters=parameters)
+
+
+def true_error(flight: Flight, place: tuple[list[float], list[float]]) -> tuple[float, float]:
+    """Return how far the true base ends from a pose: m, rad."""
+    pose = flight.pose[-1]
+    turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_rotvec(place[1])
+    return float(np.linalg.norm(pose[:3] - place[0])), float(turn.magnitude())
+
+
+def assert_met(flight: Flight) -> None:
+    assert flight.outcome is Outcome.REACHED, flight.message
+    assert np.all(np.less_equal(true_error(flight, TURNED), WITHIN))
+
+
+def test_noisy_joints_are_not_shaken_and_noisy_rates_are_no_drift() -> None:
+    noise = {"position": 1e-3, "attitude": 8.7e-4, "joint": 1e-3}
+    noise |= dict.fromkeys(("velocity", "angular_velocity", "joint_rate"), 1e-3)
+    sensors = {f"plant.sensors.{name}_noise": value for name, value in noise.items()}
+    flight = slide(averaging=25, rest_tolerance=2e-3, shape_deadband=4e-3, **sensors)
+    assert_met(flight)
+    # What is commanded is the gait alone: no velocity is an answer to noise.
+    planned = flight.schedules[0][1].velocities[:-1]
+    commanded = flight.commands["joint_commands"].values
+    moving = commanded[commanded.any(axis=1)]
+    np.testing.assert_allclose(moving[: len(planned)], planned, atol=1e-12)
+
+
+def test_without_a_tolerance_noisy_rates_are_taken_for_drift() -> None:
+    with pytest.raises(PlanningError, match="drifts"):
+        slide(**{"plant.sensors.velocity_noise": 1e-3})
+
+
+SURVIVED = {
+    "a slow joint": "joint_slow slider_1 0.5 at 1",
+    "a very slow joint": "joint_slow slider_2 0.1 at 1 until 4",
+    "a joint that sticks for less than a second": "joint_stuck slider_1 at 2 until 2.5",
+    "a biased actuator": "actuator_bias slider_2 0.002 at 0.5",
+    "a noisy actuator": "actuator_noise slider_3 0.01",
+    "no pose in flight": "sensor_dropout odom at 0.5 until 10",
+    "no pose when the gait ends": "sensor_dropout odom at 10 until 20",
+    "a shift of the joint sensor": "sensor_bias slider_1 0.001 at 1",
+    "noise for a while": "sensor_noise attitude 0.05 at 1 until 9",
+}
+
+
+@pytest.mark.parametrize("fault", some_fast(SURVIVED, "no pose in flight"))
+def test_the_goal_is_met_in_spite_of(fault: str) -> None:
+    flight = slide(fault, averaging=15, max_corrections=6)
+    assert_met(flight)
+    assert not any("stuck" in status.message for _, status in flight.statuses)
+
+
+@pytest.mark.parametrize("seed", some_fast({str(k): k for k in range(4)}, "0"))
+def test_wrong_masses_cost_corrections_and_not_the_goal(seed: int) -> None:
+    flight = slide(
+        model_error=0.1,
+        model_error_seed=seed,
+        max_corrections=6,
+        position_tolerance=1e-3,
+        attitude_tolerance=1e-3,
+    )
+    assert_met(flight)
+    assert flight.corrections >= 1
+    assert flight.momentum_drift.max() < 1e-12, "the plant knows its masses"
+
+
+THERE = [0.1, 0.05, 0.0], [0.0, 0.0, 0.1]
+
+
+def controlled(fault: str, time_limit: float) -> Flight:
+    """Return a flight of a planar arm whose plant has a fault."""
+    within = {"position_tolerance": 5e-3, "attitude_tolerance": 5e-3, "settle_time": 0.5}
+    control = {"tick_rate": 50.0, "time_limit": time_limit, **within}
+    parameters = {
+        "plant.tick_rate": 50.0,
+        "plant.initial_joint_positions": [-1.0, 1.0],
+        "plant.faults": [fault],
+        **{f"coordinated_control.{name}": value for name, value in control.items()},
+    }
+    robot = SpaceRobot.from_file(robot_file("planar_manipulator"))
+    method = "transposed_jacobian"
+    return fly(robot, THERE[0], rotvec=THERE[1], method=method, parameters=parameters)
+
+
+CONTROLLED = {
+    "weak thrusters": "thruster_weak all 0.5",
+    "thrusters off for a while": "thruster_off all at 1 until 3",
+    "a thruster stuck on for a while": "thruster_stuck force_y 5 at 1 until 3",
+    "a weak joint motor": "joint_slow shoulder 0.3",
+    "a noisy motor": "actuator_noise elbow 0.2",
+    "a jammed joint": "joint_stuck elbow at 1 until 4",
+    "no pose for a while": "sensor_dropout odom at 1 until 1.6",
+    "a short delay": "sensor_delay odom 0.04",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", CONTROLLED.values(), ids=CONTROLLED)
+def test_control_holds_in_spite_of(fault: str) -> None:
+    flight = controlled(fault, 60.0)
+    assert flight.outcome is Outcome.REACHED, flight.message
+    assert max(true_error(flight, THERE)) <= 0.02
+    assert flight.momentum_drift.max() < 1e-8
+
+
+@pytest.mark.slow
+def test_a_thruster_that_stays_on_is_too_much_and_said() -> None:
+    flight = controlled("thruster_stuck force_y 3", 8.0)
+    assert flight.outcome is Outcome.ABORTED
+    assert "control is lost" in flight.message
