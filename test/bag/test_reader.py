@@ -21,7 +21,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, UInt8, UInt8MultiArray
 from support.hostile.records import string
 from support.made_bags import made_bag
-from support.raw_messages import iterate_raw
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 import spacerobot_ros
@@ -112,35 +111,18 @@ def test_a_topic_without_headers_is_stamped_by_its_log_time(tmp_path: Path) -> N
     assert read_bag(tmp_path / "a.mcap")["/a"].stamp.tolist() == [1.5]
 
 
-def test_a_number_of_every_message(path: Path) -> None:
-    x = read_bag(path)["/odom"].field("pose.pose.position.x")
+def test_fields_of_every_message(path: Path) -> None:
+    odom, joints = (read_bag(path)[topic] for topic in ("/odom", "/joint_states"))
+    x = odom.field("pose.pose.position.x")
     assert x.dtype == np.float64
     assert x.tolist() == [math.sin(0.01 * k) for k in range(N)]
-
-
-def test_numbers_of_every_message(path: Path) -> None:
-    bag = read_bag(path)
-    covariance = bag["/odom"].field("pose.covariance")
-    assert np.array_equal(covariance, np.arange(36.0) + np.arange(N)[:, None])
-    position = bag["/joint_states"].field("position")
-    assert np.array_equal(position, [[0.1 * k, -0.2 * k] for k in range(N)])
-
-
-def test_words_of_every_message(path: Path) -> None:
-    bag = read_bag(path)
-    assert bag["/odom"].field("child_frame_id") == ["base_link"] * N
-    assert bag["/joint_states"].field("name") == [["slider_1", "slider_2"]] * N
-
-
-def test_whole_numbers_do_not_overflow(path: Path) -> None:
-    seconds = read_bag(path)["/odom"].field("header.stamp.sec")
-    assert seconds.dtype == np.int64
-    assert (seconds * 10**9)[-1] == 5 * 10**9
-
-
-def test_messages_inside_of_messages(path: Path) -> None:
-    positions = read_bag(path)["/odom"].field("pose.pose.position")
-    assert [p.x for p in positions] == [math.sin(0.01 * k) for k in range(N)]
+    assert [p.x for p in odom.field("pose.pose.position")] == x.tolist()
+    assert np.array_equal(odom.field("pose.covariance"), np.arange(36.0) + np.arange(N)[:, None])
+    assert np.array_equal(joints.field("position"), [[0.1 * k, -0.2 * k] for k in range(N)])
+    assert odom.field("child_frame_id") == ["base_link"] * N
+    assert joints.field("name") == [["slider_1", "slider_2"]] * N
+    seconds = odom.field("header.stamp.sec")
+    assert (seconds.dtype, (seconds * 10**9)[-1]) == (np.int64, 5 * 10**9), "without overflow"
 
 
 def test_a_list_of_messages_is_looked_into(tmp_path: Path) -> None:
@@ -184,14 +166,6 @@ def test_a_topic_without_messages(path: Path, tmp_path: Path) -> None:
     assert math.isnan(bag.end_time)
 
 
-def test_decoded_messages(path: Path, assert_same: AssertSame) -> None:
-    expected = [(time, message) for topic, _, time, message in flight() if topic == "/odom"]
-    found = list(read_bag(path).messages("/odom"))
-    assert [time_ns for time_ns, _ in found] == [time_ns for time_ns, _ in expected]
-    for (_, message), (_, original) in zip(found, expected, strict=True):
-        assert_same(original, message)
-
-
 def test_every_type(tmp_path: Path, samples: list[Sample], assert_same: AssertSame) -> None:
     with BagWriter(tmp_path / "a.mcap") as writer:
         for topic, type_name, message in samples:
@@ -215,19 +189,6 @@ def test_meaningless_bytes_at_the_end_do_no_harm(tmp_path: Path) -> None:
     for _, decoded in read:
         assert decoded.position.tolist() == [1.0, 2.0]
         assert decoded.effort.tolist() == []
-
-
-def test_the_raw_messages(path: Path) -> None:
-    raw = list(iterate_raw(path))
-    assert raw == [
-        (topic, type_name, time_ns, time_ns - 300, raw[n][4])
-        for n, (topic, type_name, time_ns, _) in enumerate(flight())
-    ]
-    expected = [(topic, serialize_message(message)) for topic, _, _, message in flight()]
-    # What pads a message is not set, so that equal messages may differ in bytes: compare lengths.
-    assert [(topic, len(data)) for topic, _, _, _, data in raw] == [
-        (topic, len(data)) for topic, data in expected
-    ]
 
 
 def test_read_bag_is_there_at_once_and_costs_nothing_before() -> None:

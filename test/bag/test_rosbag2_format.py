@@ -1,19 +1,12 @@
 from __future__ import annotations
 
-import struct
-import zlib
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-import zstandard
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Message, MessageIndex, Schema
-from mcap.stream_reader import StreamReader
-from mcap_ros2.decoder import DecoderFactory
 from rclpy.serialization import serialize_message
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
@@ -64,92 +57,6 @@ def test_rosbags_decodes_every_type(
         expected_topic, _, expected = samples[n % len(samples)]
         assert (topic, time_ns) == (expected_topic, 10**18 + n * 10_000_000)
         assert_same(expected, message)
-
-
-def test_mcap_ros2_decodes_every_type(
-    bag: Path, samples: list[Sample], assert_same: AssertSame
-) -> None:
-    with bag.open("rb") as file:
-        found = list(
-            make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-        )
-    assert len(found) == 3 * len(samples)
-    for n, (schema, channel, message, decoded) in enumerate(found):
-        topic, type_name, expected = samples[n % len(samples)]
-        assert schema is not None
-        assert (channel.topic, schema.name) == (topic, type_name)
-        assert message.log_time == 10**18 + n * 10_000_000
-        assert message.publish_time == message.log_time - 1000
-        assert message.sequence == 0
-        assert_same(expected, decoded)
-
-
-def test_the_summary_agrees_with_the_data(bag: Path, samples: list[Sample]) -> None:
-    with bag.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        header, summary = reader.get_header(), reader.get_summary()
-    assert header.profile == "ros2"
-    assert summary is not None
-    statistics = summary.statistics
-    assert statistics is not None
-    with bag.open("rb") as file:
-        everything = list(StreamReader(file, validate_crcs=True).records)
-    messages = [record for record in everything if isinstance(record, Message)]
-    assert statistics.message_count == len(messages) == 3 * len(samples)
-    assert statistics.channel_message_counts == Counter(m.channel_id for m in messages)
-    assert statistics.message_start_time == messages[0].log_time
-    assert statistics.message_end_time == messages[-1].log_time
-    assert statistics.chunk_count == len(summary.chunk_indexes) > 3
-    assert statistics.schema_count == len(summary.schemas)
-    assert statistics.channel_count == len(summary.channels) == len(samples)
-    # Each schema and channel stands in the data before the first message that needs it.
-    known: set[tuple[str, int]] = set()
-    for record in everything:
-        if isinstance(record, Schema):
-            assert record == summary.schemas[record.id]
-            known.add(("schema", record.id))
-        elif isinstance(record, Channel):
-            assert record == summary.channels[record.id]
-            assert ("schema", record.schema_id) in known
-            known.add(("channel", record.id))
-        elif isinstance(record, Message):
-            assert ("channel", record.channel_id) in known
-
-
-def test_the_indexes_point_at_the_messages(bag: Path, samples: list[Sample]) -> None:
-    indexed = 0
-    with bag.open("rb") as file:
-        summary = make_reader(file).get_summary()
-        assert summary is not None
-        for index in summary.chunk_indexes:
-            record = _record_at(file, index.chunk_start_offset)
-            assert isinstance(record, Chunk)
-            assert record.message_start_time == index.message_start_time
-            assert record.message_end_time == index.message_end_time
-            inner = _chunk_data(record)
-            end = index.chunk_start_offset + index.chunk_length + index.message_index_length
-            for channel_id, offset in index.message_index_offsets.items():
-                assert index.chunk_start_offset + index.chunk_length <= offset < end
-                message_index = _record_at(file, offset)
-                assert isinstance(message_index, MessageIndex)
-                assert message_index.channel_id == channel_id
-                for log_time_ns, start in message_index.records:
-                    opcode, _, channel, _, time_ns = struct.unpack_from("<BQHIQ", inner, start)
-                    assert (opcode, channel, time_ns) == (5, channel_id, log_time_ns)
-                    indexed += 1
-    assert indexed == 3 * len(samples)
-
-
-def test_one_topic_and_one_span_of_time_are_found_by_the_index(bag: Path) -> None:
-    with bag.open("rb") as file:
-        found = list(make_reader(file).iter_messages("/odom", starting_at=10**18 + 1))
-    assert [message.log_time - 10**18 for _, _, message in found] == [120_000_000, 240_000_000]
-
-
-def test_the_checksum_of_the_summary(bag: Path) -> None:
-    content = bag.read_bytes()
-    start, _, checksum = struct.unpack("<QQI", content[-28:-8])
-    assert checksum == zlib.crc32(content[start:-12])
 
 
 def test_the_channel_metadata_are_those_of_rosbag2(tmp_path: Path) -> None:
@@ -282,15 +189,3 @@ def test_any_file_name_survives_yaml(tmp_path: Path, name: str) -> None:
         metadata = yaml.safe_load(record.metadata["serialized_metadata"])
         assert metadata["relative_file_paths"] == [name]
         assert metadata["files"][0]["path"] == name
-
-
-def _record_at(file: Any, offset: int) -> Any:
-    file.seek(offset)
-    return next(StreamReader(file, skip_magic=True, emit_chunks=True).records)
-
-
-def _chunk_data(chunk: Chunk) -> bytes:
-    assert chunk.compression == "zstd"
-    data = zstandard.decompress(chunk.data, chunk.uncompressed_size)
-    assert zlib.crc32(data) == chunk.uncompressed_crc
-    return data

@@ -9,7 +9,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
@@ -24,7 +23,6 @@ from support.made_bags import Say, array, joint_states, made_bag, odometry
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordedRobot, RecordingError, read_bag
 from spacerobot_ros.bag.salvage import last_state, salvage_bag
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.flight.reading import FlightBag
 
 STRING = "std_msgs/msg/String"
 COUNT = 900
@@ -350,18 +348,6 @@ def test_states_that_never_meet_are_none(tmp_path: Path) -> None:
         say_joints(say, 0.5, 0)
     with pytest.raises(RecordingError, match="no complete state"):
         last_state(tmp_path / "a.mcap")
-
-
-def test_the_truth_is_what_was_measured_until_the_sensors_err(tmp_path: Path) -> None:
-    with made_bag(tmp_path / "a.mcap") as (_, say):
-        for k in range(5):
-            noise = 1000.0 if k >= 2 else 0.0
-            if noise:
-                say("/odom_true", odometry(0.5 * k, *position(k)), 0.5 * k)
-            say_odom(say, 0.5 * k, k + noise)
-    pose = FlightBag(read_bag(tmp_path / "a.mcap")).series()["pose"]
-    np.testing.assert_array_equal(pose.time, [0.0, 0.5, 1.0, 1.5, 2.0])
-    np.testing.assert_array_equal(pose.values[:, 0], range(5))
 
 
 def test_a_robot_is_described_by_its_file_or_else_by_the_last_message(tmp_path: Path) -> None:

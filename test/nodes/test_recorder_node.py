@@ -327,16 +327,6 @@ def test_a_device_is_refused_in_a_sentence(harness: Harness) -> None:
     stack.fly()
 
 
-def test_a_bag_that_cannot_be_made_is_refused_in_a_sentence(
-    ros_context: rclpy.Context, tmp_path: Path
-) -> None:
-    (tmp_path / "file").touch()
-    for bag in (tmp_path, tmp_path / "file" / "flight.mcap"):
-        with pytest.raises(SpaceRobotError) as refusal:
-            RecorderNode(**construction(ros_context, {"bag": str(bag)}))
-        assert_one_sentence(str(refusal.value), str(bag))
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [("compression", "zip"), ("flush_period", 0.0), ("flush_period", "often"), ("topics", 3)],

@@ -27,7 +27,7 @@ from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import POSE, EndEffectorGoal
+from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.figures_over_time import link_errors_figure
@@ -36,7 +36,7 @@ from spacerobot_ros.report.figures_space import (
     loops_figure,
     path_figure,
 )
-from spacerobot_ros.report.flight import FlightReport, GoalSpan, read_report
+from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import charts_of, page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.player import WORLD, View3D, view_of_flight
@@ -102,29 +102,30 @@ def test_errors_of_links_are_those_of_their_true_poses(hands: FlightReport) -> N
     assert hands.link_errors[LEFT][1].values[0, 0] > 0.3
 
 
+def flying(links: dict[str, tuple[float, ...]], goal_id: str = "") -> PlannerStatus:
+    return PlannerStatus(PlannerState.EXECUTING, goal_id=goal_id, end_effector_goals=links)
+
+
 def test_each_goal_counts_until_the_next(hands: FlightReport) -> None:
-    left, right = (
-        EndEffectorGoal(link, np.array([1.0, -2.0, k])) for k, link in ((3.0, LEFT), (4.0, RIGHT))
-    )
-    base = Goal.checked([5.0, 6.0, 7.0], TURNED)
-    both = replace(base, end_effectors=(replace(left, position=np.zeros(3)),))
-    targets = [
-        GoalSpan(0.0, 0.4, Goal.of_end_effectors([left, right])),
-        GoalSpan(0.4, 0.7, base),
-        GoalSpan(0.7, 1.35, both),
+    left = np.array([1.0, -2.0, 3.0])
+    base = SentGoal(0.4, Goal.checked([5.0, 6.0, 7.0], TURNED), "1.5")
+    flown = [
+        (0.0, flying({LEFT: (1.0, -2.0, 3.0), RIGHT: (1.0, -2.0, 4.0)})),
+        (0.4, flying({}, "1.5")),
+        (0.7, flying({LEFT: (0.0, 0.0, 0.0)}, "1.5")),
     ]
-    report = other(hands, _all_targets=targets)
-    assert report.targets == targets[1:], "goals of the base"
+    report = other(replace(hands, goals=(base,)), reports=flown)
+    spans = [(span.start, span.end, span.goal.position[1]) for span in report.targets]
+    assert spans == [(0.4, 0.7, 6.0), (0.7, 1.35, 6.0)], "goals of the base"
     errors, time = report.link_errors, hands.time
     early, late = time <= 0.4, time >= 0.7
     np.testing.assert_allclose(errors[RIGHT][0].time, time[early])
     np.testing.assert_allclose(errors[LEFT][0].time, [*time[early], *time[late]])
     _, r = poses_by_pinocchio(hands, LEFT)
-    off = [*np.linalg.norm(r[early] - left.position, axis=1), *np.linalg.norm(r[late], axis=1)]
+    off = [*np.linalg.norm(r[early] - left, axis=1), *np.linalg.norm(r[late], axis=1)]
     np.testing.assert_allclose(errors[LEFT][0].values[:, 0], off, atol=1e-12)
-    unknown = GoalSpan(0.0, 1.0, Goal.of_end_effectors([replace(left, link="nobody")]))
-    assert other(hands, _all_targets=[unknown]).link_errors == {}
-    assert other(hands, _all_targets=[]).link_errors == {}
+    for none in ([(0.0, flying({"nobody": (1.0, 2.0, 3.0)}))], []):
+        assert other(hands, reports=none).link_errors == {}
 
 
 def rows_of(report: FlightReport) -> dict[str, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import math
 import re
 import struct
@@ -26,7 +25,6 @@ from support.flight_bags import (
     Story,
     cyclic_shapes,
     goal_value,
-    rates_of,
     still,
     tell,
     urdf_of,
@@ -78,13 +76,8 @@ def report_of(tmp_path: Path, story: Story) -> Page:
 
 @pytest.fixture(scope="module")
 def story() -> Story:
-    """A slide and twenty cycles that reach a goal, in a scenario with published figures."""
+    """A slide and twenty cycles that reach a goal."""
     end = TICK * (len(cyclic_shapes()) - 1)
-    published = [
-        {"quantity": "zf", "printed": [-2.3784, 1.7], "note": "a misprint <of> ours"},
-        {"quantity": "final_position_m", "printed": [0.2995, -0.25, 0.1], "note": ""},
-        {"quantity": "unheard_of", "printed": [1.0], "note": ""},
-    ]
     return Story(
         cyclic_shapes(),
         statuses=[
@@ -94,11 +87,7 @@ def story() -> Story:
         ],
         goals=[(0.0, *GOAL)],
         metadata={
-            "scenario": {
-                "name": "test_flight",
-                "description": "A flight & more",
-                "published": json.dumps(published),
-            },
+            "scenario": {"name": "test_flight", "description": "A flight & more"},
             "parameters/planner": {"position_tolerance": "0.02", "method": '"lie_bracket"'},
         },
     )
@@ -112,14 +101,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def flown(folder: Path, story: Story) -> Page:
     return report_of(folder, story)
-
-
-@pytest.mark.slow
-def test_says_what_was_flown(flown: Page) -> None:
-    for words in ("test_flight", "A flight & more", "lie_bracket", "test_robot", "3 joints"):
-        assert words in flown.text
-    assert "Reached" in flown.text
-    assert "The goal is reached: " in flown.text
 
 
 def test_has_every_figure_in_order(flown: Page) -> None:
@@ -169,35 +150,6 @@ def test_numbers_are_those_of_the_bag(flown: Page, story: Story) -> None:
     linear, angular = flown.number("Momentum drift").split("angular")
     assert linear.split() == ["<", "1e-9", "kg", "m/s"], "it is rounding"
     assert angular.split() == ["<", "1e-9", "kg", "m²/s"]
-
-
-def test_joints_stand_beside_their_limits(flown: Page, story: Story) -> None:
-    head, *rows = flown.tables["joints"]
-    peaks = np.abs(rates_of(story.shapes)).max(axis=0)
-    for row, joint, last, peak in zip(rows, range(3), story.shapes[-1], peaks, strict=True):
-        cells = dict(zip(head, row, strict=True))
-        assert cells["Joint"] == f"joint_{joint}"
-        assert cells["Unit"] == ("m" if joint == 0 else "rad")
-        assert float(cells["Final"]) == pytest.approx(last, abs=1e-5)
-        assert cells["Limits"] == "-1.5 to 1.5"
-        assert numbers_in(cells["Peak velocity"]) == [pytest.approx(peak, abs=1e-5)]
-        assert numbers_in(cells["Used"]) == [pytest.approx(100 * peak / 0.8, abs=0.06)]
-
-
-def test_published_figures_stand_beside_measured_ones(flown: Page) -> None:
-    _, *rows = flown.tables["published"]
-    assert rows == [
-        ["zf", "-2.3784, 1.7", "-2.3784, 1.7", "planner", "a misprint <of> ours"],
-        ["final_position_m", "0.2995, -0.25, 0.1", "0.3100, -0.26, 0.1", "flight", ""],
-        ["unheard_of", "1", "–", "", ""],
-    ]
-
-
-@pytest.mark.slow
-def test_the_same_bag_makes_the_same_report(folder: Path, flown: Page) -> None:
-    assert flown.figures
-    write_report(folder / "flight.mcap", folder / "again.html")
-    assert (folder / "again.html").read_bytes() == (folder / "out/report.html").read_bytes()
 
 
 def test_pictures_of_dense_traces_stay_small(tmp_path: Path) -> None:
@@ -251,16 +203,6 @@ def test_what_is_missing_for_a_picture_of_the_robot_is_named(
     assert "has no joints" not in page.text
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("n", [1, 9])
-def test_any_number_of_joints(tmp_path: Path, n: int) -> None:
-    t = np.linspace(0, 1, 60)[:, np.newaxis]
-    page = report_of(tmp_path, Story(np.sin(t * np.arange(1, n + 1)) * 0.5))
-    assert len(page.tables["joints"]) == n + 1
-    assert ("loops" in page.figures) == (n > 1)
-    assert "velocities" in page.figures
-
-
 @pytest.mark.usefixtures("blank")
 def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
     page = report_of(tmp_path, Story(still(), prefix="/free_flyer"))
@@ -268,18 +210,6 @@ def test_without_goal_and_planner_and_in_a_namespace(tmp_path: Path) -> None:
     assert "The bag contains no goal pose." in page.text
     assert "no planner or controller status" in page.text
     assert "Position error" not in page.tiles
-
-
-@pytest.mark.usefixtures("blank")
-def test_a_refused_goal(tmp_path: Path) -> None:
-    statuses = [
-        (0.0, "Waiting for a goal pose.", {"state": "idle"}),
-        (0.0, "The goal is beyond the stroke.", {"state": "refused"} | goal_value()),
-    ]
-    page = report_of(tmp_path, Story(still(), statuses, goals=[(0.0, *GOAL)]))
-    assert "The goal is beyond the stroke." in page.text
-    assert numbers_in(page.number("Goal position (refused)")) == GOAL[0]
-    assert "Manoeuvre" not in page.tiles
 
 
 @pytest.mark.usefixtures("blank")
@@ -306,22 +236,6 @@ def test_the_head_says_that_the_goal_is_not_that_of_the_scenario(tmp_path: Path)
         page = report_of(folder, Story(still(), goals=goals, metadata=record))
         assert f"{shown}\n" in page.text
         assert hidden not in page.text
-
-
-@pytest.mark.usefixtures("blank")
-def test_several_schedules(tmp_path: Path) -> None:
-    other = ([0.0, 0.0, 1.0], [0.0, 0.0, 0.1])
-    statuses = [
-        (0.0, "Flying.", EXECUTING | goal_value(*other) | {"goal_id": "0.000000001"}),
-        (10.0, "Flying.", EXECUTING | goal_value() | {"goal_id": "10.000000000"}),
-        (20.0, "Flying.", EXECUTING | goal_value() | {"goal_id": "10.000000000"}),
-        (30.0, "The goal is not met.", {"state": "failed"} | goal_value()),
-    ]
-    goals = [(0.0, *other), (10.0, *GOAL)]
-    page = report_of(tmp_path, Story(still(), statuses, goals))
-    assert numbers_in(page.number("Manoeuvre")) == [20.0, 3]
-    assert "Failed" in page.text
-    assert numbers_in(page.number("Goal position")) == GOAL[0]
 
 
 @pytest.mark.usefixtures("blank")

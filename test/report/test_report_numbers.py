@@ -421,17 +421,6 @@ def test_a_controller_and_the_components_that_it_controls(tmp_path: Path) -> Non
     assert "Goal attitude" not in rows_of(found)
 
 
-def test_momenta_that_thrusters_put_in_are_no_drift(tmp_path: Path) -> None:
-    def more(say: Any, time: float, k: int) -> None:
-        swing = (0.0, 3e-9, -4e-9, 0.0)[k]
-        expected = array(7 + 3 * swing, 4 * swing, 0, 0, 0, 5 - 6 * swing + 1e-3 * (k == 2))
-        say("/momentum_expected", expected, time)
-
-    found = flight(tmp_path, more=more)
-    assert found.momentum_drift[0] < 1e-15
-    assert found.momentum_drift[1] == pytest.approx(1e-3)
-
-
 # -- what is drawn ----------------------------------------------------------------------------
 
 
@@ -475,17 +464,6 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
     plain = flight(tmp_path, name="plain.mcap")
     assert sensors_figure(plain) is None
     assert not any("measured" in note for _, _, note in headline(plain))
-
-
-def test_sensors_that_err_for_a_while_are_right_before_and_after(tmp_path: Path) -> None:
-    def more(say: Any, time: float, k: int) -> None:
-        if k in (1, 2):
-            true = (0.95, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-            say("/odom_true", odometry(time, *true, *STILL), time)
-
-    found = flight(tmp_path, more=more)
-    np.testing.assert_array_equal(found.time, [0.0, 0.5, 1.0, 1.5])
-    np.testing.assert_array_equal(found.pose[:, 0], [0.7, 0.95, 0.95, 0.7])
 
 
 def test_an_attitude_error_is_along_axes_of_the_world(tmp_path: Path) -> None:
@@ -659,19 +637,19 @@ def test_propellant_is_what_the_plant_counted() -> None:
     assert f"{24 - fired} of 24 thrusters were never on" in figure.caption
 
 
-def test_a_flight_that_was_not_measured_at_its_end_is_drawn(tmp_path: Path) -> None:
-    whole = read_report(tell(tmp_path / "a.mcap", Story(cyclic_shapes())))
+@pytest.fixture(scope="module")
+def looping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tell(tmp_path_factory.mktemp("looping") / "a.mcap", Story(cyclic_shapes()))
+
+
+def test_a_flight_that_was_not_measured_at_its_end_is_drawn(looping: Path) -> None:
+    whole = read_report(looping)
     assert whole.cycles is not None
     early = whole.signal("pose").between(0.0, 0.5 * whole.end)
     cut = replace(whole, series={**whole.series, "pose": early})
     figure = position_figure(cut)
     assert isinstance(figure, ReportFigure)
     assert figure.groups[0].signal.time[-1] < whole.cycles.last(3)[0]
-
-
-@pytest.fixture(scope="module")
-def looping(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tell(tmp_path_factory.mktemp("looping") / "a.mcap", Story(cyclic_shapes()))
 
 
 @pytest.mark.parametrize(
