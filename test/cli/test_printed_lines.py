@@ -656,4 +656,6 @@ def test_only_a_goal_that_is_reached_is_exit_0(
     assert sent == [[1.0, 2.0, 3.0], [0.6, 0.0, 0.8, 0.0], "", 0.0]
     runner.invoke(main, ["goal", "1", "2", "3", "--goal-rotvec", "0", "0", "1"])
     assert sent[1] == pytest.approx([0.0, 0.0, math.sin(0.5), math.cos(0.5)])
+    runner.invoke(main, ["goal", "1", "2", "3", "--goal-rpy-deg", "0", "90", "90"])
+    assert sent[1] == pytest.approx([-0.5, 0.5, 0.5, 0.5])
     assert runner.invoke(main, ["goal", "1", "2", "3", "4"]).exit_code == 2

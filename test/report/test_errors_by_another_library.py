@@ -24,7 +24,6 @@ from support.html_page import Page
 from support.slow import some_fast
 
 from spacerobot_ros import fly, read_run
-from spacerobot_ros.cli.flights import _summary_lines
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
@@ -37,6 +36,8 @@ from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.scenario import load_scenario
+from spacerobot_ros.session import run
+from spacerobot_ros.session.run import RunResult
 from spacerobot_ros.viewer.content import goal_errors, status_html
 from spacerobot_ros.viewer.state import StackState
 
@@ -143,6 +144,14 @@ def shown(text: str, pattern: str) -> float:
     return 0.0 if found[1] else float(found[2]) * {"": 1.0, "m": 1e-3, "µ": 1e-6}[found[3]]
 
 
+def printed_lines(summary: dict[str, Any]) -> list[str]:
+    """Return what the command prints of a flight that comes to this summary."""
+    result = RunResult(summary | {"plan_time_s": 0.0, "wall_time_s": 1.0})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "run_scenario", lambda *_, **__: result)
+        return CliRunner().invoke(main, ["run", "sliding_masses"]).stdout.splitlines()
+
+
 def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     """Compare what terminal, JSON, report, live page, campaign and ``repr`` say with the truth."""
     truth = truth_in(bag)
@@ -158,7 +167,7 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     same(summary["position_error_m"], summary["attitude_error_rad"], 9)
     assert ("position" in summary["not_controlled"]) is not position_counts
 
-    lines = _summary_lines(summary | {"plan_time_s": 0.0, "wall_time_s": 1.0})
+    lines = printed_lines(summary)
     position, attitude = (next(x for x in lines if x.startswith(y)) for y in ("posi", "atti"))
     same(shown(position, r"m, # m from the goal"), shown(attitude, r"rad, # rad ="), 3)
     degrees = shown(attitude, r"= # deg from")
@@ -214,7 +223,7 @@ def assert_all_say_of_the_end_effector(bag: Path, flight: Flight) -> None:
     report = read_report(bag)
     texts = Cells(page(report, PagePart(""), [])).texts
     card = " ".join(texts[texts.index("End-effector error") :][:3])
-    lines = _summary_lines(summary | {"plan_time_s": 0.0, "wall_time_s": 1.0})
+    lines = printed_lines(summary)
     printed = next(line for line in lines if line.startswith("end-effector"))
     live = next(x for x in live_head(flight, bag) if x.startswith("end_effector is "))
     numbers = (
