@@ -26,7 +26,7 @@ from spacerobot_ros.batch.targets import Target
 from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
 from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot
 from spacerobot_ros.model.description import Inertia
-from spacerobot_ros.resources import robot_file, share_directory
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.config import SensorConfig
@@ -118,6 +118,8 @@ def test_flights_have_their_last_tick_and_the_steps_of_their_plant(sliders: Spac
     plain = flights(sliders, STILL)
     assert (plain.report_ticks, len(plain)) == ((10,), 2)
     assert flights(sliders, STILL, report_ticks=(0, 4, 10)).report_ticks == (0, 4, 10)
+    assert plain.substeps == 5
+    assert flights(sliders, RELAXED, actuation="effort").substeps == 50
     assert flights(sliders, STILL, integration_step=0.02).substeps == 3
     assert flights(sliders, STILL, integration_step=0.05).substeps == 1
 
@@ -234,32 +236,22 @@ def test_errors_are_distances_and_angles_to_a_pose(sliders: SpaceRobot) -> None:
     assert angle.shape == distance.shape == (2, 3)
 
 
-def test_steps_are_those_of_the_actuation_unless_they_are_given(sliders: SpaceRobot) -> None:
-    assert flights(sliders, STILL).substeps == 5
-    assert flights(sliders, RELAXED, actuation="effort").substeps == 50
-
-
 # -- flights of a batch are those of the plant: the scalar engine, and what batches refuse -------
 
 
-@pytest.fixture(scope="module")
-def described_sliders() -> SpaceRobot:
-    return SpaceRobot(load_robot(share_directory() / "urdf" / "sliding_masses.urdf"))
-
-
-def test_a_heavier_slider_carries_the_base_further(described_sliders: SpaceRobot) -> None:
+def test_a_heavier_slider_carries_the_base_further(sliders: SpaceRobot) -> None:
     """At zero momentum the centre of mass rests: M r_base = -sum m_k s_k, by hand."""
     positions = np.linspace([0.0, 0.0, 0.0], [0.2, 0.0, 0.0], 11)
-    nominal = InertialParameters.of(described_sliders.description)
+    nominal = InertialParameters.of(sliders.description)
     inertial = nominal.scaled(masses=np.array([[1, 1, 1, 1], [1, 1.5, 1, 1.0]]), inertias=1.0)
     start = InitialState(joint_positions=np.zeros(3))
     flights = Flights(
         *(
-            described_sliders,
+            sliders,
             "velocity",
             0.05,
             10,
-            InitialStates.repeated(described_sliders, start, 2),
+            InitialStates.repeated(sliders, start, 2),
         ),
         FollowedSchedule(positions),
         inertial,
@@ -274,42 +266,28 @@ def test_a_heavier_slider_carries_the_base_further(described_sliders: SpaceRobot
     assert moved[1] > 1.2 * moved[0] > 0.0
 
 
-def test_what_no_body_weighs_is_refused(described_sliders: SpaceRobot) -> None:
-    nominal = InertialParameters.of(described_sliders.description)
+def test_what_no_body_weighs_is_refused(sliders: SpaceRobot) -> None:
+    nominal = InertialParameters.of(sliders.description)
     with pytest.raises(RobotDescriptionError, match=r"mass_2.*must be positive"):
-        described_sliders.with_inertial(nominal.scaled([1.0, 1.0, -0.1, 1.0]))
+        sliders.with_inertial(nominal.scaled([1.0, 1.0, -0.1, 1.0]))
     broken = nominal.inertias.copy()
     broken[0] = np.diag([1.0, 1.0, 2.1])
     with pytest.raises(RobotDescriptionError, match=r"base_link.*not physical"):
-        described_sliders.with_inertial(InertialParameters(nominal.masses, nominal.centers, broken))
+        sliders.with_inertial(InertialParameters(nominal.masses, nominal.centers, broken))
     with pytest.raises(RobotDescriptionError, match=r"mass_1.*not finite"):
-        described_sliders.with_inertial(nominal.shifted(np.diag([0.0, np.nan, 0.0, 0.0])[:, :3]))
+        sliders.with_inertial(nominal.shifted(np.diag([0.0, np.nan, 0.0, 0.0])[:, :3]))
 
 
-def test_a_payload_is_welded_on(described_sliders: SpaceRobot) -> None:
-    nominal = InertialParameters.of(described_sliders.description)
+def test_a_payload_is_welded_on(sliders: SpaceRobot) -> None:
+    nominal = InertialParameters.of(sliders.description)
     payload = Inertia(2.0, np.array([0.0, 0.3, 0.0]), np.diag([0.1, 0.2, 0.25]))
     loaded = nominal.with_payload(1, payload)
     assert loaded.masses[1] == 4.0
     np.testing.assert_allclose(loaded.centers[1], [0.0, 0.15, 0.0])
     # Two masses of 2 kg, 0.3 m apart: reduced mass 1 kg.
     np.testing.assert_allclose(loaded.inertias[1], np.diag([0.19, 0.2, 0.34]))
-    again = InertialParameters.of(described_sliders.with_inertial(loaded).description)
+    again = InertialParameters.of(sliders.with_inertial(loaded).description)
     np.testing.assert_array_equal(again.vector, loaded.vector)
-
-
-def test_flights_that_do_not_go_together_are_refused(described_sliders: SpaceRobot) -> None:
-    starts = InitialStates.repeated(described_sliders, InitialState(), 2)
-    commands = HeldCommands(np.zeros((5, 3)))
-    for arguments, sentence in (
-        (("speed", 0.05, 10, starts, commands), "not velocity or effort"),
-        (("velocity", 0.05, 0, starts, commands), "0 ticks"),
-        (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((5, 2)))), "commands have shape"),
-        (("velocity", 0.05, 10, starts, HeldCommands(np.zeros((3, 5, 3)))), "3 flights"),
-        (("effort", 0.05, 10, starts, FollowedSchedule(np.zeros((5, 3)))), "velocity actuation"),
-    ):
-        with pytest.raises(ParameterError, match=sentence):
-            Flights(described_sliders, *arguments)
 
 
 STATES = "pose", "twist", "q", "qdot", "momentum"

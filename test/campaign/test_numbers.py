@@ -16,7 +16,7 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
-from spacerobot_ros.campaign.config import Criterion, load_campaign, passes_criteria
+from spacerobot_ros.campaign.config import Criterion, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
 from spacerobot_ros.campaign.rows import Row
@@ -203,60 +203,6 @@ def test_criteria_include_their_bounds() -> None:
         assert passes_criteria([criterion], "reached", {"duration_s": value}) is met
     assert not passes_criteria([criterion], "reached", {})
     assert not passes_criteria([criterion], "failed", {"duration_s": 2.0})
-
-
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"scenario": None}, "'scenario' must be a scenario name or file."),
-        (
-            {"disperse": {"mass.mass_1": {"norm": {}}, "mass.*": {"norm": {}}}},
-            "'mass.mass_1' is dispersed twice.",
-        ),
-        (
-            {"disperse": {"mass": {"choice": []}}},
-            "'mass' must have a list of values to choose from.",
-        ),
-        (
-            {"disperse": {"mass": {"choice": 3}}},
-            "'mass' must have a list of values to choose from.",
-        ),
-        (
-            {"disperse": {"mass": {"norm": 3}}},
-            "'mass': norm takes loc, scale, not 3",
-        ),
-        (
-            {"disperse": {"mass": {"poisson": [1, 2, 3]}}},
-            "'mass': poisson takes mu, loc, not [1, 2, 3]",
-        ),
-        ({"longest": -1}, "'longest' is -1; it must be a finite number of at least 0."),
-        (
-            {"longest": True},
-            "'longest' is True; it must be a finite number of at least 0.",
-        ),
-        ({"flights": 10_000_001}, "'flights' is 10000001; it must be a whole number from 1 to 1"),
-        ({"flights": 2.0}, "'flights' is 2.0; it must be a whole number from 1 to 10000000."),
-        ({"seed": 2**63}, "'seed' is 9223372036854775808; it must be a whole number from 0 to 9"),
-        (
-            {"criteria": {"duration_s": {"min": "a"}}},
-            "'duration_s: min' is 'a'; it must be a finite number.",
-        ),
-    ],
-)
-def test_what_is_refused_of_a_campaign(given: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(ParameterError) as refused:
-        campaign(**given)
-    assert str(refused.value).startswith(sentence)
-
-
-def test_a_file_that_is_refused_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "a.yaml"
-    file.write_text("campaign: {scenario: 3}")
-    with pytest.raises(ParameterError) as refused:
-        load_campaign(file)
-    assert str(refused.value) == (
-        f"The campaign file {file} is refused: 'scenario' must be a scenario name or file."
-    )
 
 
 # -- draws ----------------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.targets import (
     DrawnFlight,
     MassFactors,
-    _start_positions,
     description_of,
     targets_of,
 )
@@ -250,9 +249,8 @@ def test_goals_are_shifted_in_the_world(scenario: Scenario) -> None:
 
 def test_joints_start_as_near_to_zero_as_their_limits_allow() -> None:
     plain = campaign().scenario
-    assert _start_positions(plain) == [0.0, 0.0, 0.0]
-    given = plain.with_overrides("plant", {"initial_joint_positions": [0.1, 0.2, -0.3]})
-    assert _start_positions(given) == [0.1, 0.2, -0.3]
+    flight = targets_of("initial.joints.slider_1", plain)[0].apply(DrawnFlight.of(plain), 0.25)
+    assert flight.scenario.plant.initial_joint_positions == (0.25, 0.0, 0.0)
 
 
 def test_the_parts_of_a_fault_are_drawn_in_any_order(scenario: Scenario) -> None:
@@ -286,34 +284,3 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
         np.testing.assert_allclose(found.inertias[2], 3.0 * usual.inertias[2])
         np.testing.assert_allclose(found.inertias[1], usual.inertias[1])
         np.testing.assert_allclose(found.centers[2], usual.centers[2] + [0.25, 0.0, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("tick_rate", "cannot be dispersed"),
-        ("coordinated_control.tick_rate", "flies with planner"),
-        ("plant.tick_rat", "has no parameter 'tick_rat'. Did you mean 'tick_rate'?"),
-        ("plant.tf_links", "is neither a number nor a string"),
-        ("plant.initial_orientation[0]", "disperse initial.rotvec.x, y and z"),
-        (
-            "plant.initial_position",
-            "name an element of the list, such as plant.initial_position[0]",
-        ),
-        ("plant.tick_rate[0]", "it is not a list"),
-        ("plant.initial_position[3]", "'3' is not an index from 0 to 2 of the list."),
-        ("plant.initial_joint_positions[3]", "nor one of the joints slider_1, slider_2, slider_3"),
-        ("mass.mass_9", "the robot has no body 'mass_9'; it has base_link, mass_1"),
-        ("com.mass_1", "'com.mass_1' must be com.BODY.x, y, z or *, or com.*; the bodies are base"),
-        ("com.mass_1.w", "must be com.BODY.x"),
-        ("initial.velocity.x", "initial.position.x, initial.position.y"),
-        ("initial.joints.slider_9", "has no joint 'slider_9'; it has slider_1, slider_2, slider_3"),
-        ("end_effector_goal.position.x", "has no goal for the end-effector"),
-        ("faults[3].at", "plant.faults has 3 faults; the first is faults[0]."),
-        ("faults[0].value", "a fault of kind joint_stuck does not take a value"),
-    ],
-)
-def test_names_that_are_none_are_refused(name: str, words: str, scenario: Scenario) -> None:
-    with pytest.raises(ParameterError) as caught:
-        targets_of(name, scenario)
-    assert words in str(caught.value)

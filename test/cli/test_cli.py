@@ -38,7 +38,6 @@ QUICK = [
 @pytest.fixture(autouse=True)
 def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
     # The events executor asks for the file behind standard error, which a captured one lacks.
     monkeypatch.setattr("faulthandler.enable", lambda: None)
 

@@ -377,7 +377,6 @@ def trial(problem: PlanningProblem, name: str, reached: bool = True) -> PlanEval
 
 def plan(patch: pytest.MonkeyPatch, reached: bool, *words: str) -> Result:
     """Run the command with plans that come to the trial above."""
-    patch.setenv("SPACEROBOT_COMPILE", "0")
     patch.setattr(trials, "try_method", lambda problem, name: trial(problem, name, reached))
     return CliRunner().invoke(main, ["plan", *words])
 
@@ -424,10 +423,7 @@ def test_a_plan_that_misses_its_goal_is_exit_1_and_a_sentence(
     )
 
 
-def test_a_real_plan_that_misses_a_tight_tolerance_is_exit_1(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+def test_a_real_plan_that_misses_a_tight_tolerance_is_exit_1() -> None:
     words = (*PLANAR, "--set", "planner.attitude_tolerance=1e-17")
     result = CliRunner().invoke(main, ["plan", *words])
     assert result.exit_code == 1

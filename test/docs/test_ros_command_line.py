@@ -55,12 +55,6 @@ def commands(page: str, *words: str) -> list[str]:
     return [each for each in found if each.strip()]
 
 
-def test_commands_are_read_as_a_shell_reads_them() -> None:
-    read = commands("README.md", "ros2 topic pub")
-    assert [each.split()[1] for each in read] == ["run", "run", "run", "topic"]
-    assert all(each.count("'") % 2 == 0 for each in read)
-
-
 class Terminals:
     """Commands in terminals of their own, each a process group; Ctrl-C reaches all of a group."""
 

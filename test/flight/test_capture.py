@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -46,14 +45,6 @@ def parameters_of(body: Inertia) -> Array:
     about = body.about_com + mass * (com @ com * np.eye(3) - np.outer(com, com))
     six = (about[i, j] for i, j in INERTIA_ENTRIES)
     return np.array([mass, *(mass * com), *six])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _interpreted() -> Iterator[None]:
-    """Simulate in CasADi's virtual machine: compiling would take longer than these flights."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SPACEROBOT_COMPILE", "0")
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -221,8 +212,7 @@ def test_a_flight_without_a_target_has_no_capture() -> None:
 # -- A planar arm approaches a block, captures it, comes to rest and carries it, in few ----------
 
 
-def test_a_planar_arm_fetches_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+def test_a_planar_arm_fetches_a_block() -> None:
     target = {
         "tick_rate": 5.0,
         "integration_step": 0.1,

@@ -6,11 +6,6 @@ import pytest
 from support.fuzzing import LONG, SENTENCES, TRIED
 
 
-@pytest.fixture(autouse=True)
-def _interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-
-
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if not LONG:
         return

@@ -21,7 +21,7 @@ from std_msgs.msg import Header, String
 from support.random_messages import few as few_trajectories
 from trajectory_msgs.msg import JointTrajectory
 
-from spacerobot_ros.errors import CommandError, RecordingError, SpaceRobotError
+from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.events import (
     INTEGER,
     SECONDS,
@@ -32,7 +32,7 @@ from spacerobot_ros.events import (
     list_format,
 )
 from spacerobot_ros.messages.builders import trajectory_message
-from spacerobot_ros.messages.definitions import MessageType, fields_of, message_definition
+from spacerobot_ros.messages.definitions import MessageType, fields_of
 from spacerobot_ros.messages.layout import (
     encode_list,
     read_columns,
@@ -422,12 +422,6 @@ def test_types_are_nested_at_most_32_deep_and_never_in_themselves() -> None:
     deep = "its types are nested more than 32 deep, or recursive"
     assert refused(chain(33)) == refused("B x\n") == deep
     assert refused("C x\n") == "it does not define a/msg/C"
-
-
-@pytest.mark.parametrize("wrong", ["String", "std_msgs/msg/", "a/msg/B/c", "/String"])
-def test_names_that_are_none_of_types_are_refused(wrong: str) -> None:
-    with pytest.raises(RecordingError, match="is not the name of a message type"):
-        message_definition(wrong)
 
 
 # -- messages -----------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,14 +48,6 @@ TARGET_TOPICS = {
     "events": DiagnosticStatus,
     "markers": MarkerArray,
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _interpreted() -> Iterator[None]:
-    """Simulate in CasADi's virtual machine: compiling would take longer than these flights."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SPACEROBOT_COMPILE", "0")
-        yield
 
 
 def events_of(rig: Rig) -> list[tuple[str, str]]:
@@ -193,9 +184,6 @@ def test_a_plant_without_a_target_captures_nothing(harness: Harness) -> None:
         )
 
 
-BLOCK_SERVICING_NODE = (share_directory() / "config" / "targets" / "block.urdf").read_text()
-
-
 def asked(loop: Loop, task: str) -> Any:
     client = loop.probe.create_client(Trigger, f"control/{task}")
     return loop.harness.call(client, Trigger.Request())
@@ -210,13 +198,12 @@ def test_an_approach_without_a_target_is_refused(harness: Harness) -> None:
     assert asked(loop, "detumble").success, "which needs none"
 
 
-def test_tasks_are_done_on_request(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
+def test_tasks_are_done_on_request(harness: Harness) -> None:
     # The arm grasps obliquely, past a corner of the block.
     loop = Loop(harness, activate=False, **{"target.clearance": 0.0})
     odom = loop.probe.create_publisher(Odometry, "target/odom", 10)
     described = loop.probe.create_publisher(String, "target/robot_description", LATCHED)
-    described.publish(String(data=BLOCK_SERVICING_NODE))
+    described.publish(String(data=BLOCK.read_text("utf-8")))
     harness.connect()
     assert asked(loop, "approach").success is False
     assert loop.node.trigger_activate() is TransitionCallbackReturn.SUCCESS

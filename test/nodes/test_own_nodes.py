@@ -30,12 +30,6 @@ from spacerobot_ros.resources import robot_file
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-@pytest.fixture(autouse=True)
-def interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile no model: the robots are small."""
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-
-
 def example(name: str) -> ModuleType:
     """Return the module of an example."""
     spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")

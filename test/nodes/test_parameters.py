@@ -226,13 +226,6 @@ def test_a_watchdog_heeds_a_timeout_that_was_set_since(harness: Harness) -> None
     assert "/heartbeat" in {each.topic_name for each in plant.subscriptions}
 
 
-def test_nodes_whose_watchdog_is_off_listen_to_no_heartbeats(harness: Harness) -> None:
-    given = {"robot": "planar_manipulator", "watchdog_timeout": 0.0}
-    node = harness.make(KINDS["planner"], given)
-    assert node.is_active
-    assert "/heartbeat" not in {each.topic_name for each in node.subscriptions}
-
-
 def test_a_refused_list_is_shown_as_a_list_and_not_to_its_end(harness: Harness) -> None:
     planner = harness.make(KINDS["planner"], {"robot": "planar_manipulator"})
     (result,) = planner.set_parameters([Parameter("max_corrections", value=[2.5] * 50)])

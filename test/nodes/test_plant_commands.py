@@ -126,16 +126,6 @@ def test_a_command_from_before_a_reset_is_forgotten(harness: Harness) -> None:
     np.testing.assert_array_equal(rig.wait("joint_states", 3).velocity, [0.3, 0.0, 0.0])
 
 
-def test_pause_without_a_command_changes_nothing(harness: Harness) -> None:
-    rig = Rig(harness)
-    for on in (False, True, True, False, False):
-        assert rig.pause(on).success
-    joints = rig.step([0.2, 0.0, 0.0])
-    assert nanoseconds(joints.header.stamp) == TICK_NS
-    harness.settle(rig.probe)
-    assert rig.probe.count("joint_states") == 2
-
-
 REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 0.0}
 
 
@@ -228,6 +218,16 @@ STATUS = "plant/status"
 URDF = Path(__file__).parents[2] / "urdf" / "planar_manipulator.urdf"
 
 
+def moving(odom: Odometry, joints: JointState) -> PinocchioOracle:
+    """Return the arm in a published state."""
+    oracle = PinocchioOracle(URDF.read_text("utf-8"), list(joints.name))
+    r, quaternion = pose_of(odom)
+    oracle.set_configuration(np.array(joints.position), quaternion, r)
+    twist, rates = np.concatenate(twist_of(odom)), np.array(joints.velocity)
+    oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(rates))
+    return oracle
+
+
 class Manipulator(Rig):
     """A plant in lockstep of an arm that may be pushed, too."""
 
@@ -266,16 +266,10 @@ class Manipulator(Rig):
     def actuation(self) -> str:
         return values_of(self.probe.last(STATUS))["actuation"]
 
-    def momentum(self) -> np.ndarray[Any, Any]:
+    def momentum(self) -> npt.NDArray[np.float64]:
         """Return linear over angular momentum (6,) of the last state, by Pinocchio."""
         self.harness.settle(self.probe)
-        odom, joints = self.probe.last("odom"), self.probe.last("joint_states")
-        oracle = PinocchioOracle(URDF.read_text("utf-8"), list(joints.name))
-        r, quaternion = pose_of(odom)
-        oracle.set_configuration(np.array(joints.position), quaternion, r)
-        twist = np.concatenate(twist_of(odom))
-        rates = np.array(joints.velocity)
-        oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(rates))
+        oracle = moving(self.probe.last("odom"), self.probe.last("joint_states"))
         return np.concatenate(oracle.momentum_W()[:2])
 
 
@@ -360,20 +354,7 @@ def test_faults_from_before_the_decision_stay(harness: Harness) -> None:
 # -- states ---------------------------------------------------------------------------------------
 
 
-Array = npt.NDArray[np.float64]
-
 ROBOTS = Path(__file__).parents[2] / "urdf"
-
-
-def momentum_by_pinocchio(robot: str, odom: Odometry, joints: JointState) -> tuple[Array, float]:
-    """Return the total momenta (world) and the kinetic energy of a published state."""
-    oracle = PinocchioOracle((ROBOTS / f"{robot}.urdf").read_text("utf-8"), list(joints.name))
-    r, quaternion = pose_of(odom)
-    oracle.set_configuration(np.array(joints.position), quaternion, r)
-    twist = np.concatenate(twist_of(odom))
-    oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(np.array(joints.velocity)))
-    p, L, energy = oracle.momentum_W()
-    return np.concatenate([p, L]), energy
 
 
 # -- what is published ------------------------------------------------------------------------
@@ -462,16 +443,14 @@ def test_states_agree_with_pinocchio_while_everything_moves(harness: Harness) ->
     for _ in range(5):
         rig.step(rng.uniform(-0.3, 0.3, len(names)).tolist(), names)
     harness.settle(rig.probe)
-    oracle = PinocchioOracle((ROBOTS / "planar_manipulator.urdf").read_text("utf-8"), names)
     for k in range(6):
         odom, joints = (rig.probe.messages[t][k] for t in ("odom", "joint_states"))
         published = np.array(rig.probe.messages["momentum"][k].data)
-        momenta, energy = momentum_by_pinocchio("planar_manipulator", odom, joints)
-        np.testing.assert_allclose(published[:6], momenta, atol=1e-12)
+        oracle = moving(odom, joints)
+        p, L, energy = oracle.momentum_W()
+        np.testing.assert_allclose(published[:6], [*p, *L], atol=1e-12)
         np.testing.assert_allclose(published[:6], [1, -2, 0.5, 0.2, 0.1, -3], atol=1e-12)
         assert published[6] == pytest.approx(energy, rel=1e-12)
-        r, quaternion = pose_of(odom)
-        oracle.set_configuration(np.array(joints.position), quaternion, r)
         R_WE, r_WE = oracle.frame_W("end_effector")
         tip = rig.probe.messages["end_effector_pose"][k]
         assert tip.header.frame_id == "world"
@@ -525,22 +504,6 @@ def test_a_namespace_moves_all_but_the_clock_and_the_diagnostics(harness: Harnes
 
 
 # -- lockstep with latecomers -----------------------------------------------------------------
-
-
-def test_a_late_reader_gets_the_state_that_waits(harness: Harness) -> None:
-    plant = harness.make(PlantNode, {"robot": "sliding_masses", "time_mode": "lockstep"})
-    assert plant.is_active
-    late = harness.probe(STATE)
-    harness.spin_until(lambda: all(late.count(topic) for topic in STATE), "the waiting state")
-    assert nanoseconds(late.last("joint_states").header.stamp) == 0
-    # It is the same tick still, and goes on from it.
-    publisher = late.create_publisher(JointState, "joint_commands", 10)
-    harness.matched(publisher)
-    publisher.publish(JointState(name=SLIDERS, velocity=[0.2, 0.0, 0.0]))
-    harness.spin_until(
-        lambda: nanoseconds(late.last("joint_states").header.stamp) > 0, "the next tick"
-    )
-    assert nanoseconds(late.last("joint_states").header.stamp) == TICK_NS
 
 
 def test_a_reader_that_comes_during_a_pause_gets_the_state_after_it(harness: Harness) -> None:
@@ -620,18 +583,6 @@ def test_a_contact_ends_with_its_obstacle(harness: Harness) -> None:
     harness.spin_until(lambda: "crate" in contacts(), "a contact")
     obstacles.publish(String(data=""))
     harness.spin_until(lambda: not contacts(), "its end")
-
-
-@pytest.mark.parametrize(
-    "parameters",
-    [{"robot_description": crossing.URDF, "clearance_period": 0.0}, {"robot": "sliding_masses"}],
-)
-def test_clearances_are_not_published_where_there_are_none(
-    harness: Harness, parameters: dict[str, Any]
-) -> None:
-    """By a period of 0, and for a robot none of whose links may touch."""
-    rig = Rig(harness, parameters, topics={"clearance": DiagnosticStatus})
-    assert rig.probe.count_publishers("clearance") == 0
 
 
 LAST = 2**31 - 1

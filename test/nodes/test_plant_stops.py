@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import Log
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.publisher import Publisher
@@ -16,9 +16,9 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from support.bad_commands import BAD_COMMANDS
 from support.control_loop import Loop, pose
-from support.planner_flight import NEAR, PLANNER, Flight, stamp_of
-from support.plant_rig import TICK, TICK_NS, Rig
-from support.ros_harness import DEEP, LATCHED, Harness, Probe, nanoseconds
+from support.planner_flight import NEAR, PLANNER, Flight, stamp_of, values_of
+from support.plant_rig import SLIDERS, TICK, TICK_NS, Rig
+from support.ros_harness import LATCHED, Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.messages.diagnostics import timing_record
@@ -298,43 +298,22 @@ def test_real_time_holds_the_last_good_command(harness: Harness) -> None:
 
 
 @pytest.mark.parametrize("timeout", [1.0, 0.0])
-def test_reset_brings_moving_joints_to_rest_in_real_time(harness: Harness, timeout: float) -> None:
+def test_deactivation_stops_time_publication_and_joints(harness: Harness, timeout: float) -> None:
     rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
     rig.send([0.3, 0.0, 0.0])
     harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
-    assert rig.trigger("plant/reset").success
-    harness.spin_until(lambda: rig.probe.last("joint_states").position[0] == 0.0, "the start")
-    rig.wait("joint_states", rig.probe.count("joint_states") + 5)
-    assert rig.probe.last("joint_states").position[0] == 0.0
-
-
-@pytest.mark.parametrize("timeout", [1.0, 0.0])
-def test_joints_are_at_rest_after_a_deactivation(harness: Harness, timeout: float) -> None:
-    rig = Rig(harness, {**REALTIME, "command_timeout": timeout})
-    rig.send([0.3, 0.0, 0.0])
-    harness.spin_until(lambda: rig.probe.last("joint_states").velocity[0] == 0.3, "motion")
-    assert rig.plant.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
-    harness.settle(rig.probe)
-    before = rig.probe.count("joint_states")
-    rig.activate()
-    rig.wait("joint_states", before + 6)
-    # The first state is the one that was left.
-    for message in rig.probe.messages["joint_states"][before + 1 :]:
-        assert list(message.velocity) == [0.0] * 3
-
-
-def test_deactivation_stops_time_and_publication(harness: Harness) -> None:
-    rig = Rig(harness, REALTIME)
-    rig.wait("joint_states", 5)
     assert rig.plant.trigger_deactivate() is TransitionCallbackReturn.SUCCESS
     harness.settle(rig.probe)
     before, stamp = rig.probe.count("joint_states"), rig.now_ns
     harness.spin_for(0.2)
     assert rig.probe.count("joint_states") == before
     rig.activate()
-    rig.wait("joint_states", before + 3)
-    stamps = [nanoseconds(m.header.stamp) for m in rig.probe.messages["joint_states"][before:]]
+    rig.wait("joint_states", before + 6)
+    states = rig.probe.messages["joint_states"][before:]
+    stamps = [nanoseconds(state.header.stamp) for state in states]
     assert stamps[:3] == [stamp, stamp + TICK_NS, stamp + 2 * TICK_NS]
+    # The first state is the one that was left.
+    assert all(list(state.velocity) == [0.0] * 3 for state in states[1:])
 
 
 def test_pause_stops_real_time_and_nothing_is_made_up_afterwards(harness: Harness) -> None:
@@ -421,10 +400,6 @@ def test_commanders_of_a_remapped_topic_are_counted(harness: Harness) -> None:
 MS = 1_000_000
 
 
-def values(status: DiagnosticStatus) -> dict[str, str]:
-    return {pair.key: pair.value for pair in status.values}
-
-
 def test_what_is_late_is_counted_with_the_worst() -> None:
     time = RealTime(10 * MS)
     time.start(0, 0)
@@ -449,47 +424,32 @@ def test_what_is_late_is_counted_with_the_worst() -> None:
     assert timing_record("/plant", "robot", time).level == 0, "nothing new is late"
 
 
-def real_time_plant(harness: Harness, **parameters: Any) -> PlantNode:
-    return harness.make(
-        PlantNode,
-        {"robot": "sliding_masses", "diagnostics_period": 0.1, "tick_rate": 50.0, **parameters},
-        autostart=False,
-    )
-
-
 def test_a_plant_in_real_time_tells_its_timing(harness: Harness) -> None:
-    plant = real_time_plant(harness)
-    assert plant.trigger_configure() is TransitionCallbackReturn.SUCCESS
-    probe = harness.probe({"/diagnostics": DiagnosticArray, "joint_states": JointState})
-    commands = probe.create_publisher(JointState, "joint_commands", DEEP)
+    given = {"time_mode": "realtime", "diagnostics_period": 0.1, "tick_rate": 50.0}
+    rig = Rig(harness, given, activate=False)
 
     def answer(state: JointState) -> None:
-        commands.publish(
+        rig.commands.publish(
             JointState(header=state.header, name=state.name, velocity=[0.01, 0.0, 0.0])
         )
 
-    probe.react["joint_states"] = answer
-    harness.connect()
-    plant.trigger_activate()
-    harness.spin_until(lambda: probe.count("joint_states") > 40, "forty ticks")
-    plant.trigger_deactivate()
-    status = {s.name: values(s) for s in probe.last("/diagnostics").status}
+    rig.probe.react["joint_states"] = answer
+    rig.activate()
+    rig.wait("joint_states", 41)
+    rig.plant.trigger_deactivate()
+    status = {s.name: values_of(s) for s in rig.probe.last("/diagnostics").status}
     timing = status["plant: timing"]
     ticks = int(timing["ticks"])
     assert 30 <= ticks <= 45
     # Every state is answered, the first one too, whose stamp is zero: nothing is out of order.
     assert status["plant: commands"]["refused"] == "0"
     assert int(timing["commands"]) in (ticks - 2, ticks - 1)
-    assert set(status["plant: strokes"]) == set(plant.plant.robot.joint_names)
+    assert set(status["plant: strokes"]) == set(SLIDERS)
     left = float(status["plant: strokes"]["slider_2"])
-    assert left == pytest.approx(plant.plant.robot.upper[1], abs=1e-9), "it has not moved"
+    assert left == pytest.approx(rig.plant.plant.robot.upper[1], abs=1e-9), "it has not moved"
 
 
 def test_lockstep_has_no_deadlines(harness: Harness) -> None:
-    plant = real_time_plant(harness, time_mode="lockstep")
-    assert plant.trigger_configure() is TransitionCallbackReturn.SUCCESS
-    probe = harness.probe({"/diagnostics": DiagnosticArray})
-    harness.connect()
-    plant.trigger_activate()
-    harness.spin_until(lambda: probe.count("/diagnostics"), "the first diagnostics")
-    assert not any("timing" in s.name for s in probe.last("/diagnostics").status)
+    rig = Rig(harness)
+    rig.wait("/diagnostics", 1)
+    assert not any("timing" in s.name for s in rig.probe.last("/diagnostics").status)

@@ -203,20 +203,6 @@ def test_a_transition_that_raises_anything_is_reported_and_may_be_tried_again(
         node.destroy_node()
 
 
-def test_a_plant_without_a_robot_names_the_parameter_that_was_misspelt() -> None:
-    root = Path(spacerobot_ros.__file__).parents[1]
-    done = subprocess.run(
-        [sys.executable, root / "scripts" / "plant", "--ros-args", "-p", "robott:=sliding_masses"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 2
-    assert "has no parameter 'robott' (did you mean 'robot'?)" in done.stderr
-    assert "The plant needs a robot" in done.stderr
-
-
 NODES = (CoordinatedControlNode, PlannerNode, PlantNode, RecorderNode, ReplayNode, ViewerNode)
 
 RELEASED = {"_state_machine"}

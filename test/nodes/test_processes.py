@@ -7,12 +7,12 @@ import os
 import resource
 import signal
 from collections.abc import Callable, Iterator
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
@@ -64,6 +64,7 @@ def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
             ("planner", (*robot, "-p", "output:=trajectory"), ["'output'", "control_msgs"])
         )
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
+    cases.append(("plant", ("-p", "robott:=sliding_masses"), ["The plant needs a robot"]))
     for node, arguments, mentions in cases:
         words = ("-m", NODE_TYPES[node].__module__, "--ros-args", *arguments)
         ended = warm_python.run(words, ROOT, environment, timeout=START)
@@ -72,6 +73,7 @@ def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
         # What ROS itself refuses, it says in its own words.
         sentence = ended.stderr.strip().splitlines()[-1].removesuffix(".") + "."
         assert_one_sentence(sentence, *mentions)
+    assert "has no parameter 'robott' (did you mean 'robot'?)" in ended.stderr
 
 
 @pytest.mark.parametrize("node", sorted(NODE_TYPES))
@@ -84,32 +86,23 @@ def test_the_help_of_an_executable_names_its_parameters(warm_python: WarmPython,
     assert set(known[node]) <= set(ended.stdout.split())
 
 
-NO_SUCH_PARAMETER = {
-    "plant": ("tick_rat", "tick_rate"),
-    "planner": ("robott", "robot"),
-    "coordinated_control": ("gains.base_positon.kp", "gains.base_position.kp"),
-}
-"""By node a misspelt parameter, and the one that is meant."""
-
-
 def test_a_parameter_that_a_node_does_not_have_is_named_with_the_nearest(
     start: Start, tmp_path: Path, harness: Harness
 ) -> None:
-    processes = []
-    for node, (given, meant) in NO_SUCH_PARAMETER.items():
-        file = tmp_path / f"{node}.yaml"
-        file.write_text(f"{node}:\n  ros__parameters:\n    {given}: 1.0\n    fuel: 2\n", "utf-8")
-        words = ["--params-file", str(file), "-p", "use_sim_time:=false"]
-        robot = {} if node != "plant" else {"robot": "sliding_masses"}
-        processes.append((start(node, robot, arguments=words), given, meant))
-    for process, given, meant in processes:
-        warned = partial(lambda process: "[WARN]" in process.said, process)
-        harness.spin_until(warned, "a warning", timeout=START)
-        (warning,) = (line for line in process.said.splitlines() if line.startswith("[WARN]"))
-        assert_one_sentence(warning.partition("]: ")[2], f"'{given}'", f"'{meant}'", "'fuel'")
+    file = tmp_path / "control.yaml"
+    given = {"gains": {"base_positon": {"kp": 1.0}}, "fuel": 2}
+    file.write_text(yaml.safe_dump({"coordinated_control": {"ros__parameters": given}}), "utf-8")
+    words = ["--params-file", str(file), "-p", "use_sim_time:=false"]
+    process = start("coordinated_control", {}, arguments=words)
+    harness.spin_until(lambda: "[WARN]" in process.said, "a warning", timeout=START)
+    (warning,) = (line for line in process.said.splitlines() if line.startswith("[WARN]"))
+    named = "'gains.base_positon.kp'", "'gains.base_position.kp'", "'fuel'"
+    assert_one_sentence(warning.partition("]: ")[2], *named)
 
 
-@pytest.mark.parametrize("node", ["planner", "coordinated_control"])
+@pytest.mark.parametrize(
+    "node", ["planner", pytest.param("coordinated_control", marks=pytest.mark.slow)]
+)
 def test_a_commander_without_a_robot_says_once_what_it_waits_for(
     start: Start, harness: Harness, node: str
 ) -> None:

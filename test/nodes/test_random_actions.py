@@ -41,8 +41,16 @@ def test_some_random_actions_leave_every_state_as_specified(
     ("setup", "seed", "count"),
     [
         pytest.param("three_joint_arm", 22, 2, id="a twist of 1e308 m/s"),
-        pytest.param("wheels_and_target", 6, 14, id="a goal of the hand alone behind a task"),
-        pytest.param("wheels_and_target", 12, 40, id="a goal behind a task is replaced"),
+        pytest.param(
+            *("wheels_and_target", 6, 14),
+            id="a goal of the hand alone behind a task",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *("wheels_and_target", 12, 40),
+            id="a goal behind a task is replaced",
+            marks=pytest.mark.slow,
+        ),
         pytest.param("wheels_and_target", 16, 34, id="a plant stops before an abort is answered"),
     ],
 )

@@ -280,7 +280,9 @@ def test_bags_and_dumps_with_the_parameters_of_ros_are_read(recorded: Recorded) 
     assert_one_sentence(misspelt.stderr, "has no parameter 'tick_rat'")
 
 
-@pytest.mark.parametrize("command", ["report", "figures", "verify"])
+@pytest.mark.parametrize(
+    "command", ["report", pytest.param("figures", marks=pytest.mark.slow), "verify"]
+)
 def test_parameters_of_a_newer_version_stop_no_command(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

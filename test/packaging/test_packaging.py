@@ -412,52 +412,6 @@ def test_what_pip_installs_is_declared_for_pip_too() -> None:
             assert f'"{name}' in setup or f"'{name}" in setup, name
 
 
-@pytest.mark.parametrize(
-    ("rule", "words"),
-    [
-        (None, ""),
-        (["python3-click"], "apt python3-click"),
-        ("python3-click", "apt python3-click"),
-        ({"noble": ["one", "two"], "*": ["three"]}, "apt one two"),
-        ({"focal": ["one"], "*": ["three"]}, "apt three"),
-        ({"noble": None, "*": ["three"]}, ""),
-        ({"focal": ["one"]}, ""),
-        ({"pip": {"packages": ["casadi"]}}, "pip casadi"),
-        ({"*": {"pip": {"packages": ["casadi"]}}}, "pip casadi"),
-        ({"noble": {"apt": {"packages": ["one"]}}}, "apt one"),
-    ],
-)
-def test_rules_of_rosdep_are_those_of_its_format(rule: Any, words: str) -> None:
-    assert installed(rule) == words
-
-
-def test_packages_of_the_distribution_are_debian_packages(tmp_path: Path) -> None:
-    for path, text in {
-        "rosdep/base.yaml": "cmake: {ubuntu: [cmake]}\nold: {fedora: [old]}\n",
-        "rosdep/python.yaml": "casadi-pip: {ubuntu: {pip: {packages: [casadi]}}}\n",
-        "jazzy/distribution.yaml": """\
-repositories:
-  common: {release: {packages: [one_msgs, two_msgs], version: 1.0.0-1}}
-  alone: {release: {version: 2.0.0-1}}
-  planned: {release: {packages: [three_msgs]}}
-  source_only: {source: {type: git}}
-""",
-    }.items():
-        (tmp_path / path).parent.mkdir(exist_ok=True)
-        (tmp_path / path).write_text(text)
-    keys = ["two_msgs", "alone", "three_msgs", "source_only", "cmake", "old", "casadi-pip", "none"]
-    assert resolved(keys, tmp_path) == {
-        "two_msgs": "apt ros-jazzy-two-msgs",
-        "alone": "apt ros-jazzy-alone",
-        "three_msgs": "",
-        "source_only": "",
-        "cmake": "apt cmake",
-        "old": "",
-        "casadi-pip": "pip casadi",
-        "none": "",
-    }
-
-
 @pytest.mark.study
 @pytest.mark.skipif(not CHECKOUT, reason="SPACEROBOT_ROSDISTRO names no checkout of rosdistro")
 def test_the_list_is_that_of_rosdistro() -> None:

@@ -16,7 +16,6 @@ from sensor_msgs.msg import JointState
 from support.hand_motion import end_of_motion
 from support.ros_harness import LATCHED, Harness, Probe
 
-from spacerobot_ros import fly
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
@@ -301,16 +300,9 @@ def test_the_hands_end_at_their_goals(name: str, tmp_path: Path) -> None:
         assert result.summary["end_effectors"][link]["position_error_m"] < 1e-9
     assert result.summary["goal"] is None
     assert result.summary["position_error_m"] is None
-    # Without ROS, bit for bit, and saved.
-    flown = fly(scenario)
-    np.testing.assert_array_equal(flown.q, flight.q)
-    np.testing.assert_array_equal(flown.pose, flight.pose)
-    flown.save(tmp_path / "saved.mcap")
-    saved = read_run(tmp_path / "saved.mcap")
-    for each in (flight, saved):
-        assert each.outcome is flown.outcome
-        assert each.end_effector_errors.keys() == aims.keys()
-        assert each.error is None
+    assert flight.outcome is Outcome.REACHED
+    assert flight.end_effector_errors.keys() == aims.keys()
+    assert flight.error is None
 
 
 def test_a_scenario_is_written_with_its_end_effectors(tmp_path: Path) -> None:
@@ -338,15 +330,14 @@ def test_a_scenario_may_have_paths_of_end_effectors(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("own_domain")
 @pytest.mark.slow
-@pytest.mark.parametrize("nodes", [False, True])
-def test_a_path_is_flown_and_in_the_bag(tmp_path: Path, nodes: bool) -> None:
+def test_a_path_is_flown_and_in_the_bag(tmp_path: Path) -> None:
     """Nodes are sent it as a path; the hand passes its corner, by the poses of the bag."""
     way = [[1.5, 0.7, 1.3], [1.3, 0.9, 0.8]]
     robot = scenario_or_robot("three_joint_arm").with_overrides(
         "plant", {"initial_joint_positions": [0.4, -0.9, 1.1]}
     )
     scenario = robot.with_end_effectors([EndEffectorGoal.along("", way)])
-    result = run_scenario(scenario, tmp_path / "path.mcap", nodes=nodes)
+    result = run_scenario(scenario, tmp_path / "path.mcap", nodes=True)
     assert result.succeeded
     series = read_bag(tmp_path / "path.mcap")["/end_effector_pose"]
     places = series.table([f"pose.position.{axis}" for axis in "xyz"], 3)

@@ -591,21 +591,6 @@ def test_the_end_of_the_past_is_the_present(server: Server, page: Page) -> None:
     assert server.scene.named("/robot").position[0] == 12.0, "another robot has no such past"
 
 
-def test_a_past_of_many_states_is_evenly_thinned() -> None:
-    recent: content.RecentItems[int] = content.RecentItems(span_s=300.0, most=600)
-    for k in range(20_000):
-        recent.add(0.05 * k, k)
-    assert recent.span is not None
-    first, last = recent.span
-    assert last == pytest.approx(0.05 * 19_999)
-    assert first == pytest.approx(last - 300.0, abs=1.5)
-    steps = np.diff(recent.items) * 0.05
-    assert 250 <= len(recent.items) <= 600
-    assert steps[:-1].max() < 2.2 * steps[:-1].min()
-    assert recent.at(first - 1.0) == recent.items[0]
-    assert recent.at(last + 1.0) == 19_999
-
-
 def test_a_past_that_begins_late_is_thinned_as_one_from_zero() -> None:
     kept = []
     for began in (0.0, 4096.0):
