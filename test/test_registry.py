@@ -207,7 +207,6 @@ _COMPUTE = "    def compute(self, state, reference):\n        {}\n"
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        (_LAW.format("Pd", "NumpyLaw"), "The control law 'Pd' lacks compute."),
         (
             _LAW.format("Pd", "NumpyLaw") + "    compute = 5\n",
             "The control law 'Pd' lacks compute.",

@@ -88,7 +88,7 @@ def test_overrides_go_before_the_file_and_have_the_declared_types() -> None:
         "tick_rate": 10.0,
         "initial_position": (1.0, 2.5, 0.0),
     }
-    with pytest.raises(ParameterError, match="Node 'plant' has no parameter 'tick_rte'"):
+    with pytest.raises(ParameterError, match=r"'plant' has no parameter 'tick_rte'.*'tick_rate'"):
         scenario.with_settings(["plant.tick_rte=10"]).parameters("plant")
 
 
@@ -113,7 +113,10 @@ def test_overrides_of_a_scenario_that_is_known_are_those_of_a_new_one() -> None:
         assert scenario.plant.sensors.seed == 5
         assert scenario.plant.tick_rate == 40.0
         assert (load_scenario("sliding_masses").plant, scenario.plant.faults) == (before[0], ())
-        for bad, words in (({"sensors.sed": 1}, "no parameter"), ({"tick_rate": -1}, "tick_rate")):
+        for bad, words in (
+            ({"sensors.sed": 1}, "no parameter"),
+            ({"tick_rate": -1}, "'plant': .*'tick_rate' is -1"),
+        ):
             with pytest.raises(ParameterError, match=words):
                 _ = scenario.with_overrides("plant", bad).plant
 
@@ -352,8 +355,8 @@ def test_settings_that_are_none(text: str) -> None:
 
 def test_files_without_sections(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
-    for content in ("plant: [1]", "plant: {ros__parameters: 3}"):
-        path.write_text(content)
+    for under in ("[1]", "{ros__parameters: 3}", "{ros__parameters: null}"):
+        path.write_text(f"plant: {under}")
         with pytest.raises(ParameterError) as refused:
             read_sections(path)
         assert str(refused.value) == (
@@ -459,13 +462,6 @@ def test_what_a_scenario_needs_is_said(tmp_path: Path) -> None:
     with pytest.raises(ParameterError) as refused:
         PlanningProblem.of(bare)
     assert str(refused.value) == "The scenario 'own' has no robot; see plant.robot."
-    with pytest.raises(ParameterError) as refused:
-        found.with_overrides("plant", {"tick_rat": 1}).config("plant")
-    misspelt = "Node 'plant' has no parameter 'tick_rat'. Did you mean 'tick_rate'?"
-    assert str(refused.value) == misspelt
-    with pytest.raises(ParameterError) as refused:
-        found.with_overrides("plant", {"tick_rate": -1}).config("plant")
-    assert str(refused.value).startswith("Node 'plant': Parameter 'tick_rate' is -1")
 
 
 def test_a_scenario_of_a_robot_flies_that_robot() -> None:

@@ -483,12 +483,8 @@ def test_thrust_is_a_wrench_that_is_not_zero() -> None:
 
 
 def test_a_summary_has_the_turn_of_an_end_effector_that_a_controller_turns() -> None:
-    def flown(label: str) -> Flight:
-        report = CommandReport("law", False, 1.0, 0.0, 0.0, 0.0, 0.0, {label: 0.25})
-        return made_flight(status=ControllerStatus(ControllerState.REACHED, command=report))
-
-    assert "end_effector_attitude_error_rad" not in flown("end_effector.x").summary()
-    flight = flown("end_effector.rx")
+    assert "end_effector_attitude_error_rad" not in flown_by("end_effector.x").summary()
+    flight = flown_by("end_effector.rx")
     turn = Rotation.from_quat(flight.quantities["end_effector_pose"][-1, 3:])
     wanted = (turn.inv() * Rotation.from_quat(HAND.quaternion)).magnitude()
     assert flight.summary()["end_effector_attitude_error_rad"] == pytest.approx(wanted)

@@ -31,7 +31,7 @@ from spacerobot_ros.errors import (
     RobotDescriptionError,
     SpaceRobotError,
 )
-from spacerobot_ros.messages.readers import TemplateReader, UnreadableError
+from spacerobot_ros.messages.readers import TemplateReader
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.thrusters import load_thrusters, thrusters_of_urdf
@@ -458,18 +458,6 @@ def reader() -> TemplateReader:
     return TemplateReader("sensor_msgs/msg/JointState", {"velocity": None})
 
 
-def test_a_line_break_in_what_is_quoted_does_not_break_the_sentence() -> None:
-    assert_one_sentence(str(SpaceRobotError("The name 'a\nb' is refused.")), "'a b'")
-
-
-def test_bytes_that_are_no_message_leave_the_message_before() -> None:
-    read = reader()
-    read.accept(serialize_message(JointState(name=["a"], velocity=[2.0])))
-    with pytest.raises(UnreadableError):
-        read.accept(b"\0\1\0\0" + b"\xff" * 40)
-    assert read.floats("velocity").tolist() == [2.0]
-
-
 @pytest.mark.parametrize("text", [b"\xff\xfe", b"a\0"], ids=["not UTF-8", "zero byte inside"])
 def test_numbers_behind_a_broken_string_are_read_in_their_place(text: bytes) -> None:
     raw = bytes(serialize_message(JointState(name=["ab"], velocity=[2.0], effort=[3.0])))
@@ -500,15 +488,6 @@ def test_a_whole_number_beyond_every_float_is_refused(value: Any) -> None:
     default: Any = [0.0] if isinstance(value, list) else 0.0
     with pytest.raises(ParameterError, match="'size'"):
         Parameter("size", default, "m", "").checked(value)
-
-
-@pytest.mark.parametrize("section", ["[1, 2]", "{ros__parameters: null}"])
-def test_a_node_section_that_is_no_mapping_is_refused(tmp_path: Path, section: str) -> None:
-    path = tmp_path / "s.yaml"
-    path.write_text(f"scenario: {{ros__parameters: {{}}}}\nplant: {section}\n", encoding="utf-8")
-    with pytest.raises(ParameterError) as caught:
-        load_scenario(str(path))
-    assert_one_sentence(str(caught.value), "'plant'")
 
 
 @pytest.mark.parametrize("number", ["nan", "1e300"])

@@ -329,9 +329,10 @@ def test_a_name_without_its_final_zero_is_whole_as_in_other_readers() -> None:
 
 def test_a_reader_refuses_what_is_no_message() -> None:
     reader = TemplateReader(JOINT_STATE, spans)
-    with pytest.raises(UnreadableError, match="its bytes are not a JointState"):
-        reader.accept(b"\0\1\0\0" + b"\xff" * 29)
-    # And still reads the next.
-    message = JointState(name=["a"], position=[1.0], velocity=[2.0], effort=[0.0])
-    reader.accept(serialize_message(message))
-    check_reads(reader, message)
+    for position in (1.0, 2.0):
+        message = JointState(name=["a"], position=[position], velocity=[2.0], effort=[0.0])
+        reader.accept(serialize_message(message))
+        check_reads(reader, message)
+        with pytest.raises(UnreadableError, match="its bytes are not a JointState"):
+            reader.accept(b"\0\1\0\0" + b"\xff" * 29)
+        assert reader.floats("position") == [position]

@@ -25,8 +25,6 @@ from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.events import (
     INTEGER,
     SECONDS,
-    Event,
-    EventKind,
     KeyValueField,
     KeyValueFormat,
     list_format,
@@ -258,15 +256,6 @@ def test_pairs_have_the_order_of_the_fields_and_leave_defaults_out() -> None:
 def test_pairs_that_are_missing_or_unreadable_are_named(pairs: dict[str, str], named: str) -> None:
     with pytest.raises(SpaceRobotError, match=f"^No sample can be read from the values: .*{named}"):
         FORMAT.from_values(Sample, pairs)
-
-
-def test_an_event_carries_its_times_first_and_its_facts_last() -> None:
-    event = Event(EventKind.LATCHED, "m", 2, 1.25, "7.5", {"reason": "late", "fault": "x"})
-    pairs = event.to_values(9.5)
-    assert list(pairs) == ["event", "time", "wall_time", "goal_id", "reason", "fault"]
-    assert (pairs["time"], pairs["wall_time"]) == ("1.250000000", "9.500000")
-    assert Event.from_values(pairs, "m", 2) == event
-    assert "time" not in Event(EventKind.RESET, "").to_values(None)
 
 
 # -- statuses as messages: rclpy reads what is encoded, and nothing unprintable is read ----------

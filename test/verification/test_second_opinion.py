@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from click.testing import Result
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import JointState
 from support.command_line import CliRunner
 from support.sentences import assert_one_sentence
 from support.slow import some_fast
@@ -236,13 +235,3 @@ def test_the_commands_in_it_give_the_states_in_it(name: str) -> None:
     assert result.ticks > MIN_TICKS.get(name, 300)
     # Clock, end-effector and base pose apart, three messages tell the state of every tick.
     assert result.messages > 3 * result.ticks
-
-
-def pushed(message: JointState) -> JointState:
-    """Change what one joint is commanded, velocity or effort, by little."""
-    values = message.effort if any(message.effort) else message.velocity
-    values[-1] += 1e-3
-    return message
-
-
-# -- recorded commands, replayed open loop in another engine, lead to the recorded states --------
