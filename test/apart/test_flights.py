@@ -54,8 +54,11 @@ FURTHER: dict[str, Place] = dict.fromkeys(
 
 CONTROLLED |= FURTHER
 TOPIC_FLIGHTS = [*FLIGHTS, *(("coordinated_control", robot) for robot in FURTHER)]
-QUICK = [("planner", "sliding_masses"), ("coordinated_control", "planar_manipulator")]
-SLOW = [("planner", "surveyor"), ("coordinated_control", "servicer")]
+QUICK = ("planner", "sliding_masses")
+SLOW = [
+    *(("coordinated_control", name) for name in ("planar_manipulator", "servicer")),
+    ("planner", "surveyor"),
+]
 
 
 def robot_given(name: str, folder: Path) -> str:
@@ -93,7 +96,7 @@ def check_record(apart: NodesApart, python: WarmPython) -> None:
     apart.wait(lambda: apart.probe.count("odom") > heard + 10, "the bag's states have come again")
 
 
-@pytest.mark.parametrize(("node", "robot"), some_fast(TOPIC_FLIGHTS, *QUICK, slow=SLOW))
+@pytest.mark.parametrize(("node", "robot"), some_fast(TOPIC_FLIGHTS, QUICK, slow=SLOW))
 def test_a_goal_on_the_topic_is_reached(
     apart: NodesApart, warm_python: WarmPython, node: str, robot: str
 ) -> None:
@@ -208,6 +211,7 @@ def plan_times(apart: NodesApart) -> list[float]:
     return [float(each) for each in re.findall(r"Planned in ([\d.e-]+) s", apart.said)]
 
 
+@pytest.mark.slow
 def test_a_second_goal_in_motion_is_flown(apart: NodesApart) -> None:
     apart.start("plant", robot="sliding_masses")
     apart.start("planner")
@@ -245,8 +249,8 @@ RATES = [(node, rate) for node in SLIDE_AND_TURN for rate in (5.0, 10.0, 50.0, 2
     ("node", "rate"),
     some_fast(
         RATES,
-        ("planner", 10.0),
-        slow=[("planner", 200.0), ("coordinated_control", 5.0), ("coordinated_control", 50.0)],
+        slow=[("planner", 10.0), ("planner", 200.0)]
+        + [("coordinated_control", rate) for rate in (5.0, 50.0)],
     ),
 )
 def test_a_plant_of_any_rate_is_followed(apart: NodesApart, node: str, rate: float) -> None:

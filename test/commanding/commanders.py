@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.commanding.commander import Commander
+from spacerobot_ros.commanding.fly_to import FlyToResult, Progress
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.host import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.plant_state import Stamped
@@ -117,6 +118,51 @@ class Rig:
 
     def use(self, robot: SpaceRobot) -> None:
         self.commander.use_robot(robot, OneRobotDecoder(self.n))
+
+
+def active(make: Callable[..., Commander], settings: Any, robot: SpaceRobot, **others: Any) -> Rig:
+    """Return a commander that knows its robot and is active."""
+    rig = Rig(make, settings, robot.n, **others)
+    rig.use(robot)
+    rig.commander.activate()
+    return rig
+
+
+class TrajectoryServer:
+    """Keeps what it is asked, and is there or not."""
+
+    def __init__(self) -> None:
+        self.present = True
+        self.sent: list[tuple[int, Any]] = []
+        self.cancelled: list[int] = []
+
+    def is_available(self) -> bool:
+        return self.present
+
+    def send(self, number: int, start: Any) -> None:
+        self.sent.append((number, start))
+
+    def cancel(self, number: int) -> None:
+        self.cancelled.append(number)
+
+
+class Client:
+    """Keeps what a client is told."""
+
+    def __init__(self) -> None:
+        self.told: list[Progress] = []
+        self.results: list[FlyToResult] = []
+
+    def feedback(self, progress: Progress) -> None:
+        self.told.append(progress)
+
+    def end(self, result: FlyToResult) -> None:
+        self.results.append(result)
+
+    @property
+    def end_of(self) -> tuple[str, str]:
+        (result,) = self.results
+        return result.outcome, result.message
 
 
 METHOD = {

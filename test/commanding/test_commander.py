@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from commanding.commanders import GOAL, METHOD, Rig, config
+from commanding.commanders import GOAL, METHOD, Client, Rig, TrajectoryServer, active, config
 from support.executive_loop import planar_manipulator
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerCommander
-from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
+from spacerobot_ros.commanding.fly_to import FlyTo
 from spacerobot_ros.commanding.host import ArrayDecoder, CommanderActivity, StateArrays
 from spacerobot_ros.commanding.planner import PlannerCommander, TrajectoryOutput
 from spacerobot_ros.commanding.plant_state import PlantStopped
@@ -53,18 +53,12 @@ def arm() -> SpaceRobot:
 
 @pytest.fixture
 def planner(robot: SpaceRobot) -> Rig:
-    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
-    rig.use(robot)
-    rig.commander.activate()
-    return rig
+    return active(PlannerCommander, config(PlannerConfig, **METHOD), robot)
 
 
 @pytest.fixture
 def controller(arm: SpaceRobot) -> Rig:
-    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
-    rig.use(arm)
-    rig.commander.activate()
-    return rig
+    return active(ControllerCommander, config(ControllerConfig), arm)
 
 
 def test_goals_of_the_base_are_left_to_a_planner_whose_reference_a_law_of_joints_tracks(
@@ -271,9 +265,7 @@ def test_a_commander_that_is_to_stop_with_the_decision_answers_no_later_state(
     robot: SpaceRobot,
 ) -> None:
     settings = config(PlannerConfig, **METHOD, stop_when_decided=True)
-    rig = Rig(PlannerCommander, settings, robot.n)
-    rig.use(robot)
-    rig.commander.activate()
+    rig = active(PlannerCommander, settings, robot)
     rig.state(1)
     assert rig.commander.active
     rig.goal(goal=Goal.checked(np.zeros(3), [0.0, 0.0, 0.0, 1.0]))
@@ -287,22 +279,6 @@ def test_a_commander_that_is_to_stop_with_the_decision_answers_no_later_state(
     assert rig.commander.active
 
 
-class SilentServer:
-    """A server of trajectories that answers nothing, and goes away at a tick."""
-
-    def __init__(self) -> None:
-        self.present, self.sent, self.cancelled = True, 0, list[int]()
-
-    def is_available(self) -> bool:
-        return self.present
-
-    def send(self, number: int, start: Any) -> None:
-        self.sent += 1
-
-    def cancel(self, number: int) -> None:
-        self.cancelled.append(number)
-
-
 @pytest.mark.parametrize(
     ("goes", "words", "last"),
     [(10, "the server of the action '/arm' is gone", 24), (999, "has not responded", 106)],
@@ -310,10 +286,8 @@ class SilentServer:
 def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
     robot: SpaceRobot, goes: int, words: str, last: int
 ) -> None:
-    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD, output="trajectory"), robot.n)
-    rig.use(robot)
-    rig.commander.activate()
-    server = SilentServer()
+    rig = active(PlannerCommander, config(PlannerConfig, **METHOD, output="trajectory"), robot)
+    server = TrajectoryServer()
     rig.commander.trajectories = TrajectoryOutput(server, "/arm", rig.commander.end_schedule)
     rig.goal()
     tick = 0
@@ -324,14 +298,12 @@ def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
         assert tick <= last
     assert tick > last - 4
     assert words in rig.host.statuses[-1].message
-    assert (server.sent, server.cancelled) == (1, [1])
+    assert (len(server.sent), server.cancelled) == (1, [1])
 
 
 def test_a_controller_that_is_to_stop_with_the_decision_does(arm: SpaceRobot) -> None:
     settings = config(ControllerConfig, stop_when_decided=True, settle_time=0.1)
-    rig = Rig(ControllerCommander, settings, arm.n)
-    rig.use(arm)
-    rig.commander.activate()
+    rig = active(ControllerCommander, settings, arm)
     rig.state(1)
     assert rig.commander.active
     rig.goal(goal=Goal.checked(np.zeros(3), [0.0, 0.0, 0.0, 1.0]))
@@ -340,19 +312,6 @@ def test_a_controller_that_is_to_stop_with_the_decision_does(arm: SpaceRobot) ->
     assert rig.host.states[-1] == "reached"
     assert rig.commander.activity is CommanderActivity.DECIDED
     assert rig.host.commands[-1] < 11
-
-
-class Client:
-    """The client of a goal of an action."""
-
-    def __init__(self) -> None:
-        self.results: list[FlyToResult] = []
-
-    def feedback(self, progress: Progress) -> None:
-        pass
-
-    def end(self, result: FlyToResult) -> None:
-        self.results.append(result)
 
 
 def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
@@ -371,9 +330,7 @@ def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
 
 
 def test_goals_that_are_pursued_together_are_aborted_together(arm: SpaceRobot) -> None:
-    rig = Rig(ControllerCommander, config(ControllerConfig), arm.n)
-    rig.use(arm)
-    rig.commander.activate()
+    rig = active(ControllerCommander, config(ControllerConfig), arm)
     rig.state(1)
     client, flat = Client(), Goal.checked([0.05, -0.03, 0.0], [0.0, 0.0, 0.0, 1.0])
     rig.commander.receive_fly_to("a", lambda: FlyTo(flat), client)
@@ -482,9 +439,7 @@ def test_a_plan_that_a_disturbance_pushes_is_reported_with_a_warning(
     robot: SpaceRobot, output: str
 ) -> None:
     """Of a free-floating robot: a controller that tracks a reference has thrusters."""
-    rig = Rig(PlannerCommander, config(PlannerConfig, output=output, **METHOD), robot.n)
-    rig.use(robot)
-    rig.commander.activate()
+    rig = active(PlannerCommander, config(PlannerConfig, output=output, **METHOD), robot)
 
     def pushed(*lines: str) -> None:
         rig.commander.receive_plant_status(
@@ -649,13 +604,6 @@ def test_a_plant_of_other_commands_is_named_once_and_goals_are_refused(kind: str
     rig.commander.receive_goal(BASE_GOAL_KEY, 7, 0, lambda: GOAL)
     assert rig.host.statuses[-1].state.value == "refused"
     assert rig.host.statuses[-1].message == line
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_rate_near_zero_is_refused(kind: str) -> None:
-    with pytest.raises(ParameterError) as refusal:
-        configured(KINDS[kind][1], {"tick_rate": 1e-4})
-    assert_one_sentence(str(refusal.value), "'tick_rate'", "Hz")
 
 
 TICK = 10_000_000

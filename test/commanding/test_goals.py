@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commanding.commanders import Client
 from scipy.spatial.transform import Rotation
 from support.sentences import assert_one_sentence
 
@@ -15,7 +16,6 @@ from spacerobot_ros.commanding.fly_to import (
     FEEDBACK_PERIOD_NS,
     FlyTo,
     FlyToGoals,
-    FlyToResult,
     GoalErrors,
     Progress,
 )
@@ -31,25 +31,6 @@ from spacerobot_ros.resources import robot_file
 
 POSE = Goal.checked([0.05, -0.03, 0.02], [0.1, -0.2, 0.3, 0.9])
 NAN = math.nan
-
-
-class Client:
-    """Keeps what a client is told."""
-
-    def __init__(self) -> None:
-        self.told: list[Progress] = []
-        self.results: list[FlyToResult] = []
-
-    def feedback(self, progress: Progress) -> None:
-        self.told.append(progress)
-
-    def end(self, result: FlyToResult) -> None:
-        self.results.append(result)
-
-    @property
-    def end_of(self) -> tuple[str, str]:
-        (result,) = self.results
-        return result.outcome, result.message
 
 
 class Rig:

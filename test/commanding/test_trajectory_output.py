@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from commanding.commanders import TrajectoryServer
 
 from spacerobot_ros.commanding.planner import (
     Outcome,
@@ -18,29 +19,11 @@ FIRST = 40 * SECOND
 """Stamp of the first state."""
 
 
-class Server:
-    """Keeps what it is asked, and is there or not."""
-
-    def __init__(self) -> None:
-        self.present = True
-        self.sent: list[tuple[int, Any]] = []
-        self.cancelled: list[int] = []
-
-    def is_available(self) -> bool:
-        return self.present
-
-    def send(self, number: int, start: Any) -> None:
-        self.sent.append((number, start))
-
-    def cancel(self, number: int) -> None:
-        self.cancelled.append(number)
-
-
 class Sent:
     """An output with its server and the ends that it has told."""
 
     def __init__(self) -> None:
-        self.server, self.ends = Server(), list[TrajectoryEnd]()
+        self.server, self.ends = TrajectoryServer(), list[TrajectoryEnd]()
         self.output = TrajectoryOutput(self.server, "/arm/follow", self.ends.append)
 
     def start(self, schedule: Any = "schedule", *, accepted: bool = True) -> int:

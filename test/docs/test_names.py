@@ -93,7 +93,7 @@ def test_classes_that_the_page_of_the_architecture_names_exist() -> None:
 
 def test_tests_that_the_page_of_faults_names_exist() -> None:
     text = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
-    source = (ROOT / "test" / "nodes" / "test_faults.py").read_text(encoding="utf-8")
+    source = (ROOT / "test" / "session" / "test_scenario_flights.py").read_text(encoding="utf-8")
     table = text[text.index("## Response of the stack") :]
     names = re.findall(r"(?:F |, )`(\w+)(?:\.\.\.)?`", table)
     flights = [name for name in names if not (ROOT / "config" / "faults" / f"{name}.yaml").exists()]

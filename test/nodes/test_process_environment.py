@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
 import os
 import re
@@ -113,7 +114,7 @@ def test_full_memory_is_said_before_a_library_is_ended_by_it(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with_free(monkeypatch, free)
-    spacerobot_ros._warn_of_full_shared_memory()
+    importlib.reload(spacerobot_ros)
     assert ("SIGBUS" in caplog.text) == warned
 
 

@@ -284,6 +284,7 @@ def test_a_second_stack_in_a_domain_leaves_the_first_one_alone(
         assert plant.end() == 0, plant.said
 
 
+@pytest.mark.slow
 def test_a_viewer_in_the_domain_is_no_other_stack(
     spacerobot: Command, harness: Harness, ros_domain: int, tmp_path: Path
 ) -> None:

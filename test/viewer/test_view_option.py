@@ -55,15 +55,16 @@ def test_the_viewer_gives_way_to_what_flies_within_its_session_and_among_session
 def test_a_viewer_that_has_ended_by_itself_is_mentioned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "short_viewer.py").write_text(
+    # Python runs this file before what it is asked to.
+    (tmp_path / "sitecustomize.py").write_text(
         "import os, sys\n"
         "print('viewer      http://127.0.0.1:1/', os.getpid(), flush=True)\n"
         "while not os.path.exists('end'): pass\n"
-        "sys.exit('It has lost its way.')\n"
+        "print('It has lost its way.', file=sys.stderr, flush=True)\n"
+        "os._exit(1)\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("spacerobot_ros.session.child._CHILD_MODULE", "short_viewer")
     said: list[str] = []
     with viewing.viewing({}, said.append):
         Path("end").touch()
