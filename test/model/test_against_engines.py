@@ -308,7 +308,7 @@ def test_efforts_of_a_motion_at_zero_momentum(case: Case, engine: Oracle) -> Non
     robot, n = case.robot, case.robot.n
     H = engine.mass_matrix(case.motion)
     qdot, qddot = case.motion.qdot, np.linspace(2.0, -3.0, n)
-    omega = -np.linalg.solve(H[3:6, 3:6], H[3:6, 6:] @ qdot)
+    omega = np.asarray(-np.linalg.solve(H[3:6, 3:6], H[3:6, 6:] @ qdot), np.float64)
     motion = replace(case.motion, v_cm_B=np.zeros(3), omega_WB_B=omega)
     tau = robot.joint_efforts(motion.q, qdot, qddot)
     reached = engine.forward_dynamics(motion, np.zeros(6), tau)
