@@ -71,8 +71,10 @@
       mark.hidden = event.time < span[0] - 1e-9 || event.time > span[1] + 1e-9;
       if (mark.hidden) continue;
       mark.style.left = `${x}px`;
-      const short = event.text.split(":")[0];
-      const [wide, least] = [event.text, short].map((each) => 6.2 * each.length);
+      // The longest that fits of: the whole text, its first two details, the kind of the event.
+      const [kind] = event.text.split(":");
+      const texts = [event.text, (event.text.match(/^[^:]*: \S+ \S+/) ?? [kind])[0], kind];
+      const [wide, , least] = texts.map((each) => 6.2 * each.length);
       let room = limit[event.row] - x - 14;
       const roomBefore = x - 14 - earlier[k];
       // At the right end, and where the next mark is near, the words stand before their mark.
@@ -84,8 +86,8 @@
         (each.event.strong === event.strong ? j > k : each.event.strong));
       mark.classList.toggle("before", before && !outdone);
       words.style.display = outdone || room < least ? "none" : "";
-      words.textContent = room < wide ? short : event.text;
-      const start = before && !outdone ? x - 14 - (room < wide ? least : wide) : x - 6;
+      words.textContent = texts.find((each) => 6.2 * each.length <= room) ?? kind;
+      const start = before && !outdone ? x - 14 - 6.2 * words.textContent.length : x - 6;
       limit[event.row] = Math.min(limit[event.row], start);
     }
   }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.chromium import Browser, browser, chromium, keep_picture
@@ -92,15 +91,15 @@ def test_the_report_shows_what_happened(name: str, tmp_path: Path, window: Brows
         expected |= {"fault on: "} if EventKind.FAULT_INJECTED in kinds else set()
         expected |= {"stuck joint: "} if EventKind.STUCK_JOINT in kinds else set()
         for words in expected:
-            # On a phone, only the kind of an event may fit.
-            shown = words if width > 600 else words.split(":")[0]
-            assert any(shown in text for text in below), (width, words, below)
+            # The kind is shown, and the details beside it or, if they do not fit, on hovering.
+            kind, _, details = words.partition(": ")
+            found = any(kind in text and details in f"{text} {title}" for text, title in below)
+            assert found, (width, words, below)
 
 
-def lanes(window: Browser) -> list[Any]:
-    """Return the words below the first chart; marks of faults and of what found them are seen."""
-    words = "flightCharts.charts[0].marks.map(({words}) => words.textContent)"
+def lanes(window: Browser) -> list[tuple[str, str]]:
+    """Return words and titles below the first chart; marks of faults and their finding are seen."""
+    words = "flightCharts.charts[0].marks.map(({words, mark}) => [words.textContent, mark.title])"
     strong = "flightCharts.charts[0].marks.filter(({event}) => event.strong)"
     assert window.evaluate(f"{strong}.every(({{mark}}) => mark.firstChild.offsetHeight > 0)")
-    found: list[Any] = window.evaluate(words)
-    return found
+    return [(text, title) for text, title in window.evaluate(words)]
