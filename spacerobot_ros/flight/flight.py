@@ -1,4 +1,7 @@
-"""One flight: its data, summary, views and files.
+"""One flight: its data, measures, verdict, summary, views and files.
+
+A commander evaluates its goal with the measured state, at the time of its decision. The verdict
+uses the true state at the end of the flight; its errors are in :attr:`Flight.error`.
 
 A flight is produced by the loop without ROS (:mod:`~spacerobot_ros.flight.lockstep`) or read from a
 bag (:mod:`~spacerobot_ros.flight.reading`).
@@ -8,16 +11,60 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from spacerobot_ros.errors import counted, quantity
+import numpy as np
+
+from spacerobot_ros.control.status import ControllerStatus
+from spacerobot_ros.errors import counted, quantity, sentence_case
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.data import FlightData
+from spacerobot_ros.measures import CaptureMeasures, Measures, Outcome, peak, peak_wrench
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
+from spacerobot_ros.planning import PoseError
+from spacerobot_ros.planning.core.goal import (
+    Controlled,
+    Tolerance,
+    missed_parts,
+    missed_turn,
+    reached_message,
+)
+from spacerobot_ros.planning.execution.status import describe_remaining_error
+from spacerobot_ros.simulation.faults import active_fault
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+
+_PARTS: frozenset[Controlled] = frozenset(("position", "attitude", "shape", "end_effectors"))
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The outcome of a flight in words, according to its last true state.
+
+    Attributes
+    ----------
+    word
+        The outcome in a few words, such as ``Reached, except for the position``.
+    sentence
+        The commander's message; if the goal is reached or the time limit has expired, a sentence
+        with the true errors and the tolerances.
+    succeeded
+        Whether the true state reaches all controlled components of the goal, and whether any
+        automatic capture has taken place.
+    complete
+        Whether every component of the goal was also controlled.
+    """
+
+    word: str
+    sentence: str
+    succeeded: bool = False
+    complete: bool = False
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,6 +163,235 @@ class Flight(FlightData):
             summary["clearance_links"] = list(self.clearance.nearest.links)
             summary["clearance_time_s"] = self.clearance.nearest_time
         return summary
+
+    # -- measures -----------------------------------------------------------------------------
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether the goal was reached, according to the true state and the capture, if any."""
+        return self.verdict.succeeded
+
+    @property
+    def succeeded_by_measurement(self) -> bool:
+        """Whether the goal was reached within tolerance, according to the measured state."""
+        return self.outcome is Outcome.REACHED
+
+    @cached_property
+    def measures(self) -> Measures:
+        """The measures of the flight, which must have states."""
+        return self.measured()
+
+    def measured(self, *, clearance: bool = True) -> Measures:
+        """Return the measures of the flight, which must have states.
+
+        ``clearance``: whether to measure the smallest distance between links (slow).
+        """
+        wrench = self.commands.get("base_wrench")
+        distance, angle = self._largest_end_effector_errors
+        return Measures(
+            outcome=self.outcome,
+            message=self.message,
+            duration=self.duration,
+            manoeuvre_time=self.manoeuvre_time,
+            error=self.error,
+            peak_rate=peak(self.qdot),
+            peak_effort=peak(self.effort),
+            peak_wrench=np.zeros(2) if wrench is None else peak_wrench(wrench.values),
+            lowest=self.q.min(axis=0),
+            highest=self.q.max(axis=0),
+            momentum_drift=self.momentum_drift,
+            end_effector_distance=distance,
+            end_effector_angle=angle,
+            corrections=self.corrections,
+            propellant=math.nan if self.propellant is None else self.propellant,
+            plan_time=self.plan_time,
+            wall_time=self.wall_time,
+            clearance=self.smallest_distance if clearance else math.nan,
+            capture=self.capture_measures,
+        )
+
+    @property
+    def _largest_end_effector_errors(self) -> tuple[float, float]:
+        """Distance (m) and angle (rad) as defined in :class:`Measures`."""
+        if errors := self.end_effector_errors:
+            angles = [errors[link].angle for link in self._turned_links]
+            return max(each.distance for each in errors.values()), max(angles, default=math.nan)
+        error = self.end_effector_error
+        if error is None:
+            return math.nan, math.nan
+        return error.distance, error.angle if self.turns_end_effector else math.nan
+
+    @property
+    def _turned_links(self) -> list[str]:
+        assert self.goal is not None
+        assert self.robot is not None
+        aims = self.goal.for_robot(self.robot).end_effectors
+        return [aim.link for aim in aims if aim.quaternion is not None]
+
+    @property
+    def smallest_distance(self) -> float:
+        """Smallest distance between links, m; infinite if none can touch, NaN if not measured."""
+        if self.clearance is not None:
+            return self.clearance.nearest.distance
+        return math.inf if self.measures_clearance else math.nan
+
+    @property
+    def thrust_impulse(self) -> float:
+        """Impulse of the thrusters, N s: the sum over all, or of the commanded force; 0: none."""
+        thrust = self.signal("thruster_force").values.sum(axis=1)
+        if not thrust.size and "base_wrench" in self.commands:
+            thrust = np.linalg.norm(self.commands["base_wrench"].values[:, :3], axis=1)
+        return float(thrust[1:].sum() * self.control_period)
+
+    @cached_property
+    def capture_measures(self) -> CaptureMeasures:
+        """The capture measures; all are NaN if there is no target."""
+        capture, detumbling = self.capture, self.detumbling
+        if not capture:
+            return CaptureMeasures()
+        time = capture.get("time_s", math.nan)
+        impulse = np.array(capture.get("impulse_Ns", [math.nan] * 6))
+        joints = np.abs(capture.get("joint_impulses_Nms", ()))
+        return CaptureMeasures(
+            captured=float(capture["captured"]),
+            placed=float(self.succeeded and self._holds_target),
+            time=time,
+            distance=self._capture_distance(capture),
+            impulse=float(np.linalg.norm(impulse[:3])),
+            angular_impulse=float(np.linalg.norm(impulse[3:])),
+            joint_impulse=float(joints.max()) if joints.size else math.nan,
+            detumbling_time=detumbling.get("took_s", math.nan),
+            detumbling_bound=detumbling.get("shortest_s", math.nan),
+        )
+
+    @property
+    def _holds_target(self) -> bool:
+        changes = (EventKind.CAPTURED, EventKind.RELEASED)
+        last = [event.kind for event in self.events if event.kind in changes][-1:]
+        return last == [EventKind.CAPTURED]
+
+    def _capture_distance(self, capture: dict[str, Any]) -> float:
+        """Return the distance at a capture, or the flight's smallest, m; NaN: unknown."""
+        if not capture["captured"]:
+            return float(capture.get("nearest_m", math.nan))
+        time, distances = self._grapple_distances
+        if not len(time):
+            return math.nan
+        return float(distances[int(np.searchsorted(time, capture["time_s"] - 1e-9))])
+
+    # -- verdict ------------------------------------------------------------------------------
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The outcome of the flight in a few words and a sentence, according to its last true
+        state; faults that were active when the flight failed follow in another sentence."""
+        verdict, outcome = self._verdict_without_faults, self.outcome
+        failed = outcome in (Outcome.FAILED, Outcome.ABORTED)
+        faults = self._faults_at_decision
+        if not faults or not (failed or (outcome is Outcome.REACHED and not verdict.succeeded)):
+            return verdict
+        clauses = sentence_case("; ".join(map(active_fault, faults)))
+        return replace(verdict, sentence=f"{verdict.sentence} {clauses}.")
+
+    @property
+    def _faults_at_decision(self) -> list[str]:
+        """The lines of the faults that were active when the goal was decided."""
+        active: dict[str, None] = {}
+        decided: list[str] = []
+        for event in self.events:
+            if event.kind is EventKind.FAULT_INJECTED and "fault" in event.about:
+                active[event.about["fault"]] = None
+            elif event.kind is EventKind.FAULT_ENDED:
+                active.pop(event.about.get("fault", ""), None)
+            elif event.kind.value == f"goal_{self.outcome.value}":
+                decided = list(active)
+        return decided
+
+    @property
+    def _verdict_without_faults(self) -> Verdict:
+        late = self.outcome is Outcome.FAILED and isinstance(self.status, ControllerStatus)
+        reached = self.outcome in (Outcome.REACHED, Outcome.REACHED_PARTLY)
+        if not (reached or late):
+            return Verdict(self.outcome.value.capitalize(), self.message)
+        left_out, missed = self.not_controlled, reached and self._automatic_capture_is_missing
+        word = "Reached" if reached else "Failed"
+        if reached and left_out:
+            word += f", except for the {' and '.join(left_out)}"
+        if missed:
+            word += ", but the target is not captured"
+        succeeded = self.outcome is Outcome.REACHED and not missed
+        error, tolerance, goal = self._last_error, self._tolerances, self.goal
+        if error is None or tolerance is None:
+            sentence = self.message
+            if left_out and "not controlled" not in sentence:
+                sentence += f" Not controlled: {' and '.join(left_out)}."
+            if missed:
+                sentence += " The target is not captured."
+            return Verdict(word, sentence, succeeded, succeeded and not left_out)
+        controls = _PARTS - set(left_out)
+        if self.error is None:
+            controls -= {"position", "attitude"}
+        if not error.end_effectors:
+            controls -= {"end_effectors"}
+        errors = describe_remaining_error(error, controls, tolerance, goal)
+        within = tolerance.admits(error, controls)
+        touched = self.message.startswith("The goal is not reached without contact")
+        if late and within and not touched:
+            settling = f"{self.scenario.controller.settle_time:g} s"
+            errors += f", within tolerance for less than the settling time of {settling}"
+        if reached and not within and "measured_pose" in self.series:
+            sentence = (
+                f"The measured pose is within tolerance of the goal; the true pose is {errors}."
+            )
+            return Verdict("Reached according to the measured pose", sentence)
+        controlled = frozenset(controls)
+        parts = {} if goal is None else missed_parts(goal, error, controlled, tolerance)
+        if not self.turns_end_effector:
+            parts |= missed_turn(error.largest_end_effector_angle, tolerance)
+        if self.outcome is Outcome.REACHED_PARTLY and parts and not missed:
+            return Verdict(word, reached_message(errors, parts))
+        fact = "The goal is reached" if reached else "The goal is not reached in time"
+        if late and (touched or self.message.startswith(fact)):
+            # A controller's message states what kept it from the goal, if known.
+            fact = self.message.partition(": ")[0]
+        fact += ", but the target is not captured" * missed
+        return Verdict(word, f"{fact}: {errors}.", succeeded, succeeded and not left_out)
+
+    @property
+    def _automatic_capture_is_missing(self) -> bool:
+        automatic = self.scenario.plant.capture.mode == "automatic"
+        return automatic and not self.capture.get("captured", True)
+
+    @property
+    def _last_error(self) -> PoseError | None:
+        """The final true error of base, joints and end-effectors; None if there is none."""
+        base, links = self.error, tuple(self.end_effector_errors.values())
+        hand = self.end_effector_error
+        if not links and hand is not None:
+            # If the controller does not control the end-effector attitude, it is free.
+            turn = hand.rotvec if self.turns_end_effector else np.zeros(3)
+            links = (PoseError(hand.position, turn),)
+        if base is None and not links:
+            return None
+        position, rotvec = (np.zeros(3),) * 2 if base is None else (base.position, base.rotvec)
+        return PoseError(position, rotvec, self._joint_errors, links)
+
+    @property
+    def _joint_errors(self) -> Array:
+        """Errors (k,) of joints with goals, m or rad; for a controller, those of its outputs."""
+        wanted = None if self.goal is None else self.goal.joint_positions
+        if wanted is not None and len(self.q) and wanted.shape == self.q[-1].shape:
+            return wanted - self.q[-1]
+        command = self.status.command if isinstance(self.status, ControllerStatus) else None
+        errors = {} if command is None else command.errors
+        return np.array([x for name, x in errors.items() if name.startswith("joint.")])
+
+    @property
+    def _tolerances(self) -> Tolerance | None:
+        position, attitude = self.tolerance("position"), self.tolerance("attitude")
+        if position is None or attitude is None:
+            return None
+        return Tolerance(position, attitude, self.tolerance("joint") or Tolerance(0.0, 0.0).shape)
 
     # -- views and files ----------------------------------------------------------------------
 
