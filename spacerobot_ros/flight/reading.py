@@ -30,7 +30,7 @@ from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.series import Commands, SentGoal, Signal, goal_at_end
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.statuses import read_status
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.urdf import obstacles_from_topic, parse_robot, with_world
 from spacerobot_ros.parameters import declared, known_values
@@ -230,37 +230,37 @@ class FlightBag(RecordedRobot):
                 continue  # The event is from a later version.
             yield time_ns, replace(event, node=message.name.strip("/"))
 
-    def goals(self, topic: str) -> tuple[SentGoal, ...]:
-        """Return the valid goal poses, or the last pose of each path, in the odometry frame."""
+    def goals(self, link: str = "") -> tuple[SentGoal, ...]:
+        """Return the valid goals of the base, or of an end-effector, in the odometry frame; of a
+        path, the last pose is the goal."""
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
-        goals, ids = [], GoalIds()
-        shapes = self._goal_shapes() if topic == "goal_pose" else []
-        for time_ns, message in self.messages(topic):
-            shape = next((each for since, each in reversed(shapes) if since <= time_ns), None)
-            stamp = message.header.stamp
-            goal_id = ids.of(stamp.sec, stamp.nanosec)
-            poses, frame = [message], message.header.frame_id
-            if topic.endswith("path"):
-                if not message.poses:
+        goals: list[SentGoal] = []
+        for topic in (goal_topic(link), path_topic(link)) if link else ("goal_pose", "goal_path"):
+            ids, shapes = GoalIds(), self._goal_shapes() if topic == "goal_pose" else []
+            for time_ns, message in self.messages(topic):
+                shape = next((each for since, each in reversed(shapes) if since <= time_ns), None)
+                stamp = message.header.stamp
+                goal_id = ids.of(stamp.sec, stamp.nanosec)
+                poses = getattr(message, "poses", [message])
+                if not poses:
                     continue
-                poses = message.poses
-                frame = poses[-1].header.frame_id or frame
-            *through, (position, attitude) = map(_pose_of, poses)
-            if topic != "goal_pose" and not any(attitude):
-                # Zeros request only the position of an end-effector.
-                attitude = _NO_GOAL.quaternion.tolist()
-            try:
-                goal = Goal.received(position, attitude, shape)
-                if odom is not None:
-                    goal = goal.kept_at(*map(np.array, _pose_of(odom[1].pose)))
-                if topic == "goal_path" and through:
-                    goal = replace(goal, waypoints=np.array([x + q for x, q in through]))
-            except PlanningError:
-                continue
-            if not world or frame in ("", world):
-                goals.append(SentGoal(time_ns / SECOND, goal, goal_id))
-        return tuple(goals)
+                frame = poses[-1].header.frame_id or message.header.frame_id
+                *through, (position, attitude) = map(_pose_of, poses)
+                if topic != "goal_pose" and not any(attitude):
+                    # Zeros request only the position of an end-effector.
+                    attitude = _NO_GOAL.quaternion.tolist()
+                try:
+                    goal = Goal.received(position, attitude, shape)
+                    if odom is not None:
+                        goal = goal.kept_at(*map(np.array, _pose_of(odom[1].pose)))
+                    if topic == "goal_path" and through:
+                        goal = replace(goal, waypoints=np.array([x + q for x, q in through]))
+                except PlanningError:
+                    continue
+                if not world or frame in ("", world):
+                    goals.append(SentGoal(time_ns / SECOND, goal, goal_id))
+        return tuple(sorted(goals, key=lambda sent: sent.time))
 
     def _goal_shapes(self) -> list[tuple[int, list[float] | None]]:
         """Return the final shapes required of goals after a time (ns); None: any."""
@@ -371,18 +371,10 @@ def read_flight(bag: FlightBag) -> Flight:
         for name in COMMANDERS
     }
     decider = next((name for name in COMMANDERS if statuses[name]), COMMANDERS[0])
-    of_base = (*bag.goals("goal_pose"), *bag.goals("goal_path"))
-    goals = tuple(sorted(of_base, key=lambda sent: sent.time))
-    tool_goals = tuple(
-        sorted(
-            (*bag.goals("end_effector/goal_pose"), *bag.goals("end_effector/path")),
-            key=lambda sent: sent.time,
-        )
-    )
+    goals, tool_goals = bag.goals(), bag.goals(DEFAULT_END_EFFECTOR)
     reports = [status for _, status in statuses[decider]]
     # Bags from version 0.1 have no ids.
-    topics = [topic(link) for link in scenario.goal_links for topic in (goal_topic, path_topic)]
-    sent = goals or next(filter(None, map(bag.goals, topics)), ())
+    sent = goals or next(filter(None, map(bag.goals, scenario.goal_links)), ())
     follower, status = GoalFollower(sent[-1].goal_id if sent else "", unnamed=True), None
     for status in reports:
         if follower.update(status):

@@ -273,8 +273,8 @@ def test_goals_have_the_frame_of_their_pose_and_the_shape_that_was_sent_before(
         for time in (1.1, 1.2, 1.3, 1.4):
             say("/goal_pose", pose(time, 10 * time, 0, 0, 0, 0, 0, 1), time)
     bag = open_flight_bag(path)
-    assert [each.goal.position[0] for each in bag.goals("end_effector/path")] == [1.0, 3.0]
-    shapes = [each.goal.joint_positions for each in bag.goals("goal_pose")]
+    assert [each.goal.position[0] for each in bag.goals("end_effector")] == [1.0, 3.0]
+    shapes = [each.goal.joint_positions for each in bag.goals()]
     assert [None if each is None else each.tolist() for each in shapes] == [
         *(None, [0.3, -0.4], [0.3, -0.4], None)
     ]
