@@ -236,21 +236,19 @@ class Playback:
         """Stop time."""
         self._bag_ns, self._clock_ns = self._time(clock_ns), None
 
-    def take_due(self, clock_ns: int, max_count: int) -> list[ReplayMessage]:
-        """Return the messages that are due, at most ``max_count``.
+    def take_due(self, clock_ns: int, max_count: int) -> Iterator[ReplayMessage]:
+        """Iterate over the messages that are due, at most ``max_count``.
 
         Raises
         ------
         RecordingError
             The bag is damaged.
         """
-        taken: list[ReplayMessage] = []
-        while len(taken) < max_count:
+        for _ in range(max_count):
             due = self.next_due_time()
             if due is None or due > clock_ns:
-                break
-            taken.append(self._take_next_message())
-        return taken
+                return
+            yield self._take_next_message()
 
     def next_due_time(self) -> int | None:
         """Return the clock time at which the next message is due, ns; None at the end or while

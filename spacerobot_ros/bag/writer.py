@@ -92,7 +92,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         file."""
         self._topics: dict[str, tuple[int, str, QosProfile]] = {}
         self._schema_ids: dict[str, int] = {}
-        self._channel_ids: set[int] = set()
         self._refusal: str | None = None
         """Why nothing more can be written; None if writing is possible."""
         self._closed = False
@@ -186,7 +185,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         profile = QosProfile() if qos is None else qos
         channel = self._register(name, type_name, profile)
         self._topics[name] = channel, type_name, profile
-        self._channel_ids.add(channel)
         return channel
 
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
@@ -208,7 +206,8 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         RecordingError
             Writing fails or has failed earlier, the channel is unknown, or a time is negative.
         """
-        if self._refusal is not None or channel_id not in self._channel_ids:
+        # Channels are numbered from 1.
+        if self._refusal is not None or not 0 < channel_id <= len(self._topics):
             raise RecordingError(
                 self._refusal
                 or f"The bag {self.path} has no channel {channel_id}: use channels from add_topic."

@@ -119,8 +119,6 @@ class PlanEvaluation:
         Final error in ``pose`` and in the joint positions.
     pose
         (7,) final base pose in W: position (m) and quaternion.
-    limited
-        Number of ticks in which the plant limited a joint.
     plan_time
         Planning wall time, s.
     reached
@@ -133,7 +131,6 @@ class PlanEvaluation:
     pieces: Sequence[GaitSchedule]
     error: PoseError
     pose: Array
-    limited: int
     plan_time: float
     reached: bool
     controls: frozenset[Controlled]
@@ -210,9 +207,8 @@ def try_method(
         reached = tolerance.admits(error, schedule.controls)
         if reached:
             break
-    limited = sum(int(counts.max(initial=0)) for counts in plant.limit_counts.values())
-    pose, controls = plant.pose.copy(), schedule.controls
-    return PlanEvaluation(name, pieces, error, pose, limited, plan_time, reached, controls)
+    controls = schedule.controls
+    return PlanEvaluation(name, pieces, error, plant.pose.copy(), plan_time, reached, controls)
 
 
 def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotError]:

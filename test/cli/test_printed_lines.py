@@ -372,7 +372,7 @@ def trial(problem: PlanningProblem, name: str, reached: bool = True) -> PlanEval
         pieces.append(schedule)
     pose = np.array([0.1, 0.2, 0.3, 0.0, 0.0, math.sin(0.2), math.cos(0.2)])
     error = PoseError(np.array([0.0, 0.0123, 0.0]), np.array([0.0, 0.0, 0.0456]))
-    return PlanEvaluation(name, pieces, error, pose, 0, 0.6789, reached, tool.controls)
+    return PlanEvaluation(name, pieces, error, pose, 0.6789, reached, tool.controls)
 
 
 def plan(patch: pytest.MonkeyPatch, reached: bool, *words: str) -> Result:

@@ -366,7 +366,7 @@ def test_partial_schedules_follow_each_other_until_the_goal_is_reached() -> None
     method = Halves(ticks=20)
     trial = try_method(problem(), "stub", method)
     # 0.0616 m halved six times is less than 1 mm.
-    assert (len(trial.pieces), trial.reached, trial.limited) == (6, True, 0)
+    assert (len(trial.pieces), trial.reached) == (6, True)
     assert trial.error.distance == pytest.approx(0.03082207 / 32, rel=1e-5)
     assert trial.duration == pytest.approx(6 * 20 * TICK)
     assert trial.positions.shape == (121, 3)
