@@ -134,25 +134,28 @@ _METADATA_VERSION = 9
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """One topic of a bag: name, type, type hash, offered QoS and number of recorded messages."""
+    """One topic of a bag: name, type, type hash and offered QoS."""
 
     name: str
     type_name: str
     type_hash: str
     qos: QosProfile
-    message_count: int
 
 
 def _rosbag2_metadata(
-    file_name: str, topics: Sequence[RecordedTopic], start_ns: int | None, end_ns: int | None
+    file_name: str,
+    topics: Sequence[tuple[RecordedTopic, int]],
+    start_ns: int | None,
+    end_ns: int | None,
 ) -> dict[str, str]:
+    """Return the record for topics and their numbers of messages."""
     start, duration = _INFINITE_NS, 0
     if start_ns is not None and end_ns is not None:
         start, duration = start_ns, end_ns - start_ns
     content = {
         "duration": {"nanoseconds": duration},
         "starting_time": {"nanoseconds_since_epoch": start},
-        "message_count": sum(topic.message_count for topic in topics),
+        "message_count": sum(count for _, count in topics),
     }
     whole = {
         "version": _METADATA_VERSION,
@@ -167,9 +170,9 @@ def _rosbag2_metadata(
                     "offered_qos_profiles": [topic.qos.to_dict()],
                     "type_description_hash": topic.type_hash,
                 },
-                "message_count": topic.message_count,
+                "message_count": count,
             }
-            for topic in topics
+            for topic, count in topics
         ],
         "compression_format": "",
         "compression_mode": "",
@@ -245,7 +248,9 @@ class McapFile(Writer):
         overwrite: bool,
         profile: str = "ros2",
     ) -> None:
-        self.path = path
+        self.path, self._profile = path, profile
+        self.topics: dict[int, RecordedTopic] = {}
+        """Topics in rosbag2's metadata by channel, set by the user of the file."""
         self.message_counts: Counter[int] = Counter()
         """Number of messages by channel, including the current chunk."""
         self.start_ns: int | None = None
@@ -302,21 +307,22 @@ class McapFile(Writer):
             self.end_ns = log_time
         super().add_message(channel_id, log_time, data, publish_time, sequence)
 
-    def add_rosbag2_metadata(self, topics: Sequence[RecordedTopic]) -> None:
+    def add_rosbag2_metadata(self) -> None:
         """Append rosbag2's metadata record for the messages written so far."""
-        values = _rosbag2_metadata(self.path.name, topics, self.start_ns, self.end_ns)
+        counted = [(topic, self.message_counts[channel]) for channel, topic in self.topics.items()]
+        values = _rosbag2_metadata(self.path.name, counted, self.start_ns, self.end_ns)
         self.add_metadata(METADATA_NAME, values)
 
     def flush(self) -> None:
         """Complete the current chunk."""
         Writer.flush(self)
 
-    def finish(self, topics: Sequence[RecordedTopic] | None = None) -> None:
-        """Complete and close the file; if topics are given, add rosbag2's topic record first."""
+    def finish(self) -> None:
+        """Complete and close the file; one of ROS 2 ends with rosbag2's metadata."""
         try:
             self.flush()
-            if topics is not None:
-                self.add_rosbag2_metadata(topics)
+            if self._profile == "ros2":
+                self.add_rosbag2_metadata()
             Writer.finish(self)
         finally:
             self.close()

@@ -103,8 +103,7 @@ def salvage_bag(
             copy.add_readable_records(old)
             if copy.empty:
                 raise RecordingError(f"Nothing in the bag {source} can be read.")
-            topics = copy.topics()
-            new.finish(topics if profile == "ros2" else None)
+            new.finish()
         except BaseException:
             new.close()
             target.unlink(missing_ok=True)
@@ -137,8 +136,8 @@ class _Copy:
         self._file = file
         self._schemas: dict[int, tuple[int, str]] = {}
         """New schema ID and type name, by schema ID in the old file."""
-        self._channels: dict[int, tuple[int, Channel]] = {}
-        """New channel ID and old channel record, by channel ID in the old file."""
+        self._channels: dict[int, int] = {}
+        """New channel ID by channel ID in the old file."""
 
     def add_readable_records(self, old: BinaryIO) -> None:
         """Add the readable content of a file, up to the first truncated record."""
@@ -175,34 +174,29 @@ class _Copy:
         self.empty &= found is None or isinstance(found, Header)
         match found:
             case Message() as message if message.channel_id in self._channels:
-                number, _ = self._channels[message.channel_id]
+                number = self._channels[message.channel_id]
                 self._file.add_message(number, message.log_time, message.data, message.publish_time)
             case Schema() as schema if schema.id not in self._schemas:
                 number = self._file.register_schema(schema.name, schema.encoding, schema.data)
                 self._schemas[schema.id] = number, schema.name
             case Channel() as channel if channel.id not in self._channels:
-                schema_id, _ = self._schemas.get(channel.schema_id, (0, ""))
+                schema_id, type_name = self._schemas.get(channel.schema_id, (0, ""))
                 number = self._file.register_channel(
                     channel.topic, channel.message_encoding, schema_id, channel.metadata
                 )
-                self._channels[channel.id] = number, channel
+                self._channels[channel.id], words = number, channel.metadata
+                with suppress(RecordingError):
+                    profiles = QosProfile.from_yaml(words.get("offered_qos_profiles", ""))
+                    self._file.topics[number] = RecordedTopic(
+                        channel.topic,
+                        type_name,
+                        words.get("topic_type_hash", ""),
+                        profiles[0] if profiles else QosProfile(),
+                    )
             case Attachment() as file:
                 self._file.add_attachment(0, file.log_time, file.name, file.media_type, file.data)
             case Metadata() as metadata if metadata.name != METADATA_NAME:
                 self._file.add_metadata(metadata.name, metadata.metadata)
-
-    def topics(self) -> list[RecordedTopic]:
-        """Return all topics for rosbag2's topic record, including topics without messages."""
-        topics = []
-        for number, channel in self._channels.values():
-            count, words = self._file.message_counts[number], channel.metadata
-            _, type_name = self._schemas.get(channel.schema_id, (0, ""))
-            type_hash = words.get("topic_type_hash", "")
-            with suppress(RecordingError):
-                profiles = QosProfile.from_yaml(words.get("offered_qos_profiles", ""))
-                qos = profiles[0] if profiles else QosProfile()
-                topics.append(RecordedTopic(channel.topic, type_name, type_hash, qos, count))
-        return topics
 
 
 # -- the state to resume from -----------------------------------------------------------------

@@ -90,7 +90,8 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._repeated: list[Callable[[McapFile], None]] = []
         """One function per attachment or metadata record; it adds the attachment or record to a
         file."""
-        self._topics: dict[str, tuple[int, str, QosProfile]] = {}
+        self._topics: dict[str, tuple[int, RecordedTopic]] = {}
+        """Channel and description of every topic."""
         self._schema_ids: dict[str, int] = {}
         self._refusal: str | None = None
         """Why nothing more can be written; None if writing is possible."""
@@ -99,7 +100,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         try:
             # rosbag2 writes this record at both ends. The first one informs readers of a
             # truncated file that its QoS policies are strings.
-            self._file.add_rosbag2_metadata([])
+            self._file.add_rosbag2_metadata()
         except RecordingError:
             self._file.close()
             raise
@@ -133,7 +134,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def message_counts(self) -> dict[str, int]:
         """Number of messages on each topic in the bag, including the current chunk."""
         counts = self._earlier_counts + self._file.message_counts
-        return {name: counts[channel] for name, (channel, _, _) in self._topics.items()}
+        return {name: counts[channel] for name, (channel, _) in self._topics.items()}
 
     @property
     def bytes_written(self) -> int:
@@ -175,16 +176,16 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         if self._refusal is not None:
             raise RecordingError(self._refusal)
         if name in self._topics:
-            channel_id, known_type, _ = self._topics[name]
-            if type_name != known_type:
+            channel, known = self._topics[name]
+            if type_name != known.type_name:
                 raise RecordingError(
-                    f"The topic {name} has type {known_type} in the bag {self.path}, not "
+                    f"The topic {name} has type {known.type_name} in the bag {self.path}, not "
                     f"{type_name}."
                 )
-            return channel_id
-        profile = QosProfile() if qos is None else qos
-        channel = self._register(name, type_name, profile)
-        self._topics[name] = channel, type_name, profile
+            return channel
+        topic = RecordedTopic(name, type_name, type_hash(type_name), qos or QosProfile())
+        channel = self._register(topic)
+        self._topics[name] = channel, topic
         return channel
 
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
@@ -266,19 +267,24 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         if refused:
             self._file.close()
         else:
-            self._file.finish(self._recorded_topics())
+            self._file.finish()
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _register(self, name: str, type_name: str, qos: QosProfile) -> int:
+    def _register(self, topic: RecordedTopic) -> int:
         """Add a topic to the current file; it gets the same channel in every file."""
-        hash_string = type_hash(type_name)
-        if type_name not in self._schema_ids:
-            text = message_definition(type_name).encode()
-            self._schema_ids[type_name] = self._file.register_schema(type_name, "ros2msg", text)
-        metadata = {"offered_qos_profiles": qos.to_yaml(), "topic_type_hash": hash_string}
-        return self._file.register_channel(name, "cdr", self._schema_ids[type_name], metadata)
+        file, kind = self._file, topic.type_name
+        if kind not in self._schema_ids:
+            text = message_definition(kind).encode()
+            self._schema_ids[kind] = file.register_schema(kind, "ros2msg", text)
+        metadata = {
+            "offered_qos_profiles": topic.qos.to_yaml(),
+            "topic_type_hash": topic.type_hash,
+        }
+        channel = file.register_channel(topic.name, "cdr", self._schema_ids[kind], metadata)
+        file.topics[channel] = topic
+        return channel
 
     def _is_full(self) -> bool:
         max_size, max_duration_ns = self._limits
@@ -334,16 +340,16 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     def _begin_next_file(self) -> None:
         """Complete the current file and start the next one, with the same schemas and channels."""
-        self._file.finish(self._recorded_topics())
+        self._file.finish()
         self._earlier_counts += self._file.message_counts
         self._file = self._open_next_file()
         self.splits += 1
-        self._file.add_rosbag2_metadata(self._recorded_topics())
+        self._schema_ids = {}
+        for _, topic in self._topics.values():
+            self._register(topic)
+        self._file.add_rosbag2_metadata()
         for record in self._repeated:
             record(self._file)
-        self._schema_ids = {}
-        for name, (_, type_name, qos) in self._topics.items():
-            self._register(name, type_name, qos)
 
     def _open_next_file(self) -> McapFile:
         while True:
@@ -354,13 +360,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                 # A file of another bag has this number: in flight, the next number is used.
                 if self._overwrite:
                     raise
-
-    def _recorded_topics(self) -> list[RecordedTopic]:
-        counts = self._file.message_counts
-        return [
-            RecordedTopic(name, type_name, type_hash(type_name), qos, counts[channel])
-            for name, (channel, type_name, qos) in self._topics.items()
-        ]
 
     @contextmanager
     def _adding(self) -> Iterator[None]:

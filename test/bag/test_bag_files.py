@@ -200,7 +200,7 @@ def test_a_file_that_goes_just_before_the_end_is_missed(tmp_path: Path) -> None:
 def test_a_disk_that_is_full_at_the_very_end_is_a_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def finish(self: McapFile, _: Any) -> None:
+    def finish(self: McapFile) -> None:
         self.close()
         raise RecordingError(f"Cannot write the bag {self.path}: no space.")
 
