@@ -26,6 +26,7 @@ from mcap.writer import CompressionType, Writer
 from spacerobot_ros.bag.mcap_reading import require_regular
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.files import load_yaml
+from spacerobot_ros.messages.definitions import message_definition
 from spacerobot_ros.times import SECOND
 
 # -- quality of service -----------------------------------------------------------------------
@@ -250,7 +251,8 @@ class McapFile(Writer):
     ) -> None:
         self.path, self._profile = path, profile
         self.topics: dict[int, RecordedTopic] = {}
-        """Topics in rosbag2's metadata by channel, set by the user of the file."""
+        """Topics in rosbag2's metadata, by channel."""
+        self._schema_ids: dict[str, int] = {}
         self.message_counts: Counter[int] = Counter()
         """Number of messages by channel, including the current chunk."""
         self.start_ns: int | None = None
@@ -294,6 +296,18 @@ class McapFile(Writer):
             problem = str(error.strerror or error)
         if problem:
             raise RecordingError(f"The bag {self.path} was lost during recording: {problem}.")
+
+    def add_topic(self, topic: RecordedTopic) -> int:
+        """Add a topic of an installed type, and return its channel."""
+        kind = topic.type_name
+        if kind not in self._schema_ids:
+            text = message_definition(kind).encode()
+            self._schema_ids[kind] = self.register_schema(kind, "ros2msg", text)
+        profile, type_hash = topic.qos.to_yaml(), topic.type_hash
+        metadata = {"offered_qos_profiles": profile, "topic_type_hash": type_hash}
+        channel = self.register_channel(topic.name, "cdr", self._schema_ids[kind], metadata)
+        self.topics[channel] = topic
+        return channel
 
     def add_message(
         self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int = 0

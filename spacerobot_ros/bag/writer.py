@@ -12,7 +12,7 @@ from pathlib import Path
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.messages.definitions import message_definition, type_hash
+from spacerobot_ros.messages.definitions import type_hash
 from spacerobot_ros.times import SECOND
 
 _RECORDER_CHUNK_SIZE = 262_144
@@ -90,9 +90,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._repeated: list[Callable[[McapFile], None]] = []
         """One function per attachment or metadata record; it adds the attachment or record to a
         file."""
-        self._topics: dict[str, tuple[int, RecordedTopic]] = {}
-        """Channel and description of every topic."""
-        self._schema_ids: dict[str, int] = {}
         self._refusal: str | None = None
         """Why nothing more can be written; None if writing is possible."""
         self._closed = False
@@ -134,7 +131,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def message_counts(self) -> dict[str, int]:
         """Number of messages on each topic in the bag, including the current chunk."""
         counts = self._earlier_counts + self._file.message_counts
-        return {name: counts[channel] for name, (channel, _) in self._topics.items()}
+        return {topic.name: counts[channel] for channel, topic in self._file.topics.items()}
 
     @property
     def bytes_written(self) -> int:
@@ -175,18 +172,16 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         """
         if self._refusal is not None:
             raise RecordingError(self._refusal)
-        if name in self._topics:
-            channel, known = self._topics[name]
-            if type_name != known.type_name:
-                raise RecordingError(
-                    f"The topic {name} has type {known.type_name} in the bag {self.path}, not "
-                    f"{type_name}."
-                )
-            return channel
+        for channel, known in self._file.topics.items():
+            if known.name == name:
+                if type_name != known.type_name:
+                    raise RecordingError(
+                        f"The topic {name} has type {known.type_name} in the bag {self.path}, not "
+                        f"{type_name}."
+                    )
+                return channel
         topic = RecordedTopic(name, type_name, type_hash(type_name), qos or QosProfile())
-        channel = self._register(topic)
-        self._topics[name] = channel, topic
-        return channel
+        return self._file.add_topic(topic)
 
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Add one message.
@@ -207,8 +202,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         RecordingError
             Writing fails or has failed earlier, the channel is unknown, or a time is negative.
         """
-        # Channels are numbered from 1.
-        if self._refusal is not None or not 0 < channel_id <= len(self._topics):
+        if self._refusal is not None or channel_id not in self._file.topics:
             raise RecordingError(
                 self._refusal
                 or f"The bag {self.path} has no channel {channel_id}: use channels from add_topic."
@@ -272,20 +266,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _register(self, topic: RecordedTopic) -> int:
-        """Add a topic to the current file; it gets the same channel in every file."""
-        file, kind = self._file, topic.type_name
-        if kind not in self._schema_ids:
-            text = message_definition(kind).encode()
-            self._schema_ids[kind] = file.register_schema(kind, "ros2msg", text)
-        metadata = {
-            "offered_qos_profiles": topic.qos.to_yaml(),
-            "topic_type_hash": topic.type_hash,
-        }
-        channel = file.register_channel(topic.name, "cdr", self._schema_ids[kind], metadata)
-        file.topics[channel] = topic
-        return channel
-
     def _is_full(self) -> bool:
         max_size, max_duration_ns = self._limits
         span = (self._file.end_ns or 0) - (self._file.start_ns or 0)
@@ -340,13 +320,13 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     def _begin_next_file(self) -> None:
         """Complete the current file and start the next one, with the same schemas and channels."""
-        self._file.finish()
-        self._earlier_counts += self._file.message_counts
+        done = self._file
+        done.finish()
+        self._earlier_counts += done.message_counts
         self._file = self._open_next_file()
         self.splits += 1
-        self._schema_ids = {}
-        for _, topic in self._topics.values():
-            self._register(topic)
+        for topic in done.topics.values():
+            self._file.add_topic(topic)
         self._file.add_rosbag2_metadata()
         for record in self._repeated:
             record(self._file)
