@@ -353,7 +353,7 @@ def _record_of_row(row: Row) -> dict[str, Any]:
         "wall_time_s": row.wall_time,
         "plan_time_s": row.plan_time,
         "engine": row.engine,
-        "fallback": row.fallback,
+        "fallback": row.draw.fallback,
         "versions": versions_json(),
     }
 

@@ -45,11 +45,16 @@ class Draw:
         Seed of sensor and actuator noise.
     values
         Values by dispersion name.
+    fallback
+        Reason why engine ``flights`` flies the draw instead of the campaign's engine, which
+        completes "the flight ..." (for example "needed corrections"), or is an error message; empty
+        for the campaign's engine.
     """
 
     number: int
     seed: int
     values: Mapping[str, Any]
+    fallback: str = ""
 
 
 class Draws:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 
@@ -12,7 +11,7 @@ from spacerobot_ros.campaign.config import ENGINES, Campaign
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Fallback, Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 _FLIGHTS_WORTH_A_DEVICE = 100_000
@@ -62,13 +61,10 @@ def fly_all(
     engine: Engine, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
 ) -> Iterator[Row]:
     """Yield a row for each draw; fallbacks are flown last."""
-    fallbacks: list[Fallback] = []
+    fallbacks: list[Draw] = []
     for made in engine.fly(campaign, draws, stopped):
-        if isinstance(made, Fallback):
-            fallbacks.append(made)
-        else:
+        if isinstance(made, Row):
             yield made
-    reasons = {each.draw.number: each.reason for each in fallbacks}
-    for row in engine_by_name(FLIGHTS).fly(campaign, [each.draw for each in fallbacks], stopped):
-        assert isinstance(row, Row), "the engine 'flights' has no fallbacks"
-        yield replace(row, fallback=reasons[row.draw.number])
+        else:
+            fallbacks.append(made)
+    yield from FlightsEngine().fly(campaign, fallbacks, stopped)

@@ -2,8 +2,8 @@
 
 A lane, or a thread of a device, can follow one schedule to the end of the schedule and evaluate the
 goal, or fly under coordinated control until the outcome is known. A draw that requires more (a
-correction, a joint at a limit, a loss of control) becomes a :class:`.Fallback` for the engine
-``flights``; the resulting rows of the dataset are the same.
+correction, a joint at a limit, a loss of control) is passed on to engine ``flights``;
+the resulting rows of the dataset are the same.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from spacerobot_ros.campaign.one_by_one import (
     nominal_robots,
     plant_robot,
 )
-from spacerobot_ros.campaign.rows import LANES, Fallback, Row
+from spacerobot_ros.campaign.rows import LANES, Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller, controlled_outputs
 from spacerobot_ros.control.goals import decided_message
@@ -174,7 +174,7 @@ class LanesEngine:
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Fallback]:
+    ) -> Iterator[Row | Draw]:
         """Fly draws in batches."""
         lanes: _ScheduledLanes | _ControlledLanes = self._controlled
         if "planner" in campaign.scenario.commanders:
@@ -191,8 +191,8 @@ class LanesEngine:
             except Exception as error:  # The error is reported as a row.
                 yield Row.of_error(draw, error, self.name)
                 continue
-            if isinstance(ready, Fallback):
-                yield ready
+            if isinstance(ready, str):
+                yield replace(draw, fallback=ready)
                 continue
             batch.append(ready)
             ticks += 0 if ready.planned is None else ready.schedule.ticks
@@ -210,7 +210,7 @@ class LanesEngine:
         lanes: _ScheduledLanes | _ControlledLanes,
         batch: Sequence[_PreparedDraw],
         stopped: Callable[[], bool],
-    ) -> Iterator[Row | Fallback]:
+    ) -> Iterator[Row | Draw]:
         began, interrupted = time.perf_counter(), False
 
         def look() -> bool:
@@ -225,14 +225,14 @@ class LanesEngine:
                 return
         # The error concerns one draw, so each draw is flown separately.
         except SpaceRobotError as error:
-            yield from (Fallback(each.draw, str(error)) for each in batch)
+            yield from (replace(each.draw, fallback=str(error)) for each in batch)
             return
         taken = (time.perf_counter() - began) / len(batch)
         flown: list[tuple[Draw, Measures]] = []
         each_measures = lanes.measures(campaign, result, batch, flights)
         for ready, measures in zip(batch, each_measures, strict=True):
             if isinstance(measures, str):
-                yield Fallback(ready.draw, measures)
+                yield replace(ready.draw, fallback=measures)
             else:
                 wall_time = taken + ready.plan_time
                 flown.append((ready.draw, replace(measures, wall_time=wall_time)))
@@ -266,13 +266,14 @@ class _ScheduledLanes:
 
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
-    ) -> _PreparedDraw | Fallback:
+    ) -> _PreparedDraw | str:
+        """Plan for the first state of a draw; return the reason for a fallback if that fails."""
         began = time.perf_counter()
         schedule, goal = self._plans.schedule(flight), flight.scenario.goal
         if schedule is None:
-            return Fallback(draw, "had no schedule in its first state")
+            return "had no schedule in its first state"
         if schedule.controls & (POSE - goal.asked):
-            return Fallback(draw, "maintains a part of the pose that its goal does not specify")
+            return "maintains a part of the pose that its goal does not specify"
         return _PreparedDraw(draw, flight, schedule, time.perf_counter() - began)
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
@@ -404,14 +405,14 @@ class _ControlledLanes:
 
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
-    ) -> _PreparedDraw | Fallback:
+    ) -> _PreparedDraw | str:
         """Check that a draw can be flown in a batch, because an error would also end the other
         flights of the batch."""
         ready = _PreparedDraw(draw, flight)
         try:
             self.flights(campaign, [ready])
         except SpaceRobotError as error:
-            return Fallback(draw, str(error))
+            return str(error)
         return ready
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:

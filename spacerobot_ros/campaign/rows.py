@@ -43,9 +43,6 @@ class Row:
         Whether the goal was reached and all criteria were met.
     engine
         Name of the engine used.
-    fallback
-        Reason why engine ``flights`` was used instead of the campaign's engine; empty if the
-        campaign's engine was used.
     wall_time, plan_time
         Wall time of the flight, and wall time of its planning, s.
     """
@@ -56,7 +53,6 @@ class Row:
     metrics: Mapping[str, float] = field(default_factory=dict)
     passed: bool = False
     engine: str = ""
-    fallback: str = ""
     wall_time: float = math.nan
     plan_time: float = math.nan
 
@@ -101,18 +97,6 @@ class Row:
         return cls(draw, ERROR, reason, engine=engine)
 
 
-@dataclass(frozen=True)
-class Fallback:
-    """A draw that an engine passes on to engine ``flights``.
-
-    ``reason`` completes "the flight ..." (for example "needed corrections"), or is an error
-    message.
-    """
-
-    draw: Draw
-    reason: str
-
-
 class Engine(Protocol):
     """Flies campaign draws; batches of fewer than ``efficient_flights`` draws take as long as
     batches of that size."""
@@ -125,5 +109,6 @@ class Engine(Protocol):
 
     def fly(
         self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Fallback]:
-        """Yield a row or a fallback for each draw, until stopped."""
+    ) -> Iterator[Row | Draw]:
+        """Yield a row for each draw, or the draw with a reason why it is a fallback, until
+        stopped."""

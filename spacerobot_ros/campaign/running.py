@@ -110,10 +110,11 @@ def run_campaign(
     wanted = campaign.engine if engine == "auto" else engine
     chosen = select_engine(campaign, wanted, local=not scheduler)
     with ExitStack() as opened:
-        opened_workers = None
-        if scheduler and len(dataset.flown_numbers()) < len(draws):
+        crew = None
+        left = len(set(range(len(draws))) - dataset.flown_numbers())
+        if (workers or scheduler) and left:
             # Before the folder is created, so that a missing scheduler leaves no folder behind.
-            opened_workers = opened.enter_context(open_workers(len(draws), workers, scheduler))
+            crew = opened.enter_context(open_workers(left, workers, scheduler))
         done = dataset.begin(campaign)
         numbers = [number for number in range(len(draws)) if number not in done]
         began, before = time.monotonic(), len(draws) - len(numbers)
@@ -125,9 +126,7 @@ def run_campaign(
 
         flown = 0
         try:
-            if workers and not scheduler and numbers:
-                opened_workers = opened.enter_context(open_workers(len(numbers), workers))
-            for batch in _fly_rows(campaign, draws, numbers, chosen.name, opened_workers, stopped):
+            for batch in _fly_rows(campaign, draws, numbers, chosen.name, crew, stopped):
                 dataset.add(batch)
                 flown += len(batch)
                 show(progress(flown))

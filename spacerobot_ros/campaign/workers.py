@@ -23,7 +23,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -35,7 +35,7 @@ from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all
-from spacerobot_ros.campaign.rows import FLIGHTS, Fallback, Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.termination import end_with_parent
@@ -55,7 +55,7 @@ _NO_WORKER_WARNING_DELAY = 5.0
 
 _THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
-_Task = Future[list[Row | Fallback]]
+_Task = Future[list[Row | Draw]]
 
 KILLED = "killed"
 """Outcome of a flight during which a worker died twice."""
@@ -82,7 +82,7 @@ def this_code() -> str:
 
 def fly_task(
     packed: bytes, code: str, draws: list[Draw], engine: str, include_fallbacks: bool
-) -> list[Row | Fallback]:
+) -> list[Row | Draw]:
     """Fly some draws: a worker task.
 
     Parameters
@@ -161,7 +161,7 @@ class LocalWorkers:
                 self._pool = self._make_pool()
                 return self._pool.submit(fly_task, *arguments)
 
-    def result(self, task: _Task) -> list[Row | Fallback]:
+    def result(self, task: _Task) -> list[Row | Draw]:
         """Return the result of a finished task, or raise its exception."""
         try:
             return task.result()
@@ -244,7 +244,7 @@ class DaskWorkers:
         """Queue a task; the arguments are those of :func:`fly_task`."""
         return self._executor.submit(fly_task, *arguments)
 
-    def result(self, task: _Task) -> list[Row | Fallback]:
+    def result(self, task: _Task) -> list[Row | Draw]:
         """Return the result of a finished task.
 
         Raises
@@ -369,8 +369,9 @@ class TaskDistributor:
         }
         """Number of flights per task, by engine."""
         self._fallbacks: deque[int] = deque()
-        """Draws that the engine passes on to engine ``flights``."""
-        self._reasons: dict[int, str] = {}
+        """Numbers of draws that wait for engine ``flights``."""
+        self._passed_on: dict[int, Draw] = {}
+        """Draws that the engine has passed on to engine ``flights``, by number."""
         self._running: dict[_Task, _SubmittedTask] = {}
         self._retry_alone: deque[int] = deque()
         """Draws in tasks whose worker has died."""
@@ -409,7 +410,8 @@ class TaskDistributor:
             self._submit_task([queue.popleft() for _ in range(count)], engine)
 
     def _submit_task(self, numbers: list[int], engine: str, *, alone: bool = False) -> None:
-        draws = [self._draws[number] for number in numbers]
+        passed_on = self._passed_on
+        draws = [passed_on[n] if n in passed_on else self._draws[n] for n in numbers]
         task = self._workers.submit(self._packed, this_code(), draws, engine, alone)
         self._running[task] = _SubmittedTask(numbers, engine, alone)
 
@@ -421,21 +423,16 @@ class TaskDistributor:
         except WorkerDeath:
             return self._on_worker_death(task)
         rows = [each for each in made if isinstance(each, Row)]
-        passed_on = [each for each in made if isinstance(each, Fallback)]
-        self._fallbacks += [each.draw.number for each in passed_on]
-        self._reasons |= {each.draw.number: each.reason for each in passed_on}
+        passed_on = {each.number: each for each in made if isinstance(each, Draw)}
+        self._passed_on |= passed_on
+        self._fallbacks += passed_on
         if not task.runs_alone and rows:
             took = sum(row.wall_time for row in rows if not math.isnan(row.wall_time))
             if took > 0:
                 size = 0.5 * self._sizes[task.engine] + 0.5 * len(rows) * TARGET_TASK_TIME / took
                 least = engine_by_name(task.engine).efficient_flights
                 self._sizes[task.engine] = max(least, min(_MAX_TASK_FLIGHTS, size))
-        return [
-            replace(row, fallback=self._reasons[number])
-            if (number := row.draw.number) in self._reasons
-            else row
-            for row in rows
-        ]
+        return rows
 
     def _on_worker_death(self, task: _SubmittedTask) -> list[Row]:
         """Repeat the flights of a task one at a time; return the row of a flight that was alone."""

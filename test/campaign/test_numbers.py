@@ -315,9 +315,7 @@ def test_a_stored_flight_has_its_metrics(tmp_path: Path) -> None:
     dataset.begin(MADE)
     draws = Draws(MADE)
     metrics = {"position_error_m": 0.25, "duration_s": 3.0}
-    dataset.add(
-        [Row(draws[n], "reached", ".", metrics, True, "lanes", "", 1.0, 2.0) for n in (2, 4)]
-    )
+    dataset.add([Row(draws[n], "reached", ".", metrics, True, "lanes", 1.0, 2.0) for n in (2, 4)])
     dataset.close()
     assert running.stored_flight(dataset, 3) is None
     assert running.stored_flight(dataset, 4) == ("reached", "lanes", metrics)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -64,7 +65,8 @@ def filled(
             outcome, reason = "refused", "Too far."
         ok = passes_criteria(made.criteria, outcome, metrics)
         left = "needed corrections" if draw.number % 50 == 0 else ""
-        rows.append(Row(draw, outcome, reason, metrics, ok, "lanes", left, 0.01, 0.0))
+        draw = replace(draw, fallback=left)
+        rows.append(Row(draw, outcome, reason, metrics, ok, "lanes", 0.01, 0.0))
     dataset.add(rows)
     dataset.close()
     return folder

@@ -6,6 +6,7 @@ import multiprocessing
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, wait
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign.dataset import Dataset
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.rows import Fallback, Row
+from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.campaign.workers import (
     TaskDistributor,
@@ -36,6 +37,7 @@ class Queue:
     def __init__(self, count: int, tasks_per_worker: int) -> None:
         self._count, self.tasks_per_worker = count, tasks_per_worker
         self.open: list[tuple[list[int], str, bool]] = []
+        self.draws: list[list[Draw]] = []
         self.tasks: list[Future[Any]] = []
 
     def count(self) -> int:
@@ -46,6 +48,7 @@ class Queue:
     ) -> Future[Any]:
         assert version == this_code()
         self.open.append(([draw.number for draw in draws], engine, alone))
+        self.draws.append(draws)
         self.tasks.append(Future())
         return self.tasks[-1]
 
@@ -117,13 +120,14 @@ def test_fallbacks_go_before_what_waits_and_keep_their_reasons() -> None:
     next(found)
     assert queue.open == [(list(range(64)), "lanes", False)]
     flown = [Row(draws[n], "reached", ".", engine="lanes", wall_time=0.25) for n in range(62)]
-    queue.answer(0, [*flown, *(Fallback(draws[n], f"reason {n}") for n in (62, 63))])
+    left = [replace(draws[n], fallback=f"reason {n}") for n in (62, 63)]
+    queue.answer(0, [*flown, *left])
     assert next(found) == flown
     next(found)
     assert queue.open[1:] == [([62, 63], "flights", False)]
-    rows = [Row(draws[n], "failed", ".", engine="flights", wall_time=0.5) for n in (62, 63)]
+    rows = [Row(draw, "failed", ".", engine="flights", wall_time=0.5) for draw in queue.draws[1]]
     queue.answer(1, rows)
-    assert [(row.draw.number, row.fallback) for row in next(found)] == [
+    assert [(row.draw.number, row.draw.fallback) for row in next(found)] == [
         (62, "reason 62"),
         (63, "reason 63"),
     ]
