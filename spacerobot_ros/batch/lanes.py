@@ -133,6 +133,9 @@ class LaneBlock:
     ) -> None:
         self._flights, self._tick, self._model, self._flown = flights, tick, model, rows
         self._result, self._target, self._rows = result, tick.target, tick.memory_layout
+        program, self._controller = flights.program, None
+        if tick.controller is not None and isinstance(program, ControlledGoals):
+            self._controller = BatchController(program, tick.controller)
         self._lanes = len(rows) if tick.target.threads else tick.target.lanes
         self._groups = -(-len(rows) // self._lanes)
         surplus = np.repeat(rows[-1:], self._groups * self._lanes - len(rows))
@@ -202,7 +205,7 @@ class LaneBlock:
         self._write_rows("state", np.concatenate(parts, axis=1), lanes)
 
     def _write_errors_and_gains(self) -> None:
-        at, errors, controller = self._flown, self._flights.sensors, self._tick.controller
+        at, errors, controller = self._flown, self._flights.sensors, self._controller
         if errors is not None:
             self._write_rows("joint_bias", errors.joint_bias[at])
             self._write_rows("joint_noise", errors.noise[at, 4:5])
@@ -281,13 +284,13 @@ class LaneBlock:
             if not begin:
                 self._begin_control()
             self._fly_until(min(begin + _CHUNK_TICKS, flights.ticks))
-        if self._tick.controller is not None:
+        if self._controller is not None:
             library.end_flights(job)
         self._write_results()
 
     def _fly_until(self, tick: int) -> None:
         self._tick.library.fly_until(self._job, tick)
-        while self._tick.controller is not None and self._pending.any():
+        while self._controller is not None and self._pending.any():
             self._command_outside_lanes()
             self._tick.library.fly_until(self._job, tick)
         self._note_failures()
@@ -298,7 +301,7 @@ class LaneBlock:
         self._ended[lane] = tick
 
     def _begin_control(self) -> None:
-        controller = self._tick.controller
+        controller = self._controller
         if controller is None:
             return
         self._tick.library.measure_starts(self._job)
@@ -325,7 +328,7 @@ class LaneBlock:
         self._memory[:, self._rows["failure"]] = 0.0
 
     def _command_outside_lanes(self) -> None:
-        controller, each = self._tick.controller, 1 if self._target.threads else self._lanes
+        controller, each = self._controller, 1 if self._target.threads else self._lanes
         assert controller is not None
         of_loops = np.arange(len(self._flown)) // each
         waiting = self._target.to_numpy(self._pending)[of_loops] != 0
@@ -361,8 +364,8 @@ class LaneBlock:
         first = "effort" if self._flights.actuation == "effort" else "rate"
         result.limited_ticks[first][rows] = limits[:, :n]
         result.limited_ticks["stroke"][rows] = limits[:, n:]
-        if self._tick.controller is not None:
-            self._write_decisions(self._tick.controller)
+        if self._controller is not None:
+            self._write_decisions(self._controller)
         self._measure()
 
     def _measure(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import ControlledGoals, Flights
 from spacerobot_ros.batch.targets import Target
+from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.goal_monitor import Decision
 from spacerobot_ros.model.compilation import compilation_settings
 from spacerobot_ros.model.description import Array
@@ -115,7 +116,7 @@ class CompiledTick:
     """Memory layout of a group."""
     report_width: int
     """Number of values in a report."""
-    controller: BatchController | None = None
+    controller: CoordinatedController | None = None
     """Source of the commands; None: tables."""
 
     @classmethod
@@ -145,9 +146,6 @@ class CompiledTick:
         if key not in model.derived:
             model.derived[key] = cls._compile(flights, model, target, link)
         compiled: CompiledTick = model.derived[key]
-        if compiled.controller is not None and isinstance(program, ControlledGoals):
-            controller = BatchController(program, compiled.controller.controller)
-            return replace(compiled, controller=controller)
         return compiled
 
     @classmethod
@@ -176,8 +174,8 @@ class CompiledTick:
             functions[kind] = ca.Function(name, inputs, chosen, [*names.inputs, "p"], [*results])
         controller = None
         if isinstance(flights.program, ControlledGoals):
-            controller = BatchController.of(flights)
-            functions["CONTROL"] = controller.function()
+            in_lanes = BatchController.of(flights)
+            controller, functions["CONTROL"] = in_lanes.controller, in_lanes.function()
         sizes: dict[str, int] = {}
         for each in functions.values():
             sizes |= {name: each.nnz_in(i) for i, name in enumerate(each.name_in())}

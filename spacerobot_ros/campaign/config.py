@@ -42,8 +42,8 @@ _CAMPAIGN_KEYS = (
     *("criteria", "metrics", "engine", "description"),
 )
 _MAX_FLIGHTS = 10_000_000
-ENGINES = ("auto", "lanes", "flights")
-"""Names of engines that can fly a campaign, besides devices."""
+ENGINES = ("auto", "lanes", "flights", "cuda")
+"""Names of engines that can fly a campaign, besides other devices."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ def parse_campaign(
 def require_engine(name: str) -> None:
     """Raise ParameterError if there is no engine with a name."""
     if not is_device_name(name):
-        _require_known("engine", name, (*ENGINES, "cuda"))
+        _require_known("engine", name, ENGINES)
 
 
 def _require_known(kind: str, name: Any, known: Sequence[str]) -> None:

@@ -143,7 +143,7 @@ class Draws:
             )
         base = 2 ** int(np.log2(base))
         problem = sobol_problem(self._campaign.names)
-        sample = import_salib("sample.sobol").sample
+        sample = require_module("SALib.sample.sobol").sample
         seed = int(np.random.SeedSequence(self._campaign.seed).generate_state(1)[0] >> 1)
         return np.asarray(sample(problem, base, calc_second_order=False, seed=seed))
 
@@ -219,11 +219,6 @@ def _with_values(campaign: Campaign, draw: Draw, flight: DrawnFlight) -> DrawnFl
 def require_module(module: str) -> Any:
     """Return a module from the extra ``campaign``; see :func:`.optional_module`."""
     return optional_module(module, "campaign", "Campaigns need")
-
-
-def import_salib(module: str) -> Any:
-    """Return a SALib module; see :func:`require_module`."""
-    return require_module(f"SALib.{module}")
 
 
 def sobol_problem(names: Sequence[str]) -> dict[str, Any]:

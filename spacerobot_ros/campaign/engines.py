@@ -7,16 +7,19 @@ from functools import cache
 from importlib.util import find_spec
 
 from spacerobot_ros.batch.targets import device_named
-from spacerobot_ros.campaign.config import ENGINES, Campaign
+from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.campaign.rows import FLIGHTS, Engine, Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 _FLIGHTS_WORTH_A_DEVICE = 100_000
 """Minimum number of flights under coordinated control for which a device saves more time than its
 program takes to compile; other campaigns spend most of their time planning."""
+
+
+Engine = LanesEngine | FlightsEngine
 
 
 def select_engine(campaign: Campaign, engine_name: str, *, local: bool = True) -> Engine:
@@ -30,7 +33,7 @@ def select_engine(campaign: Campaign, engine_name: str, *, local: bool = True) -
     """
     reasons, names = [], [engine_name]
     if engine_name == "auto":
-        names = [*["cuda"] * (local and _is_worth_a_device(campaign)), *ENGINES[1:]]
+        names = [*["cuda"] * (local and _is_worth_a_device(campaign)), "lanes", FLIGHTS]
     for name in names:
         engine = engine_by_name(name)
         reason = engine.refusal(campaign)

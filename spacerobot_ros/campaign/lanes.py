@@ -35,7 +35,7 @@ from spacerobot_ros.campaign.one_by_one import (
     nominal_robots,
     plant_robot,
 )
-from spacerobot_ros.campaign.rows import LANES, Row
+from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller, controlled_outputs
 from spacerobot_ros.control.goals import decided_message
@@ -136,10 +136,11 @@ class LanesEngine:
         ``lanes``, or the name of a device; see :func:`.device_named`.
     """
 
-    def __init__(self, name: str = LANES) -> None:
+    def __init__(self, name: str = "lanes") -> None:
         self.name = name
-        self._target = vector_unit() if name == LANES else device_named(name)
+        self._target = vector_unit() if name == "lanes" else device_named(name)
         self.efficient_flights = _DEVICE_FLIGHTS if self._target.threads else 64
+        """Smaller batches of draws take as long as one of this size."""
         self._scheduled, self._controlled = _ScheduledLanes(), _ControlledLanes()
 
     def refusal(self, campaign: Campaign) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from spacerobot_ros.campaign.config import Campaign
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
-from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.rows import FLIGHTS, Row
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.flight import Flight
@@ -30,7 +30,7 @@ from spacerobot_ros.scenario import Scenario
 class FlightsEngine:
     """Engine that flies draws one by one; an invalid draw does not affect the other draws."""
 
-    name = "flights"
+    name = FLIGHTS
     efficient_flights = 1
 
     def refusal(self, campaign: Campaign) -> str:

@@ -1,11 +1,11 @@
-"""Campaign rows, one per draw, and the engines that fly draws."""
+"""Campaign rows, one per draw."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
 from spacerobot_ros.campaign.draws import Draw
@@ -16,9 +16,6 @@ from spacerobot_ros.measures import Measures, metrics_of_each
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.flight import Flight
-
-LANES = "lanes"
-"""Name of the engine that flies many draws at once in SIMD lanes."""
 
 FLIGHTS = "flights"
 """Name of the engine that flies draws one by one, the fallback for other engines."""
@@ -95,20 +92,3 @@ class Row:
         if not isinstance(error, SpaceRobotError):
             reason = f"{type(error).__name__}: {' '.join(reason.split())}"
         return cls(draw, ERROR, reason, engine=engine)
-
-
-class Engine(Protocol):
-    """Flies campaign draws; batches of fewer than ``efficient_flights`` draws take as long as
-    batches of that size."""
-
-    name: str
-    efficient_flights: int
-
-    def refusal(self, campaign: Campaign) -> str:
-        """Return the reason why this engine cannot fly a campaign, as a clause; empty if it can."""
-
-    def fly(
-        self, campaign: Campaign, draws: Iterable[Draw], stopped: Callable[[], bool]
-    ) -> Iterator[Row | Draw]:
-        """Yield a row for each draw, or the draw with a reason why it is a fallback, until
-        stopped."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.campaign.draws import import_salib, sobol_problem
+from spacerobot_ros.campaign.draws import require_module, sobol_problem
 from spacerobot_ros.model.description import Array
 
 Flags = npt.NDArray[np.bool_]
@@ -237,7 +237,9 @@ def sobol_indices(
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
     problem = sobol_problem(names)
-    result = import_salib("analyze.sobol").analyze(problem, values, calc_second_order=False, seed=1)
+    result = require_module("SALib.analyze.sobol").analyze(
+        problem, values, calc_second_order=False, seed=1
+    )
     keys = ("S1", "S1_conf", "ST", "ST_conf")
     columns = zip(*(np.asarray(result[key]).tolist() for key in keys), strict=True)
     return {name: (a, b, c, d) for name, (a, b, c, d) in zip(names, columns, strict=True)}

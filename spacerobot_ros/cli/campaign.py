@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from spacerobot_ros.campaign.running import Progress
 
 
-_ENGINES = ("auto", "lanes", "flights", "cuda")
-
-
 def _checked_engine(context: click.Context, parameter: click.Parameter, name: str) -> str:
     from spacerobot_ros.campaign.config import require_engine
 
@@ -33,6 +30,12 @@ def _checked_engine(context: click.Context, parameter: click.Parameter, name: st
     except ParameterError as refusal:
         raise click.BadParameter(str(refusal)) from refusal
     return name
+
+
+def _complete_engine(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
+    from spacerobot_ros.campaign.config import ENGINES
+
+    return [name for name in ENGINES if name.startswith(incomplete)]
 
 
 class _CampaignGroup(click.Group):
@@ -65,9 +68,7 @@ def campaign_command() -> None:
     show_default=True,
     metavar="NAME",
     callback=_checked_engine,
-    shell_complete=lambda _context, _parameter, begun: [
-        name for name in _ENGINES if name.startswith(begun)
-    ],
+    shell_complete=_complete_engine,
     help="Flight engine: auto, lanes, flights or cuda (cuda:1, cuda:single; see the docs).",
 )
 @click.option(

@@ -112,18 +112,17 @@ def run_command(
         by_nodes = nodes or realtime is not None
         result = run_scenario(chosen, path, shown.fly, nodes=by_nodes, longest=longest)
     path = Path(result.summary["bag"])
-    if result.summary["state"] == "refused" and not result.summary["ticks"]:
-        if bag is None and report is None:
-            # No one has requested a recording of a robot that did not move.
-            path.unlink(missing_ok=True)
-            result.summary["bag"] = None
-        if json_file is not None:
-            write_json(json_file, result.summary)
+    refused = result.summary["state"] == "refused" and not result.summary["ticks"]
+    if refused and bag is None and report is None:
+        # No one has requested a recording of a robot that did not move.
+        path.unlink(missing_ok=True)
+        result.summary["bag"] = None
+    if json_file is not None:
+        write_json(json_file, result.summary)
+    if refused:
         if report is not None:
             _write_report(path, report)
         fail(result.message)
-    if json_file is not None:
-        write_json(json_file, result.summary)
     verdict, *lines = _summary_lines(result.summary)
     published = _published_lines(chosen, result.summary)
     for line in (verdict, *_fault_lines(chosen), *lines, *published):
