@@ -43,21 +43,13 @@ _PARAMETERS_EQUAL_IN_ALL_FLIGHTS = (
 
 _POSE_TARGET_NAMES = ("goal", "end_effector_goal", "initial")
 
-TARGET_KINDS = (
-    ("NODE.PARAMETER", "a node parameter; with [i] or [JOINT] appended, one element of a list"),
-    ("mass, mass.BODY, mass.*", "factor on mass and inertia of all bodies, of one body or of each"),
-    ("inertia, inertia.BODY, inertia.*", "factor on the inertia, in the same way"),
-    ("com.BODY.AXIS, com.*", "offset of a centre of mass in its body frame, m"),
-    ("target.mass, target.inertia", "factor on the target's mass and inertia, or its inertia only"),
-    ("target.com.AXIS", "offset of the target's centre of mass in its root link frame, m"),
-    ("goal.position.AXIS, goal.rotvec.AXIS", "goal offset, m; rotation in the goal frame, rad"),
-    ("end_effector_goal. ...", "the same for the end-effector goal"),
-    ("initial.position.AXIS, initial.rotvec.AXIS", "the same for the initial base pose"),
-    ("initial.joints.JOINT", "offset of an initial joint position, m or rad"),
-    ("faults[i].at, .until, .value, .kind, .target", "component of the i-th fault in plant.faults"),
-    ("faults[i].present", "1 or 0: whether the fault occurs"),
-)  # fmt: skip
-"""Kinds of names, with descriptions for users."""
+_TARGET_NAMES = (
+    "NODE.PARAMETER; mass, mass.BODY, mass.*; inertia, inertia.BODY, inertia.*; com.BODY.AXIS, "
+    "com.*; target.mass, target.inertia; target.com.AXIS; goal.position.AXIS, goal.rotvec.AXIS; "
+    "end_effector_goal. ...; initial.position.AXIS, initial.rotvec.AXIS; initial.joints.JOINT; "
+    "faults[i].at, .until, .value, .kind, .target; faults[i].present"
+)
+"""Kinds of names, for users."""
 
 
 @dataclass(frozen=True)
@@ -245,9 +237,8 @@ def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
     known = [f"{node}.{p.name}" for node in CONFIGS for p in declared(CONFIGS[node])]
     known += ["mass", "inertia", "com", "target.mass", "target.inertia", "target.com.x"]
     known += [*_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
-    kinds = "; ".join(names for names, _ in TARGET_KINDS)
     raise ParameterError(
-        f"'{name}' cannot be dispersed; available: {kinds}.{suggestion(name, known)}"
+        f"'{name}' cannot be dispersed; available: {_TARGET_NAMES}.{suggestion(name, known)}"
     )
 
 

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
 @click.command("run", cls=GoalCommand)
 @click.argument("scenario", metavar="SCENARIO|ROBOT", shell_complete=complete_scenario)
-@end_effector_options
 @goal_options
 @registered_option(
     "--method",

@@ -302,28 +302,21 @@ def _read_path(file: Path) -> list[list[float]]:
 
 
 def goal_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the goal options to a command, as its argument ``goal``."""
+    """Add the options for base and end-effector goals to a command, as its argument ``goal``."""
 
     @wraps(command)
-    def with_goal(
-        *words: Any,
-        goal: Any,
-        position: Any,
-        rotvec: Any,
-        rpy_deg: Any,
-        poses: Any = (),
-        positions: Any = (),
-        links: Any = (),
-        paths: Any = (),
-        **options: Any,
-    ) -> None:
+    def with_goal(*words: Any, goal: Any, position: Any, **options: Any) -> None:
         if goal is not None and position is not None:
             raise click.UsageError("The goal is given twice, as a pose and as a position.")
-        hands = end_effector_goals(poses, positions, links, paths)
-        command(*words, goal=GoalOptions(goal or position, rotvec, rpy_deg, hands), **options)
+        rotvec, rpy_deg, *hands = (
+            options.pop(name)
+            for name in ("rotvec", "rpy_deg", "poses", "positions", "links", "paths")
+        )
+        chosen = GoalOptions(goal or position, rotvec, rpy_deg, end_effector_goals(*hands))
+        command(*words, goal=chosen, **options)
 
     with_poses = _position_option(_pose_option(_attitude_options("goal-")(with_goal)))
-    return cast("Callable[..., None]", with_poses)
+    return end_effector_options(cast("Callable[..., None]", with_poses))
 
 
 def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:

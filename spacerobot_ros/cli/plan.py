@@ -17,7 +17,6 @@ from spacerobot_ros.cli.options import (
     GoalCommand,
     GoalOptions,
     complete_scenario,
-    end_effector_options,
     goal_options,
     json_option,
     picture_option,
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 
 @click.command("plan", cls=GoalCommand)
 @click.argument("scenario", metavar="SCENARIO|ROBOT", shell_complete=complete_scenario)
-@end_effector_options
 @goal_options
 @registered_option("--method", registries=(METHODS,), help="Gait method [the scenario's].")
 @settings_option
