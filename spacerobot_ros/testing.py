@@ -137,9 +137,7 @@ class Stack:
             "coordinated_control" if controls else "planner",
             self._world,
             lambda: getattr(self.nodes.get("plant"), "time_ns", 0) + self._sent,
-            end_effectors=[each.link for each in goal.end_effectors],
-            paths=goal.links_with_paths,
-            base_path=goal.waypoints is not None,
+            goal,
             name=f"mission_client_{self._sent}",
             context=self.context,
         )

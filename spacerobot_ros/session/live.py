@@ -215,11 +215,9 @@ def send_goal(
                 decider,
                 "",
                 lambda: clocks["own"] or clocks["global"] or time.time_ns(),
+                goal,
                 namespace=namespace,
                 name=f"goal_{decider}",
-                end_effectors=[each.link for each in goal.end_effectors],
-                paths=goal.links_with_paths,
-                base_path=goal.waypoints is not None,
                 # An empty message resets the joint positions that an earlier goal required.
                 joint_names=tuple if decider == "planner" else None,
             )

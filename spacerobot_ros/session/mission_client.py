@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -24,7 +24,6 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.builders import goal_messages
 from spacerobot_ros.messages.statuses import read_status
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.messages import shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.process import spin_until
@@ -32,7 +31,6 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import LATEST_NS, SECOND
-from spacerobot_ros.topics import goal_topic, path_topic
 
 _STATUS_CHECK_PERIOD = 0.2  # wall s
 
@@ -60,10 +58,8 @@ class MissionClient:
     joint_names
         Function that returns the robot joints if this or an earlier goal may require joint
         positions; None if no goal in this stack requires them.
-    end_effectors
-        Links with goals; empty name: the default end-effector.
-    paths
-        The end-effectors whose goals are paths.
+    goal, end_effector
+        Goals of the kinds that will be sent, as for :meth:`send`; they determine the topics.
     name, namespace, context
         Node name, namespace and rclpy context.
     """
@@ -73,11 +69,10 @@ class MissionClient:
         decider: str,
         world_frame: str,
         now: Callable[[], int],
+        goal: Goal,
+        end_effector: Goal | None = None,
         *,
         joint_names: Callable[[], Sequence[str]] | None = None,
-        end_effectors: Sequence[str] = (),
-        paths: Collection[str] = (),
-        base_path: bool = False,
         name: str = "mission_client",
         namespace: str = "",
         context: rclpy.Context | None = None,
@@ -96,11 +91,10 @@ class MissionClient:
         self._joint_names = joint_names
         self._sent = 0
         self._follower = GoalFollower()
-        self.goal_topics = ["goal_path" if base_path else "goal_pose"]
+        base = "goal_pose" if goal.waypoints is None else "goal_path"
+        aims = goal_messages(goal, end_effector, world_frame, 0)
+        self.goal_topics = [base, *(topic for topic in aims if topic != base)]
         """Topics of the goal, that of the base first."""
-        for link in end_effectors:
-            topic_of = path_topic if link in paths else goal_topic
-            self.goal_topics.append(topic_of(link or DEFAULT_END_EFFECTOR))
         self._sends: dict[str, Publisher] = {}
         for topic in self.goal_topics:
             kind = Path if topic.endswith("path") else PoseStamped

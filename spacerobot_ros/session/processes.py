@@ -168,10 +168,9 @@ class MultiProcessStack:
             decider,
             scenario.config(decider).world_frame,
             lambda: self.time_ns,
+            scenario.goal,
+            scenario.end_effector_goal,
             joint_names=None if names is None else lambda: names,
-            end_effectors=scenario.end_effectors,
-            paths=scenario.goal.links_with_paths,
-            base_path=scenario.goal.waypoints is not None,
             namespace=self.namespace,
         )
         node = self.client.node

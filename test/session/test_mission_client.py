@@ -45,8 +45,9 @@ class Mission:
             decider,
             "world",
             lambda: NOW,
+            GOAL,
+            GOAL,
             joint_names=lambda: ("a", "b"),
-            end_effectors=("",),
             context=harness.context,
         )
         harness.add(self.client.node)
@@ -225,7 +226,7 @@ def test_a_goal_waits_for_a_commander_that_is_known_beside_a_viewer(
 
 def test_a_recorder_that_reads_goals_is_no_commander(harness: Harness) -> None:
     """It may be known before the commander: then a goal would be lost without a word."""
-    client = MissionClient("planner", "world", lambda: NOW, context=harness.context)
+    client = MissionClient("planner", "world", lambda: NOW, GOAL, context=harness.context)
     harness.add(client.node)
     recorder = harness.probe({"goal_pose": PoseStamped}, name="recorder")
     commander = harness.probe({}, name="commander")
@@ -252,8 +253,7 @@ def test_a_path_of_an_end_effector_is_sent_on_its_topic(harness: Harness) -> Non
         "planner",
         "world",
         lambda: NOW,
-        end_effectors=("left", "right"),
-        paths=goal.links_with_paths,
+        goal,
         context=harness.context,
     )
     harness.add(client.node)
