@@ -218,15 +218,11 @@ class Scenario:
         return {"scenario": scenario, **parameters}
 
     @property
-    def end_effectors(self) -> tuple[str, ...]:
-        """Links that have goals; an empty name is the default end-effector."""
-        default = () if self.end_effector_goal is None else ("",)
-        return (*default, *(each.link for each in self.goal.end_effectors))
-
-    @property
     def goal_links(self) -> tuple[str, ...]:
-        """Names of the links in :attr:`end_effectors`, as in their topics."""
-        return tuple(link or DEFAULT_END_EFFECTOR for link in self.end_effectors)
+        """Names of the end-effectors that have goals, as in their topics."""
+        default = () if self.end_effector_goal is None else (DEFAULT_END_EFFECTOR,)
+        links = (each.link or DEFAULT_END_EFFECTOR for each in self.goal.end_effectors)
+        return (*default, *links)
 
     def _goal_poses(self) -> dict[str, list[float]]:
         goals = zip(GOAL_KEYS, (self.goal, self.end_effector_goal), strict=True)

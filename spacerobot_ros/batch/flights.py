@@ -275,14 +275,12 @@ class Flights:
         if not self.report_ticks:
             object.__setattr__(self, "report_ticks", (self.ticks,))
         self._require_program()
-        last = -1
-        for instant in self.report_ticks:
-            if not last < instant <= self.ticks:
-                raise ParameterError(
-                    f"The instants {self.report_ticks} are not ascending ticks of a flight of "
-                    f"{self.ticks} ticks."
-                )
-            last = instant
+        limits = (-1, *self.report_ticks, self.ticks + 1)
+        if list(limits) != sorted(set(limits)):
+            raise ParameterError(
+                f"The instants {self.report_ticks} are not ascending ticks of a flight of "
+                f"{self.ticks} ticks."
+            )
         if self.inertial is not None:
             bodies = robot.description.bodies
             if self.inertial.masses.shape != (count, len(bodies)):

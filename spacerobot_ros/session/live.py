@@ -219,7 +219,7 @@ def send_goal(
                 namespace=namespace,
                 name=f"goal_{decider}",
                 # An empty message resets the joint positions that an earlier goal required.
-                joint_names=tuple if decider == "planner" else None,
+                joint_names=() if decider == "planner" else None,
             )
             for decider in ("planner", "coordinated_control")
         ]

@@ -56,8 +56,8 @@ class MissionClient:
     now
         Function that returns the time for goal stamps, ns: simulated time if available.
     joint_names
-        Function that returns the robot joints if this or an earlier goal may require joint
-        positions; None if no goal in this stack requires them.
+        The robot joints if this or an earlier goal may require joint positions; None if no goal in
+        this stack requires them.
     goal, end_effector
         Goals of the kinds that will be sent, as for :meth:`send`; they determine the topics.
     name, namespace, context
@@ -72,7 +72,7 @@ class MissionClient:
         goal: Goal,
         end_effector: Goal | None = None,
         *,
-        joint_names: Callable[[], Sequence[str]] | None = None,
+        joint_names: Sequence[str] | None = None,
         name: str = "mission_client",
         namespace: str = "",
         context: rclpy.Context | None = None,
@@ -183,7 +183,7 @@ class MissionClient:
         self._follower = GoalFollower(GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND)))
         self.message = ""
         if self._joint_names is not None:
-            self._sends[_SHAPE].publish(shape_message(goal, self._joint_names()))
+            self._sends[_SHAPE].publish(shape_message(goal, self._joint_names))
         for topic, aim in goal_messages(goal, end_effector, self._frame, time_ns).items():
             self._sends[topic].publish(aim)
 

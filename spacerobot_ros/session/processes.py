@@ -170,7 +170,7 @@ class MultiProcessStack:
             lambda: self.time_ns,
             scenario.goal,
             scenario.end_effector_goal,
-            joint_names=None if names is None else lambda: names,
+            joint_names=names,
             namespace=self.namespace,
         )
         node = self.client.node

@@ -47,7 +47,7 @@ class Mission:
             lambda: NOW,
             GOAL,
             GOAL,
-            joint_names=lambda: ("a", "b"),
+            joint_names=("a", "b"),
             context=harness.context,
         )
         harness.add(self.client.node)
@@ -352,7 +352,7 @@ def test_another_end_effector_is_heard_by_the_planner_without_being_listed() -> 
     aim = EndEffectorGoal.checked("link_5", [0.4, 0.1, 0.8])
     scenario = load_scenario("reach").with_end_effectors([aim])
     assert scenario.planner.end_effectors == ("link_7", "link_5")
-    assert scenario.end_effectors == ("link_5",)
+    assert scenario.goal_links == ("link_5",)
     # Another goal of the base takes its place.
     assert not scenario.with_goal(rotvec=[0.0, 0.0, 0.1]).goal.end_effectors
 
