@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
@@ -57,33 +58,27 @@ class Row:
     def of(cls, campaign: Campaign, draw: Draw, flight: Flight, engine: str) -> Row:
         """Return a flight's row, including the campaign's user-defined metrics."""
         measures = flight.measured(clearance=campaign.measures_clearance)
-        (row,) = cls.of_each(campaign, [(draw, measures)], engine)
-        if not campaign.own_metrics:
-            return row
-        metrics = {**row.metrics, **own_metrics_of(flight, campaign.own_metrics)}
-        passed = passes_criteria(campaign.criteria, row.outcome, metrics)
-        return replace(row, metrics=metrics, passed=passed)
+        own_metrics = own_metrics_of(flight, campaign.own_metrics)
+        (row,) = cls.of_each(campaign, [(draw, measures)], engine, own_metrics)
+        return row
 
     @classmethod
     def of_each(
-        cls, campaign: Campaign, flown: Sequence[tuple[Draw, Measures]], engine: str
+        cls,
+        campaign: Campaign,
+        flown: Sequence[tuple[Draw, Measures]],
+        engine: str,
+        own_metrics: Mapping[str, float] = MappingProxyType({}),
     ) -> list[Row]:
-        """Return the rows of flights."""
-        robot = description_of(campaign.scenario)
-        found = metrics_of_each([measures for _, measures in flown], robot)
-        return [
-            cls(
-                draw=draw,
-                outcome=measures.outcome.value,
-                reason=measures.message,
-                metrics=metrics,
-                passed=passes_criteria(campaign.criteria, measures.outcome.value, metrics),
-                engine=engine,
-                wall_time=measures.wall_time,
-                plan_time=measures.plan_time,
-            )
-            for (draw, measures), metrics in zip(flown, found, strict=True)
-        ]
+        """Return the rows of flights with the same user-defined metrics."""
+        found = metrics_of_each([each for _, each in flown], description_of(campaign.scenario))
+        rows = []
+        for (draw, measures), metrics in zip(flown, found, strict=True):
+            outcome, metrics = measures.outcome.value, {**metrics, **own_metrics}
+            passed = passes_criteria(campaign.criteria, outcome, metrics)
+            times = measures.wall_time, measures.plan_time
+            rows.append(cls(draw, outcome, measures.message, metrics, passed, engine, *times))
+        return rows
 
     @classmethod
     def of_error(cls, draw: Draw, error: BaseException, engine: str) -> Row:
