@@ -323,12 +323,12 @@ class Flights:
     def command_size(self) -> int:
         """Size of a command: n joint velocities, or n efforts and a wrench (6) on the base: force
         (N), then torque (N m), in the base frame."""
-        return self.robot.n + (6 if PLANTS[self.actuation].wrench else 0)
+        return self.robot.n + (6 if PLANTS[self.actuation].takes_wrench else 0)
 
     @property
     def substeps(self) -> int:
         """Number of Runge-Kutta steps in a tick."""
-        step = self.integration_step or PLANTS[self.actuation].integration_step
+        step = self.integration_step or PLANTS[self.actuation].default_integration_step
         return count_steps(self.control_period, step)
 
     @property
@@ -379,12 +379,11 @@ def plant_of(flights: Flights, row: int) -> Plant:
     SpaceRobotError
         The plant rejects the start state.
     """
-    kind = PLANTS[flights.actuation]
-    return kind.plant(
+    return PLANTS[flights.actuation](
         flights.robot_of(row),
         flights.control_period,
         flights.initial_states.initial_state(row),
-        flights.integration_step or kind.integration_step,
+        flights.integration_step or None,
     )
 
 

@@ -26,7 +26,8 @@ from spacerobot_ros.model.compilation import compilation_settings
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
 from spacerobot_ros.parameters import values_of
-from spacerobot_ros.simulation import effort_plant, velocity_plant
+from spacerobot_ros.simulation import effort_plant
+from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.effort_plant import JointStops
 
 
@@ -154,7 +155,6 @@ class CompiledTick:
     ) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
         names, n = _TICK_VARIABLES[flights.actuation], robot.n
-        make = effort_plant.tick_function if effort else velocity_plant.tick_function
         # Reports need all results except the poses of links.
         reported = [name for name in names.outputs if not name.startswith("link")]
         ticks: dict[str, Sequence[str]] = {
@@ -163,7 +163,9 @@ class CompiledTick:
         }
         functions: dict[str, ca.Function] = {}
         for kind, results in ticks.items():
-            tick = make(robot, Composition(model, ca.MX), flights.substeps)
+            tick = PLANTS[flights.actuation].tick_function(
+                robot, Composition(model, ca.MX), flights.substeps
+            )
             inputs = tick.mx_in()
             outputs = dict(zip(names.outputs, tick.call(inputs, True, False), strict=True))
             if link:

@@ -131,7 +131,7 @@ class Commander(ABC):
         """Goals received before the robot description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
         self.inputs = InputWatch(self.states, self.plant, host.has_publisher, clock)
-        self._reported_missing = self._reported_waiting = ""
+        self._reported_missing = "", ""
         """The missing topics in the last status, as a clause, and the goal that waits; empty:
         none."""
         self._last_status: Status | None = None
@@ -212,7 +212,7 @@ class Commander(ABC):
             The goal file is invalid.
         """
         self.inputs.begin()
-        self._reported_missing = ""
+        self._reported_missing = "", ""
         self._resume_goals(self._goal_file.load())
         self.activity = CommanderActivity.ACTIVE
         self._report_missing()
@@ -448,7 +448,7 @@ class Commander(ABC):
         self.states.put_joints(stamp_ns, joints)
         if not self.config.tick_rate:
             self._follow_rate()
-        if self._reported_missing:
+        if self._reported_missing[0]:
             self.inputs.note_state()
             self._report_missing()
         self.answer()
@@ -489,12 +489,11 @@ class Commander(ABC):
         self.inputs.excuse_suspension()
         missing = self.missing
         goal_id = self._pursued_goal_id if missing else ""
-        known = missing == self._reported_missing and goal_id == self._reported_waiting
-        if known or not self.active:
+        if (missing, goal_id) == self._reported_missing or not self.active:
             return
-        if missing and self._reported_missing and self.inputs.just_begun:
+        if missing and self._reported_missing[0] and self.inputs.just_begun:
             return  # The other messages are on their way.
-        self._reported_missing, self._reported_waiting = missing, goal_id
+        self._reported_missing = missing, goal_id
         if missing:
             goes_on = " The goal is pursued when they arrive." if goal_id else ""
             message = f"Waiting for {missing}.{goes_on}"

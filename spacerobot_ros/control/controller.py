@@ -185,7 +185,7 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        return GoalMotion(start, goal, self._motion, carries, aims.get("waypoints", ()))
+        return GoalMotion(start, goal, carries, aims.get("waypoints", ()))
 
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
@@ -197,11 +197,11 @@ class CoordinatedController:
         assert planner is not None
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
-        start, limits = self.reference_at(time + lead, state), self._motion
+        start = self.reference_at(time + lead, state)
         later = replace(grapple, motion=grapple.motion.later(lead))
 
         def work(cancellation: Cancellation) -> GrappleReference:
-            return planner.plan_grapple(start, state, limits, later, cancellation)
+            return planner.plan_grapple(start, state, later, cancellation)
 
         return PlanningJob(work, time + lead)
 
@@ -236,7 +236,7 @@ class CoordinatedController:
         return motion if self.wheels is None else self.wheels.limits_with_wheels(motion, state.q)
 
     def _begin_motion(self, time: float, state: ControlState, motion: GoalMotion) -> None:
-        start, goal, _, carries, _ = motion
+        start, goal, carries, _ = motion
         limits = self._motion_within_limits(state)
         self.begin(time, self._profile_type(start, goal, limits, carries=carries))
 
@@ -274,7 +274,7 @@ class CoordinatedController:
         profile, self.profile, self.coming_to_rest = self.profile, None, False
         start = self.reference_at(time, state)
         goal, carries = (start, True) if profile is None else (profile.goal, profile.carries)
-        self._begin_motion(time, state, GoalMotion(start, goal, self._motion, carries))
+        self._begin_motion(time, state, GoalMotion(start, goal, carries))
 
     def hold_here(self, time: float, state: ControlState) -> None:
         """Hold the measured pose and shape; the previous reference is dropped."""
@@ -348,7 +348,7 @@ class CoordinatedController:
         else:
             if self.profile is None:
                 here = self.reference_at(time, state)
-                self.begin(time, StepReference(here, here, self._motion, carries=True))
+                self.begin(time, StepReference(here, here, carries=True))
             # The law is always evaluated, for its errors and status.
             self.law.time = time
             with self._failures_of_law(time):

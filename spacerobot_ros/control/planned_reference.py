@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple, TypedDict
 import numpy as np
 
 from spacerobot_ros.collision import BasePoses
-from spacerobot_ros.control.limits import ActuatorLimits, MotionLimits
+from spacerobot_ros.control.limits import ActuatorLimits
 from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.control.reference import ReferenceProfile
 from spacerobot_ros.control.state import (
@@ -43,7 +43,7 @@ class PlannedReference(ReferenceProfile):
 
     Parameters
     ----------
-    start, goal, limits, carries
+    start, goal, carries
         See :class:`.ReferenceProfile`.
     *legs
         The plan: motions one after the other, all but the last to a waypoint.
@@ -55,11 +55,10 @@ class PlannedReference(ReferenceProfile):
         self,
         start: Reference,
         goal: Reference,
-        limits: MotionLimits,
         *legs: ThrustMotion,
         carries: bool = False,
     ) -> None:
-        super().__init__(start, goal, limits, carries=carries)
+        super().__init__(start, goal, carries=carries)
         self._legs = legs
         self._ends = np.cumsum([leg.duration for leg in legs]).tolist()
         """Times since the start at which the legs end, s."""
@@ -145,7 +144,7 @@ class GrappleReference(PlannedReference):
 
     Parameters
     ----------
-    start, limits, motion
+    start, motion
         See :class:`PlannedReference`.
     grapple
         The target; its motion starts at the same time as the plan.
@@ -153,13 +152,11 @@ class GrappleReference(PlannedReference):
 
     name: ClassVar[str] = "grapple"
 
-    def __init__(
-        self, start: Reference, limits: MotionLimits, motion: ThrustMotion, grapple: Grapple
-    ) -> None:
+    def __init__(self, start: Reference, motion: ThrustMotion, grapple: Grapple) -> None:
         end = motion.at(motion.duration)
         joints = None if start.joints is None else JointReference.at_rest(end.q)
         base, hand = PoseReference(*end.base), PoseReference(*end.end_effector)
-        super().__init__(start, Reference(base, hand, joints), limits, motion)
+        super().__init__(start, Reference(base, hand, joints), motion)
         self.motion, self.grapple = motion, grapple
         frame = grapple.motion.grapple([motion.duration])
         beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 6))
@@ -192,13 +189,12 @@ class Aims(TypedDict, total=False):
 
 
 class GoalMotion(NamedTuple):
-    """Start and goal of a motion, and its limits; ``carries``: whether the arm keeps its shape;
-    ``waypoints``: base poses (7,) on the way.
+    """Start and goal of a motion; ``carries``: whether the arm keeps its shape; ``waypoints``: base
+    poses (7,) on the way.
     """
 
     start: Reference
     goal: Reference
-    limits: MotionLimits
     carries: bool
     waypoints: tuple[Array, ...] = ()
 
@@ -272,7 +268,7 @@ class ReferencePlanner:
         PlanningError
             No motion is found.
         """
-        start, goal, limits, carries, waypoints = motion
+        start, goal, carries, waypoints = motion
         assert goal.base is not None
         begin = self._begin(start, state)
         q, hand, shape = begin.q, None, None
@@ -296,13 +292,12 @@ class ReferencePlanner:
                 name = f"waypoint {len(legs) + 1}" if end is not ends[-1] else "the last pose"
                 raise PlanningError(f"On the way to {name}: {error}") from error
             begin = RobotMotion.at_rest(end.base, q)
-        return PlannedReference(start, goal, limits, *legs, carries=carries)
+        return PlannedReference(start, goal, *legs, carries=carries)
 
     def plan_grapple(
         self,
         start: Reference,
         state: ControlState,
-        limits: MotionLimits,
         grapple: Grapple,
         cancellation: Cancellation,
     ) -> GrappleReference:
@@ -314,7 +309,7 @@ class ReferencePlanner:
             No motion is found.
         """
         motion = self._planner.plan(self._begin(start, state), grapple, cancellation)
-        return GrappleReference(start, limits, motion, grapple)
+        return GrappleReference(start, motion, grapple)
 
     def _begin(self, start: Reference, state: ControlState) -> RobotMotion:
         """Return where a plan from a reference begins."""

@@ -41,8 +41,6 @@ class ReferenceProfile(ABC):
         Current poses and joint positions; velocities are ignored.
     goal
         Desired poses and joint positions; missing groups are not controlled.
-    limits
-        Largest speeds and accelerations.
     carries
         Whether the end-effector has no goal and moves with the base, so that the arm keeps its
         shape.
@@ -50,13 +48,8 @@ class ReferenceProfile(ABC):
 
     name: ClassVar[str]
 
-    def __init__(
-        self, start: Reference, goal: Reference, limits: MotionLimits, *, carries: bool = False
-    ) -> None:
-        self.start = start
-        self.goal = goal
-        self.limits = limits
-        self.carries = carries
+    def __init__(self, start: Reference, goal: Reference, *, carries: bool = False) -> None:
+        self.start, self.goal, self.carries = start, goal, carries
         self.duration = 0.0
         """Time after which the reference equals the goal, s."""
 
@@ -88,9 +81,19 @@ class ReferenceProfile(ABC):
 
 
 class StepReference(ReferenceProfile):
-    """Step to the goal, as in paper 4, section V."""
+    """Step to the goal, as in paper 4, section V; it has no limits."""
 
     name: ClassVar[str] = "step"
+
+    def __init__(
+        self,
+        start: Reference,
+        goal: Reference,
+        limits: MotionLimits | None = None,
+        *,
+        carries: bool = False,
+    ) -> None:
+        super().__init__(start, goal, carries=carries)
 
     def at(self, time: float) -> Reference:
         """Return the goal."""
@@ -111,7 +114,7 @@ class QuinticReference(ReferenceProfile):
     def __init__(
         self, start: Reference, goal: Reference, limits: MotionLimits, *, carries: bool = False
     ) -> None:
-        super().__init__(start, goal, limits, carries=carries)
+        super().__init__(start, goal, carries=carries)
         self._base, self._end_effector = self.lines()
         self._joints = np.zeros(0)
         if goal.joints is not None and start.joints is not None:
@@ -240,11 +243,11 @@ class HeldVelocityReference:
         )
 
 
-PROFILES: dict[str, type[ReferenceProfile]] = {
+PROFILES: dict[str, type[StepReference | QuinticReference]] = {
     StepReference.name: StepReference,
     QuinticReference.name: QuinticReference,
 }
-"""The profiles by name."""
+"""The profiles by name; their arguments are start, goal and limits."""
 
 
 class _PoseInterpolation:

@@ -7,18 +7,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, ParameterError
-from spacerobot_ros.model import SpaceRobot, integration
+from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
-from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.capture import CapturePlant, Target, load_target
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.effort_plant import EffortPlant
@@ -359,29 +357,8 @@ class PlantWithFaults(WrappedPlant):
         return realised
 
 
-@dataclass(frozen=True)
-class PlantKind:
-    """Plant class for an actuation mode.
-
-    Attributes
-    ----------
-    plant
-        The plant class, whose arguments are the robot, control period (s), initial state and
-        integration step (s).
-    integration_step
-        Default maximum Runge-Kutta step, s.
-    wrench
-        Whether the plant accepts a wrench on its base.
-    """
-
-    plant: Callable[..., Plant]
-    integration_step: float
-    wrench: bool
-
-
-PLANTS: dict[str, PlantKind] = {
-    "velocity": PlantKind(VelocityPlant, integration.DEFAULT_INTEGRATION_STEP, wrench=False),
-    "effort": PlantKind(EffortPlant, effort_plant.DEFAULT_INTEGRATION_STEP, wrench=True),
+PLANTS: dict[str, type[VelocityPlant | EffortPlant]] = {
+    each.actuation: each for each in (VelocityPlant, EffortPlant)
 }
 """Plant classes by the value of parameter ``actuation``."""
 
@@ -418,7 +395,7 @@ def build_plant(
             f"Parameter 'integration_step' is {step}; it must be 0 (automatic) or at least "
             f"{_MIN_STEP:g} s."
         )
-    if config.thrusters and not kind.wrench:
+    if config.thrusters and not kind.takes_wrench:
         raise ParameterError(
             f"Parameter 'thrusters' is '{config.thrusters}', but actuation "
             f"'{config.actuation}' has no base wrench: set actuation to effort, or "
@@ -447,10 +424,10 @@ def build_plant(
         else:
             plant = mujoco_plant.MujocoCapturePlant(robot, start, step, description, config)
     else:
-        step = step or kind.integration_step
+        step = step or kind.default_integration_step
 
         def dynamics(of: SpaceRobot, at: InitialState) -> Plant:
-            return kind.plant(of, control_period, at, step)
+            return kind(of, control_period, at, step)
 
         if description is None:
             plant = dynamics(robot, start)
@@ -464,7 +441,7 @@ def build_plant(
         plant,
         config.faults,
         control_period,
-        wrench=kind.wrench,
+        wrench=kind.takes_wrench,
         seed=config.sensors.seed,
         disturbances=config.disturbances,
         surroundings=surroundings,

@@ -24,10 +24,13 @@ A locked joint (by a brake or a jam) is brought to rest by the same kind of impu
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import override
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
@@ -37,7 +40,7 @@ from spacerobot_ros.model.external_loads import LoadLayout
 from spacerobot_ros.model.integration import repeat_step
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.loads import PlantLoads
-from spacerobot_ros.simulation.plant import CompiledPlant, Flags, InitialState, body_outputs
+from spacerobot_ros.simulation.plant import CompiledPlant, Flags, body_outputs
 
 BISECTIONS = 40
 """Number of bisection steps for the arrival time: the error is 1e-12 of an integration step."""
@@ -239,48 +242,28 @@ class EffortPlant(CompiledPlant):
         (6,) force (N) and torque (N m) of the last tick at the base link origin, in base
         components.
 
-    Parameters
-    ----------
-    robot
-        The model; efforts are clipped to the limits in its description.
-    control_period
-        Duration of a tick, s.
-    initial
-        Initial state.
-    integration_step
-        Maximum Runge-Kutta step within a tick, s.
-
-    Raises
-    ------
-    ParameterError
-        The initial configuration has the wrong length or violates joint limits, or a value is
-        invalid.
+    See :class:`.CompiledPlant` for the parameters and errors of the constructor.
     """
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        control_period: float,
-        initial: InitialState | None = None,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-    ) -> None:
-        limits = "effort", "stroke"
-        super().__init__(
-            "effort", tick_function, limits, robot, control_period, initial, integration_step
-        )
-        n = robot.n
-        self._stops = JointStops(robot, control_period / self._substeps)
+    actuation: ClassVar[str] = "effort"
+    default_integration_step: ClassVar[float] = DEFAULT_INTEGRATION_STEP
+    takes_wrench: ClassVar[bool] = True
+    limits: ClassVar[tuple[str, str]] = "effort", "stroke"
+
+    @override
+    def _bind(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+        robot, n = self.robot, self.robot.n
+        self._stops = JointStops(robot, self.control_period / self._substeps)
         self._loads: PlantLoads | None = None
-        self._state, self._command, self._h = self._advance.inputs
-        self._next_state, self.pose, self.twist, self._realised = self._advance.outputs[:4]
-        self.momentum, self.link_R, self.link_r, self._limited = self._advance.outputs[4:]
+        self._state, self._command, self._h = inputs
+        self._next_state, self.pose, self.twist, self._realised = outputs[:4]
+        self.momentum, self.link_R, self.link_r, self._limited = outputs[4:]
         shape, _, rates, p_W, L_W, _ = state_slices(n)
         self.q, self.qdot = self._next_state[shape], self._next_state[rates]
         self.expected_momenta = self._next_state[p_W.start : L_W.stop]
         self.effort, self.wrench = self._realised[:n], self._realised[n:]
         self._held = np.zeros(n, dtype=np.bool_)
         self._holding = False
-        self.reset()
 
     def reset(self) -> None:
         """Return to the initial state, with zero efforts; the limit counters are kept."""
@@ -369,47 +352,48 @@ class EffortPlant(CompiledPlant):
         self.limit_counts["stroke"] += stopped
         return bool(clipped.any() or stopped.any())
 
+    @staticmethod
+    @override
+    def tick_function(
+        robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
+    ) -> ca.Function:
+        """Compose the tick from model functions; see :class:`EffortPlant` for its results.
 
-def tick_function(
-    robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
-) -> ca.Function:
-    """Compose the tick from model functions; see :class:`EffortPlant` for its results.
+        If ``loaded`` is set, the external load vector is the last input.
+        """
+        n = robot.n
+        parts = state_slices(n)
+        state, command = ca.MX.sym("state", parts[-1].stop), ca.MX.sym("command", n + 6)
+        h = ca.MX.sym("h")
+        lowest, highest = _effort_bounds(robot, state[parts[2]])
+        effort = ca.fmin(ca.fmax(command[:n], lowest), highest)
+        realised = ca.vertcat(effort, command[n:])
+        march = repeat_step(_step_counting_stops(robot, model, loaded=loaded), substeps)
+        p, touching = list(model.inputs.values()), _count_touching_joints(robot, state)
+        layout = LoadLayout(len(robot.link_names))
+        loads = [ca.MX.sym("loads", layout.size)] if loaded else []
+        x = ca.vertcat(state, *(each[layout.time] for each in loads), touching)
+        marched = march(x, ca.vertcat(realised, *loads), h / substeps, *p)
+        next_state = marched[: parts[-1].stop]
 
-    If ``loaded`` is set, the external load vector is the last input.
-    """
-    n = robot.n
-    parts = state_slices(n)
-    state, command = ca.MX.sym("state", parts[-1].stop), ca.MX.sym("command", n + 6)
-    h = ca.MX.sym("h")
-    lowest, highest = _effort_bounds(robot, state[parts[2]])
-    effort = ca.fmin(ca.fmax(command[:n], lowest), highest)
-    realised = ca.vertcat(effort, command[n:])
-    march = repeat_step(_step_counting_stops(robot, model, loaded=loaded), substeps)
-    p, touching = list(model.inputs.values()), _count_touching_joints(robot, state)
-    layout = LoadLayout(len(robot.link_names))
-    loads = [ca.MX.sym("loads", layout.size)] if loaded else []
-    x = ca.vertcat(state, *(each[layout.time] for each in loads), touching)
-    marched = march(x, ca.vertcat(realised, *loads), h / substeps, *p)
-    next_state = marched[: parts[-1].stop]
-
-    q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
-    pose, twist, bodies = body_outputs(model, q, quaternion, qdot, (p_W, L_W), r_WC_W)
-    clipped = command[:n] != effort
-    # A comparison with NaN is false.
-    diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _MAX_FINITE_STATE)
-    touched = marched[-1] + diverged
-    return model.function(
-        f"loaded_effort_tick_{substeps}" if loaded else f"effort_tick_{substeps}",
-        [state, command, h, *loads],
-        [
-            next_state,
-            pose,
-            twist,
-            realised,
-            *bodies,
-            ca.densify(ca.vertcat(ca.sum1(clipped) + touched, clipped, touched)),
-        ],
-    )
+        q, quaternion, qdot, p_W, L_W, r_WC_W = (next_state[part] for part in parts)
+        pose, twist, bodies = body_outputs(model, q, quaternion, qdot, (p_W, L_W), r_WC_W)
+        clipped = command[:n] != effort
+        # A comparison with NaN is false.
+        diverged = parts[-1].stop - ca.sum1(ca.fabs(next_state) < _MAX_FINITE_STATE)
+        touched = marched[-1] + diverged
+        return model.function(
+            f"loaded_effort_tick_{substeps}" if loaded else f"effort_tick_{substeps}",
+            [state, command, h, *loads],
+            [
+                next_state,
+                pose,
+                twist,
+                realised,
+                *bodies,
+                ca.densify(ca.vertcat(ca.sum1(clipped) + touched, clipped, touched)),
+            ],
+        )
 
 
 def _effort_bounds(robot: SpaceRobot, qdot: ca.MX) -> tuple[ca.MX | Array, ca.MX | Array]:

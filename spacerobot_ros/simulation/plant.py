@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import casadi as ca
 import numpy as np
@@ -102,40 +103,78 @@ class WrappedPlant:
         self.plant.reset()
 
 
-class CompiledPlant:
+class CompiledPlant(ABC):
     """Base class of plants that compute each tick by one compiled function.
 
-    ``tick(robot, model, substeps, loaded=...)`` composes this function; with loads, their vector is
-    its last input. ``kind`` names the plant in the names of functions, ``limits`` are the kinds of
-    limits that it counts; for the other parameters, see the subclasses.
+    Parameters
+    ----------
+    robot
+        The model.
+    control_period
+        Duration of a tick, s.
+    initial
+        Initial state.
+    integration_step
+        Maximum Runge-Kutta step within a tick, s; None: the default of the plant.
+
+    Raises
+    ------
+    ParameterError
+        The initial configuration has the wrong length or violates joint limits, or a value is
+        invalid.
     """
+
+    actuation: ClassVar[str]
+    """Value of the parameter ``actuation`` that selects the plant."""
+    default_integration_step: ClassVar[float]
+    """Default maximum Runge-Kutta step, s."""
+    takes_wrench: ClassVar[bool]
+    """Whether a step accepts a wrench on the base."""
+    limits: ClassVar[tuple[str, str]]
+    """Kinds of limits that the plant counts."""
 
     _h: Array
     """Input of the tick: its duration, s."""
 
     def __init__(
         self,
-        kind: str,
-        tick: Callable[..., ca.Function],
-        limits: tuple[str, str],
         robot: SpaceRobot,
         control_period: float,
-        initial: InitialState | None,
-        integration_step: float,
+        initial: InitialState | None = None,
+        integration_step: float | None = None,
     ) -> None:
-        substeps = count_steps(control_period, integration_step)
-        self.robot, self.control_period, self._substeps = robot, control_period, substeps
+        step = self.default_integration_step if integration_step is None else integration_step
+        self.robot, self.control_period = robot, control_period
         self.initial = initial or InitialState()
-
-        def composed(prefix: str = "") -> BufferedFunction:
-            return robot.composed(
-                f"{prefix}{kind}_tick_{substeps}",
-                lambda model: tick(robot, model, substeps, loaded=bool(prefix)),
-            )
-
-        self._advance, self._composed = composed(), composed
+        self._substeps = count_steps(control_period, step)
+        self._advance = self._composed()
         self._tick: BufferedFunction | LoadedTick = self._advance
-        self.limit_counts = {each: np.zeros(robot.n, dtype=np.int64) for each in limits}
+        self.limit_counts = {each: np.zeros(robot.n, dtype=np.int64) for each in self.limits}
+        self._bind(self._advance.inputs, self._advance.outputs)
+        self.reset()
+
+    @staticmethod
+    @abstractmethod
+    def tick_function(
+        robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
+    ) -> ca.Function:
+        """Compose the tick from model functions; with ``loaded``, the external load vector is the
+        last input."""
+
+    @abstractmethod
+    def _bind(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
+        """Name the inputs and outputs of the tick."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Return to the initial state; the limit counts are kept."""
+
+    def _composed(self, prefix: str = "") -> BufferedFunction:
+        robot, substeps = self.robot, self._substeps
+        return robot.composed(
+            f"{prefix}{self.actuation}_tick_{substeps}",
+            lambda model: self.tick_function(robot, model, substeps, loaded=bool(prefix)),
+        )
 
     def _use_loads(self, loads: PlantLoads, *further: Array) -> None:
         """Apply loads from now on; ``further`` are arrays for additional outputs of the tick."""

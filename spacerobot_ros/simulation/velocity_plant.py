@@ -7,8 +7,12 @@ external loads, they are states that change with the impulses.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import ClassVar
+
 import casadi as ca
 import numpy as np
+from typing_extensions import override
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
@@ -17,7 +21,7 @@ from spacerobot_ros.model.external_loads import LoadLayout
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.loads import PlantLoads
-from spacerobot_ros.simulation.plant import CompiledPlant, Flags, InitialState, body_outputs
+from spacerobot_ros.simulation.plant import CompiledPlant, Flags, body_outputs
 
 _ROUNDING = 1e-9
 """Largest excess over a limit that is attributed to rounding: a fraction of a rate, and a motion in
@@ -32,44 +36,24 @@ class VelocityPlant(CompiledPlant):
     velocity is the mean of the velocities before and during the tick; the acceleration is their
     difference divided by the tick length. Effort limits do not apply to servos.
 
-    Parameters
-    ----------
-    robot
-        The model.
-    control_period
-        Duration of a tick, s.
-    initial
-        Initial state.
-    integration_step
-        Maximum Runge-Kutta step of the attitude within a tick, s.
-
-    Raises
-    ------
-    ParameterError
-        The initial configuration has the wrong length or violates joint limits, the joints are
-        moving, or a value is invalid.
+    See :class:`.CompiledPlant` for the parameters and errors of the constructor; the initial joint
+    velocities must be zero.
     """
 
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        control_period: float,
-        initial: InitialState | None = None,
-        integration_step: float = DEFAULT_INTEGRATION_STEP,
-    ) -> None:
-        limits = "rate", "stroke"
-        super().__init__(
-            "velocity", tick_function, limits, robot, control_period, initial, integration_step
-        )
-        inputs, outputs = self._advance.inputs, self._advance.outputs
+    actuation: ClassVar[str] = "velocity"
+    default_integration_step: ClassVar[float] = DEFAULT_INTEGRATION_STEP
+    takes_wrench: ClassVar[bool] = False
+    limits: ClassVar[tuple[str, str]] = "rate", "stroke"
+
+    @override
+    def _bind(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
         self._state, self._command, self._before = inputs[:3]
         self.expected_momenta, self._r_cm, self._h = inputs[3:]
         self._next_state, self.pose, self.twist, self.qdot = outputs[:4]
         self.effort, self.momentum, self.link_R, self.link_r = outputs[4:8]
         self._limited, self._next_r_cm = outputs[8:]
-        self.q = self._next_state[: robot.n]
+        self.q = self._next_state[: self.robot.n]
         self._held: Flags | None = None
-        self.reset()
 
     def reset(self) -> None:
         """Return to the initial state, at rest; the limit counters are kept."""
@@ -114,64 +98,68 @@ class VelocityPlant(CompiledPlant):
         self.limit_counts["stroke"] += by_stroke
         return True
 
+    @staticmethod
+    @override
+    def tick_function(
+        robot: SpaceRobot,
+        model: Composition,
+        substeps: int,
+        *,
+        loaded: bool = False,
+    ) -> ca.Function:
+        """Compose the tick from model functions; see :class:`VelocityPlant` for its results.
 
-def tick_function(
-    robot: SpaceRobot,
-    model: Composition,
-    substeps: int,
-    *,
-    loaded: bool = False,
-) -> ca.Function:
-    """Compose the tick from model functions; see :class:`VelocityPlant` for its results.
+        With ``loaded``, the external load vector is the last input, and the momenta after the tick
+        are the last output. The model has a parameter argument ``p``.
+        """
+        n = robot.n
+        state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
+        before = ca.MX.sym("before", n)
+        momenta, r_cm, h = ca.MX.sym("momenta", 6), ca.MX.sym("r_cm", 3), ca.MX.sym("h")
+        p_W, L_W = momenta[:3], momenta[3:]
 
-    With ``loaded``, the external load vector is the last input, and the momenta after the tick
-    are the last output. The model has a parameter argument ``p``.
-    """
-    n = robot.n
-    state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
-    before = ca.MX.sym("before", n)
-    momenta, r_cm, h = ca.MX.sym("momenta", 6), ca.MX.sym("r_cm", 3), ca.MX.sym("h")
-    p_W, L_W = momenta[:3], momenta[3:]
-
-    rate = ca.fmin(ca.fmax(command, -robot.velocity_limit), robot.velocity_limit)
-    q = state[:n]
-    # A tick of zero duration computes outputs only, and must not divide by zero.
-    duration = ca.fmax(h, 1e-12)
-    to_lower, to_upper = (ca.DM(robot.lower) - q) / duration, (ca.DM(robot.upper) - q) / duration
-    qdot = ca.fmin(ca.fmax(rate, to_lower), to_upper)
-    by_rate = ca.fabs(command - rate) > _ROUNDING * ca.DM(robot.velocity_limit)
-    by_stroke = ca.fabs(rate - qdot) * duration > _ROUNDING
-    limited = ca.vertcat(ca.sum1(by_rate) + ca.sum1(by_stroke), by_rate, by_stroke)
-
-    loads: list[ca.MX] = []
-    if loaded:
-        layout = LoadLayout(len(robot.link_names))
-        loads = [ca.MX.sym("loads", layout.size)]
-        effort = model(
-            "loaded_servo_efforts", state[n:], q, before, qdot, L_W, duration, r_cm, *loads
+        rate = ca.fmin(ca.fmax(command, -robot.velocity_limit), robot.velocity_limit)
+        q = state[:n]
+        # A tick of zero duration computes outputs only, and must not divide by zero.
+        duration = ca.fmax(h, 1e-12)
+        to_lower, to_upper = (
+            (ca.DM(robot.lower) - q) / duration,
+            (ca.DM(robot.upper) - q) / duration,
         )
-        x = ca.vertcat(state, momenta, r_cm, loads[0][layout.time])
-        x_next = model(f"loaded_velocity_step:{substeps}", x, qdot, *loads, h)
-        next_state, r_cm_next = x_next[: n + 4], x_next[n + 10 : n + 13]
-        p_W, L_W = x_next[n + 4 : n + 7], x_next[n + 7 : n + 10]
-    else:
-        effort = model("servo_efforts", state[n:], q, before, qdot, L_W, duration)
-        next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
-        r_cm_next = r_cm + p_W * (h / model.total_mass)
-    q_next, quaternion = next_state[:n], next_state[n:]
-    pose, twist, bodies = body_outputs(model, q_next, quaternion, qdot, (p_W, L_W), r_cm_next)
-    return model.function(
-        f"loaded_velocity_tick_{substeps}" if loaded else f"velocity_tick_{substeps}",
-        [state, command, before, momenta, r_cm, h, *loads],
-        [
-            next_state,
-            pose,
-            twist,
-            qdot,
-            effort,
-            *bodies,
-            ca.densify(limited),
-            r_cm_next,
-            *([ca.vertcat(p_W, L_W)] if loaded else []),
-        ],
-    )
+        qdot = ca.fmin(ca.fmax(rate, to_lower), to_upper)
+        by_rate = ca.fabs(command - rate) > _ROUNDING * ca.DM(robot.velocity_limit)
+        by_stroke = ca.fabs(rate - qdot) * duration > _ROUNDING
+        limited = ca.vertcat(ca.sum1(by_rate) + ca.sum1(by_stroke), by_rate, by_stroke)
+
+        loads: list[ca.MX] = []
+        if loaded:
+            layout = LoadLayout(len(robot.link_names))
+            loads = [ca.MX.sym("loads", layout.size)]
+            effort = model(
+                "loaded_servo_efforts", state[n:], q, before, qdot, L_W, duration, r_cm, *loads
+            )
+            x = ca.vertcat(state, momenta, r_cm, loads[0][layout.time])
+            x_next = model(f"loaded_velocity_step:{substeps}", x, qdot, *loads, h)
+            next_state, r_cm_next = x_next[: n + 4], x_next[n + 10 : n + 13]
+            p_W, L_W = x_next[n + 4 : n + 7], x_next[n + 7 : n + 10]
+        else:
+            effort = model("servo_efforts", state[n:], q, before, qdot, L_W, duration)
+            next_state = model(f"velocity_step:{substeps}", state, qdot, L_W, h)
+            r_cm_next = r_cm + p_W * (h / model.total_mass)
+        q_next, quaternion = next_state[:n], next_state[n:]
+        pose, twist, bodies = body_outputs(model, q_next, quaternion, qdot, (p_W, L_W), r_cm_next)
+        return model.function(
+            f"loaded_velocity_tick_{substeps}" if loaded else f"velocity_tick_{substeps}",
+            [state, command, before, momenta, r_cm, h, *loads],
+            [
+                next_state,
+                pose,
+                twist,
+                qdot,
+                effort,
+                *bodies,
+                ca.densify(limited),
+                r_cm_next,
+                *([ca.vertcat(p_W, L_W)] if loaded else []),
+            ],
+        )

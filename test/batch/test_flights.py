@@ -323,10 +323,9 @@ class OnePlant:
         self.plants: list[Plant] = []
 
     def make(self, starts: InitialStates, masses: InertialParameters, row: int) -> Plant:
-        kind = PLANTS[self.kind]
         robot = self.robot.with_inertial(masses[row])
         initial = starts.initial_state(row)
-        return kind.plant(robot, self.period, initial, kind.integration_step)
+        return PLANTS[self.kind](robot, self.period, initial)
 
     def step(self, commands: np.ndarray, ticks: int) -> None:
         n = self.robot.n

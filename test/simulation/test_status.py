@@ -323,7 +323,7 @@ def test_an_initial_state_takes_the_place_of_that_of_the_configuration() -> None
 
 
 def test_thrusters_need_a_plant_that_takes_a_wrench() -> None:
-    assert {name: kind.wrench for name, kind in PLANTS.items()} == {
+    assert {name: kind.takes_wrench for name, kind in PLANTS.items()} == {
         "velocity": False,
         "effort": True,
     }
