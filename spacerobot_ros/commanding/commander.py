@@ -281,7 +281,10 @@ class Commander(ABC):
             self._refuse_goal(str(error), goal_id)
             return
         self._fly_to.begin(goal_id, client, request)
-        tolerance = request.tolerance_or(self._default_tolerance())
+        config = self.config
+        position = config.position_tolerance or DEFAULT_POSITION_TOLERANCE
+        default = Tolerance(position, config.attitude_tolerance, config.joint_tolerance)
+        tolerance = request.tolerance_or(default)
         accepted = IdentifiedGoal(
             request.goal, goal_id, tolerance, resumes=False, required=request.tolerance
         )
@@ -357,11 +360,6 @@ class Commander(ABC):
             pursued |= {each.goal_id for each in outputs if isinstance(each, Status)}
         return pursued
 
-    def _watch_fly_to(self) -> None:
-        self._fly_to.advance(self.stamps.now_ns, self._progress)
-        self._abort_fly_to()
-        self._fly_to.end_dropped_goals(self._active_goal_ids())
-
     def _abort_fly_to(self) -> None:
         """Abort all goals if the client or the time limit of one of them requires it."""
         waiting = {goal.goal_id for goal in self._waiting_goals.values()}
@@ -405,12 +403,6 @@ class Commander(ABC):
         except CommandError:
             return None
 
-    def _default_tolerance(self) -> Tolerance:
-        """Return the tolerance of goals that do not specify their own."""
-        config = self.config
-        position = config.position_tolerance or DEFAULT_POSITION_TOLERANCE
-        return Tolerance(position, config.attitude_tolerance, config.joint_tolerance)
-
     # -- states -------------------------------------------------------------------------------
 
     def receive_odom(self, stamp_ns: int, odom: Any) -> None:
@@ -424,7 +416,9 @@ class Commander(ABC):
         odoms, waiting = self.host.waiting_states()
         self._take_states(odoms, [Stamped(stamp_ns, joints), *waiting])
         if self._fly_to:
-            self._watch_fly_to()
+            self._fly_to.advance(self.stamps.now_ns, self._progress)
+            self._abort_fly_to()
+            self._fly_to.end_dropped_goals(self._active_goal_ids())
         self.inputs.note_state()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:

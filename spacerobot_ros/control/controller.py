@@ -115,7 +115,7 @@ class CoordinatedController:
     ) -> None:
         self.law, self.wheels, self.planner = law, wheels, planner
         self._distances = law.outputs.selection.distances
-        self._limits, self._motion = limits, config.motion
+        self.limits, self._motion = limits, config.motion
         rates = config.joint_rates * law.robot.velocity_limit
         self.joint_rate_limits = JointRateLimits(law.robot, rates, config.control_period)
         self._profile_type = PROFILES.get(config.profile, QuinticReference)
@@ -125,7 +125,8 @@ class CoordinatedController:
         self.profile: ReferenceProfile | None = None
         """Profile of the current goals; None before the first state."""
         self._began = 0.0
-        self._followed = Reference()
+        self.followed = Reference()
+        """External references; groups without one follow the profile."""
         self._sent: Actuation | None = None
         self._commanded_at = -math.inf
         """Time of the last command, s."""
@@ -141,7 +142,7 @@ class CoordinatedController:
     def reset(self) -> None:
         """Discard goals and measurements; the next state is treated as the first."""
         self.law.reset_integral()
-        self.profile, self._followed = None, Reference()
+        self.profile, self.followed = None, Reference()
         self.coming_to_rest = False
         self._sent = self._estimator = self._stopped_at = None
         self.mode = Mode.MEASURED
@@ -151,7 +152,7 @@ class CoordinatedController:
     def take_over_goals(self, other: CoordinatedController) -> None:
         """Pursue another controller's goals from now on."""
         self.profile, self._began = other.profile, other._began
-        self._followed, self.coming_to_rest = other._followed, other.coming_to_rest
+        self.followed, self.coming_to_rest = other.followed, other.coming_to_rest
 
     def set_gains(self, gains: Gains) -> None:
         """Change the gains from the next command on."""
@@ -232,7 +233,7 @@ class CoordinatedController:
             )
 
     def _motion_within_limits(self, state: ControlState) -> MotionLimits:
-        motion = self._motion.within_thruster_limits(self._limits, self.law.robot, state.q)
+        motion = self._motion.within_thruster_limits(self.limits, self.law.robot, state.q)
         return motion if self.wheels is None else self.wheels.limits_with_wheels(motion, state.q)
 
     def _begin_motion(self, time: float, state: ControlState, motion: GoalMotion) -> None:
@@ -295,10 +296,10 @@ class CoordinatedController:
         ``payload`` is the body that the robot holds, ``torque_limit`` the largest grasp torque, N
         m; 0: no limit.
         """
-        torque, wheels = self._limits.torque, self.wheels
+        torque, wheels = self.limits.torque, self.wheels
         if wheels is not None:
             torque += wheels.torque_about_every_axis
-        force, period = self._limits.force, self._control_period
+        force, period = self.limits.force, self._control_period
         return Detumbling(self.law.robot, payload, force, torque, torque_limit, period)
 
     def reference_at(self, time: float, state: ControlState) -> Reference:
@@ -316,18 +317,8 @@ class CoordinatedController:
     def follow(self, reference: Reference) -> None:
         """Track an external reference at the next command; output groups without an external
         reference follow the profile."""
-        self._followed = reference
+        self.followed = reference
         self.coming_to_rest = False
-
-    @property
-    def followed_end_effector(self) -> PoseReference | None:
-        """External end-effector reference; None: the profile's."""
-        return self._followed.end_effector
-
-    @property
-    def has_thrusters(self) -> bool:
-        """Whether a force can act on the base."""
-        return self._limits.force > 0.0
 
     def command(
         self, time: float, measured: ControlState | None, q: Array, qdot: Array
@@ -373,7 +364,7 @@ class CoordinatedController:
             if self.law.integrates and not self.coming_to_rest:
                 self.law.integrate_error(periods * self._control_period, limited=result.limited)
         else:
-            result = self._limits.apply(commanded)
+            result = self.limits.apply(commanded)
             if self.wheels is not None:
                 self.wheels.coast()
         self._sent = result.realised
@@ -392,7 +383,7 @@ class CoordinatedController:
         the actual thrusters, which may exceed them.
         """
         given = self._realised(commanded, around_B)
-        kept = self.joint_rate_limits.apply(state, given, self._limits.effort, periods)
+        kept = self.joint_rate_limits.apply(state, given, self.limits.effort, periods)
         if self.wheels is not None and kept is not given:
             # The wrench is lowered if joints are too fast.
             kept = self._realised(kept, around_B)
@@ -407,11 +398,11 @@ class CoordinatedController:
             return correction._replace(wrench_B=correction.wrench_B + around_B)
         wheels = self.wheels
         if wheels is None:
-            return self._limits.apply(wanted).realised
+            return self.limits.apply(wanted).realised
         torque = wheels.command_torque(wanted.wrench_B[3:])
         rest = wanted.wrench_B.copy()
         rest[3:] -= torque
-        limited = self._limits.apply(Actuation(rest, wanted.tau)).realised
+        limited = self.limits.apply(Actuation(rest, wanted.tau)).realised
         wheels.thrust = limited.wrench_B
         return Actuation(wanted.wrench_B - (rest - limited.wrench_B), limited.tau)
 
@@ -421,7 +412,7 @@ class CoordinatedController:
         """Return the part of ``[f; n; tau]`` (6 + n,) within the actuator limits, and whether joint
         rate limits lower it further; if so, call :meth:`apply_limits`.
         """
-        realised = self._limits.expression(actuation)
+        realised = self.limits.expression(actuation)
         return realised, self.joint_rate_limits.exceeds_limits_expression(omega, q, qdot, realised)
 
     @property
@@ -433,10 +424,6 @@ class CoordinatedController:
     def time_since_measurement(self) -> float:
         """Time since the last base measurement, s."""
         return self._estimator.elapsed if self._estimator is not None else 0.0
-
-    def reference_moves(self, time: float) -> bool:
-        """Whether the reference is still moving at ``time`` (s)."""
-        return self.profile is not None and not self.reference_at_rest(time)
 
     def time_until_blocked(self, time: float) -> float:
         """Return the time, s, for which the planned reference stays clear of obstacles from
@@ -508,7 +495,7 @@ class CoordinatedController:
 
     def _followed_reference(self, time: float) -> Reference:
         assert self.profile is not None
-        own, given = self.profile.at(time - self._began), self._followed
+        own, given = self.profile.at(time - self._began), self.followed
         if given.base is None and given.joints is None and given.end_effector is None:
             return own
         return Reference(

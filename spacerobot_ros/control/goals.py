@@ -507,7 +507,7 @@ class GoalPlanning:
         planner = controller.planner
         assert planner is not None
         seen, begins = state.copied(), -math.inf
-        if controller.reference_moves(time):
+        if controller.profile is not None and not controller.reference_at_rest(time):
             begins = time + self._lead * planner.in_background
         motion = controller.motion_to(max(begins, time), seen, **aims)
 

@@ -242,7 +242,7 @@ class OutputVector:
         )
         self._R_WB = matrix_from_quaternion(self._quaternion)
 
-        J_base = self._link_jacobian(robot.base_link)
+        J_base = self.model(f"jacobian:{robot.base_link}", self.q)
         self.v_cm = v - J_base[:3, 3:6] @ self.omega - J_base[:3, 6:] @ self.qdot
         self.z0dot = ca.vertcat(self.v_cm, self.omega, self.qdot)
         self.J_q_inverse = ca.SX.eye(self.N)
@@ -309,8 +309,8 @@ class OutputVector:
         require_finite("reference", memory)
 
     def without_force(self, Q: ca.SX) -> ca.SX:
-        """Return generalised forces (N,); the force on the centre of mass is zero if no actuator
-        can exert it.
+        """Return generalised forces or velocities (N,); those of the centre of mass are zero if no
+        actuator can exert a force on it.
         """
         return Q if self.thrust else ca.vertcat(ca.SX.zeros(3), Q[3:])
 
@@ -327,9 +327,6 @@ class OutputVector:
 
     # -- groups -------------------------------------------------------------------------------
 
-    def _link_jacobian(self, link: str) -> ca.SX:
-        return self.model(f"jacobian:{link}", self.q)
-
     def _pose_group(
         self, J_B: ca.SX, position: ca.SX, quaternion: ca.SX, target: ca.SX
     ) -> _OutputGroup:
@@ -342,7 +339,7 @@ class OutputVector:
         z0dot = ca.SX.sym("z0dot", self.N)
         twist_rate = ca.jtimes(J_B @ z0dot, self.q, self.qdot)
         # A centre of mass without thrust adds no acceleration.
-        moving = self.z0dot if self.thrust else ca.vertcat(ca.SX.zeros(3), self.z0dot[3:])
+        moving = self.without_force(self.z0dot)
         twist_rate = ca.substitute(twist_rate, z0dot, moving)
         twist_B = J_B @ moving
         bias = [
@@ -365,7 +362,8 @@ class OutputVector:
         position = r_WB + self._R_WB @ r_BL[:, self.robot.link_names.index(link)]
         attitude = link_quaternion(self.robot.description, link, self.q)
         quaternion = quaternion_multiply(self._quaternion, attitude)
-        return self._pose_group(self._link_jacobian(link), position, quaternion, target)
+        J_B = self.model(f"jacobian:{link}", self.q)
+        return self._pose_group(J_B, position, quaternion, target)
 
     def _joint_group(self, target: ca.SX) -> _OutputGroup:
         n = self.robot.n

@@ -366,7 +366,7 @@ class ApproachTask:
     ) -> None:
         law, options, described = controller.law, self.config.target, self.target.description
         outputs, clearance = law.outputs.selection, None
-        held = controller.followed_end_effector
+        held = controller.followed.end_effector
         held = held or controller.reference_at(time, state).end_effector
         assert held is not None
         if described is not None and options.clearance:
@@ -430,7 +430,8 @@ class DetumblingTask:
         ]
         self._fastest = max(rates)
         speed = float(np.linalg.norm(self._law.velocity(state)))
-        if self._fastest > options.rate or (controller.has_thrusters and speed > options.speed):
+        pushed = controller.limits.force > 0.0
+        if self._fastest > options.rate or (pushed and speed > options.speed):
             self._at_rest_since = None
         elif self._at_rest_since is None:
             self._at_rest_since = time

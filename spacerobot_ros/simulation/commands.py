@@ -240,7 +240,13 @@ class CommandValidator:
         unset = False
         if self._lockstep:
             if stamp_ns != now_ns or source.arrived:
-                return self._refuse(source, _not_this_tick_clause(stamp_ns, now_ns), now_ns)
+                early = stamp_ns > now_ns
+                clause = (
+                    f"it is {'ahead of time' if early else 'stale'}: stamped "
+                    f"{stamp_ns / SECOND:.9g} s, while the plant is at {now_ns / SECOND:.9g} s"
+                )
+                reason = Reason.EARLY if early else Reason.STALE
+                return self._refuse(source, Refusal(reason, clause), now_ns)
             refusal = self._refusal_of_values(source, values)
         else:
             if not stamp_ns and (
@@ -404,15 +410,6 @@ class CommandValidator:
         clause = f"a command on '{source.topic}' was refused: {refusal.clause}"
         self.latch(refusal.reason.value, clause, now_ns)
         return Refusal(refusal.reason, refusal.clause, latches=True)
-
-
-def _not_this_tick_clause(stamp_ns: int, now_ns: int) -> Refusal:
-    early = stamp_ns > now_ns
-    return Refusal(
-        Reason.EARLY if early else Reason.STALE,
-        f"it is {'ahead of time' if early else 'stale'}: stamped {stamp_ns / SECOND:.9g} s, while "
-        f"the plant is at {now_ns / SECOND:.9g} s",
-    )
 
 
 def _parse_latching_reasons(words: str) -> frozenset[Reason]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -279,10 +278,18 @@ class ReportedState:
         self._plant = plant
         self.sensors = Sensors(plant, config.sensors, config.control_period)
         robot, count = plant.robot, len(plant.robot.link_names)
-        link = _end_effector_index(robot, config.end_effector_frame)
-        self._end_effector = None if link is None else LinkPlacement(count, [(link, Pose())])
-        self._end_effectors = config.end_effectors
-        named = [(index, Pose()) for index in _link_indices(robot, config.end_effectors)]
+        link = robot.description.end_effector(config.end_effector_frame)
+        self._end_effector: LinkPlacement | None = None
+        if link:
+            index = _link_index(robot, link, "'end_effector_frame' is")
+            self._end_effector = LinkPlacement(count, [(index, Pose())])
+        names = self._end_effectors = config.end_effectors
+        named = [(_link_index(robot, name, "'end_effectors' names"), Pose()) for name in names]
+        if len({pose_topic(name).name for name in names}) < len(names):
+            raise ParameterError(
+                "Parameter 'end_effectors' names links that share the topic NAME/pose: "
+                f"{', '.join(names)}; name only one of them."
+            )
         self._named_links = LinkPlacement(count, named) if named else None
         self._link_poses = robot.buffered("link_poses") if named else None
         capturing = plant.capturing
@@ -380,28 +387,11 @@ class ReportedState:
         return quantities
 
 
-def _link_indices(robot: SpaceRobot, names: Sequence[str]) -> list[int]:
+def _link_index(robot: SpaceRobot, name: str, parameter: str) -> int:
     links = list(robot.link_names)
-    for name in names:
-        if name not in links:
-            raise ParameterError(
-                f"Parameter 'end_effectors' names '{name}', but the robot has no such link; "
-                f"it has {', '.join(links)}."
-            )
-    if len({pose_topic(name).name for name in names}) < len(names):
+    if name not in links:
         raise ParameterError(
-            "Parameter 'end_effectors' names links that share the topic NAME/pose: "
-            f"{', '.join(names)}; name only one of them."
+            f"Parameter {parameter} '{name}', but the robot has no such link; it has "
+            f"{', '.join(links)}."
         )
-    return [links.index(name) for name in names]
-
-
-def _end_effector_index(robot: SpaceRobot, name: str) -> int | None:
-    links = list(robot.link_names)
-    link = robot.description.end_effector(name)
-    if link and link not in links:
-        raise ParameterError(
-            f"Parameter 'end_effector_frame' is '{link}', but the robot has no such link; "
-            f"it has {', '.join(links)}."
-        )
-    return links.index(link) if link else None
+    return links.index(name)

@@ -122,7 +122,7 @@ def test_a_target_is_approached_captured_brought_to_rest_and_carried() -> None:
     assert began["starts_s"] < began["closes_s"] < began["contact_s"] == loop.contact
     # The reference of the end-effector has left the place where it was held.
     loop.answer(40)
-    followed = loop.executive.controller.followed_end_effector
+    followed = loop.executive.controller.followed.end_effector
     assert followed is not None
     assert 0.001 < np.linalg.norm(followed.position - TIP) < 0.3
     loop.capture()
@@ -155,7 +155,7 @@ def test_a_target_is_approached_captured_brought_to_rest_and_carried() -> None:
     assert goal.end_effector is not None
     np.testing.assert_allclose(goal.base.position, AIM)
     np.testing.assert_allclose(goal.end_effector.position, TIP + AIM, atol=1e-12)
-    assert loop.executive.controller.followed_end_effector is None
+    assert loop.executive.controller.followed.end_effector is None
 
 
 def test_a_goal_of_the_end_effector_is_carried_to_where_it_is_given() -> None:
@@ -176,7 +176,7 @@ def test_the_reference_meets_the_grapple_frame_with_its_velocity_and_a_miss_has_
     loop.aim(base=goal_at(AIM, "5"))
     loop.answer()
     loop.skip_to(loop.contact + 0.02)
-    followed = loop.executive.controller.followed_end_effector
+    followed = loop.executive.controller.followed.end_effector
     assert followed is not None
     np.testing.assert_allclose(followed.position, loop.block - [0.3, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(followed.velocity, loop.drift, atol=1e-9)
@@ -195,7 +195,7 @@ def test_the_reference_meets_the_grapple_frame_with_its_velocity_and_a_miss_has_
     assert float(told) == pytest.approx(distance, abs=0.005)
     assert loop.status.goal_id == "5"
     assert loop.kinds()[-1] == "goal_aborted"
-    assert loop.executive.controller.followed_end_effector is None
+    assert loop.executive.controller.followed.end_effector is None
     assert loop.status.task == ""
 
 
@@ -321,7 +321,7 @@ def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
     loop.answer()
     assert loop.kinds().count("approach_started") == 2
     loop.skip_to(loop.contact + 0.05)
-    hand = controller.followed_end_effector
+    hand = controller.followed.end_effector
     assert hand is not None
     assert hand.position == pytest.approx(loop.block - np.array([0.3, 0.0, 0.0]), abs=1e-4)
     assert hand.velocity == pytest.approx(loop.drift, abs=1e-4)
@@ -371,7 +371,7 @@ def test_a_task_alone_is_reached_and_an_abort_ends_it() -> None:
     loop.executive.abort()
     loop.answer()
     assert (loop.state, loop.executive.servicing.task) == ("aborted", None)
-    assert loop.executive.controller.followed_end_effector is None
+    assert loop.executive.controller.followed.end_effector is None
 
 
 def test_a_later_goal_replaces_the_one_that_waits_for_the_tasks() -> None:

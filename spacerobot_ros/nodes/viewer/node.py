@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any, ClassVar
 
 import rclpy
@@ -142,8 +143,8 @@ class ViewerNode(FlightNode):
             self._streams, self, config.world_frame, self._on_status, config.watchdog_timeout
         )
         self.create_subscription(String, "robot_description", self._on_description, LATCHED)
-        self.create_subscription(String, "target/robot_description", self._on_target, LATCHED)
-        self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
+        for topic in ("target/robot_description", "obstacles"):
+            self.create_subscription(String, topic, partial(self._on_urdf, topic), LATCHED)
         self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         self.create_subscription(RosoutLog, "/rosout", self._on_log, STREAM)
         self.create_subscription(
@@ -262,17 +263,15 @@ class ViewerNode(FlightNode):
         self._offer_end_effectors()
         self._show_plant()
 
-    def _on_target(self, message: String) -> None:
+    def _on_urdf(self, topic: str, message: String) -> None:
+        """Show the target or the obstacles in a message."""
         try:
-            self._page.show_target(parse_robot(message.data))
+            if topic == "obstacles":
+                self._page.show_obstacles(obstacles_from_topic(message.data))
+            else:
+                self._page.show_target(parse_robot(message.data))
         except SpaceRobotError as error:
-            self._note(f"target/robot_description: {error}", 2)
-
-    def _on_obstacles(self, message: String) -> None:
-        try:
-            self._page.show_obstacles(obstacles_from_topic(message.data))
-        except SpaceRobotError as error:
-            self._note(f"obstacles: {error}", 2)
+            self._note(f"{topic}: {error}", 2)
 
     def _on_status(self, key: str, name: str) -> None:
         if self._full_names.get(key) == name:
