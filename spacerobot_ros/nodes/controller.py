@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -180,10 +181,8 @@ class CoordinatedControlNode(CommanderNode):
         self._path_topic.publish(path_message(path, stamp_ns, self.config.world_frame))
 
 
-def main() -> None:
-    """Run coordinated control until SIGINT or SIGTERM."""
-    sys.exit(run_node(CoordinatedControlNode))
-
+main = partial(run_node, CoordinatedControlNode)
+"""Run coordinated control until SIGINT or SIGTERM."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -309,10 +309,8 @@ def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
     return message
 
 
-def main() -> None:
-    """Run the planner until SIGINT or SIGTERM."""
-    sys.exit(run_node(PlannerNode))
-
+main = partial(run_node, PlannerNode)
+"""Run the planner until SIGINT or SIGTERM."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

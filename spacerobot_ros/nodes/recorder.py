@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -223,11 +224,6 @@ class RecorderNode(FlightNode):
             self.get_logger().info(f"{count} messages are recorded in {path}.")
 
     # -- contents ------------------------------------------------------------------------------
-
-    @property
-    def messages_recorded(self) -> int:
-        """Number of messages written."""
-        return self.recording.messages if self.recording is not None else 0
 
     @property
     def exit_code(self) -> int:
@@ -584,10 +580,8 @@ def _read_descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
         ) from error
 
 
-def main() -> None:
-    """Record until SIGINT or SIGTERM; the exit code is 1 if the recording has failed."""
-    sys.exit(run_node(RecorderNode))
-
+main = partial(run_node, RecorderNode)
+"""Record until SIGINT or SIGTERM; the exit code is 1 if the recording has failed."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

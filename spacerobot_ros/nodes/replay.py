@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
@@ -377,10 +378,8 @@ def _publisher_qos(qos: QosProfile) -> QoSProfile:
     )
 
 
-def main() -> None:
-    """Replay a bag until its end, SIGINT or SIGTERM."""
-    sys.exit(run_node(ReplayNode))
-
+main = partial(run_node, ReplayNode)
+"""Replay a bag until its end, SIGINT or SIGTERM."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -201,8 +201,8 @@ class ClearanceMonitor:
             touching |= self._from_target.links_in_contact(among)
         self.touching = touching
         return status, [
-            *(self._begun(each, time_s) for each in sorted(touching - before)),
-            *(_ended(each, time_s) for each in sorted(before - touching)),
+            *(self._event(each, time_s, begins=True) for each in sorted(touching - before)),
+            *(self._event(each, time_s, begins=False) for each in sorted(before - touching)),
         ]
 
     @property
@@ -210,11 +210,15 @@ class ClearanceMonitor:
         """Links in contact in the last state, as in the plant's status."""
         return tuple(sorted(each.subject for each in self.touching))
 
-    def _begun(self, links: LinkPair, time_s: float) -> Event:
-        then = "push each other" if self._pushing else "the simulation continues through contact"
-        joint = " and" if self._pushing else ";"
-        message = f"{_subject(links)} touch{joint} {then}."
-        return Event(EventKind.CONTACT, message, _ERROR, time_s, about=_names(links))
+    def _event(self, links: LinkPair, time_s: float, *, begins: bool) -> Event:
+        kind, level, then = EventKind.CONTACT_ENDED, _OK, "no longer touch."
+        if begins:
+            kind, level = EventKind.CONTACT, _ERROR
+            then = "touch; the simulation continues through contact."
+            if self._pushing:
+                then = "touch and push each other."
+        about = {"first": links.first, "second": links.second}
+        return Event(kind, f"{_subject(links)} {then}", level, time_s, about=about)
 
 
 def _base(pose: Array) -> BasePoses:
@@ -224,15 +228,6 @@ def _base(pose: Array) -> BasePoses:
 def _subject(links: LinkPair) -> str:
     """Return two links, or a link and an obstacle, as the beginning of a sentence."""
     return links.subject[0].upper() + links.subject[1:]
-
-
-def _ended(links: LinkPair, time_s: float) -> Event:
-    message = f"{_subject(links)} no longer touch."
-    return Event(EventKind.CONTACT_ENDED, message, _OK, time_s, about=_names(links))
-
-
-def _names(links: LinkPair) -> dict[str, str]:
-    return {"first": links.first, "second": links.second}
 
 
 @dataclass(frozen=True, eq=False)

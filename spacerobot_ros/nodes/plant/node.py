@@ -638,10 +638,8 @@ class PlantNode(FlightNode):
         return response
 
 
-def main() -> None:
-    """Run the plant until SIGINT or SIGTERM."""
-    sys.exit(run_node(PlantNode))
-
+main = partial(run_node, PlantNode)
+"""Run the plant until SIGINT or SIGTERM."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -487,10 +487,8 @@ class ViewerNode(FlightNode):
             self._answer(answer.message, 0 if answer.success else 2, name)
 
 
-def main() -> None:
-    """Serve the page until SIGINT or SIGTERM."""
-    sys.exit(run_node(ViewerNode))
-
+main = partial(run_node, ViewerNode)
+"""Serve the page until SIGINT or SIGTERM."""
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
