@@ -55,7 +55,8 @@ from spacerobot_ros.simulation.config import PlantConfig
 
 _LONGEST_TF_PERIOD = 0.1  # wall s
 
-_NO_GOAL = replace(Goal.checked([0, 0, 0], [0, 0, 0, 1]), asked=frozenset())
+NO_GOAL = replace(Goal.checked([0, 0, 0], [0, 0, 0, 1]), asked=frozenset())
+"""Goal of a scenario without one: the initial pose, of which nothing is requested."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Scenario:
     path: Path
     in_file: Mapping[str, Mapping[str, Any]]
     description: str = ""
-    goal: Goal = _NO_GOAL
+    goal: Goal = NO_GOAL
     end_effector_goal: Goal | None = None
     commanders: tuple[str, ...] = ("planner",)
     published: tuple[Published, ...] = ()

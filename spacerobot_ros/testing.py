@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy.typing as npt
@@ -21,7 +20,8 @@ from spacerobot_ros.nodes import NODE_TYPES, FlightNode
 from spacerobot_ros.nodes.common.node import endpoints_of, topics_without_all_matches
 from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.scenario import COMMANDERS, scenario_or_robot
+from spacerobot_ros.scenario import COMMANDERS, NO_GOAL, scenario_or_robot
+from spacerobot_ros.scenario_files import changed_goal
 from spacerobot_ros.session.mission_client import MissionClient
 
 __all__ = ["Arrival", "Stack"]
@@ -125,12 +125,9 @@ class Stack:
         node fails or the time limit expires.
         """
         if goal is None:
-            place = [x or 0.0, y or 0.0, z or 0.0]
-            goal = Goal.from_rotvec(place, [0.0, 0.0, 0.0] if rotvec is None else rotvec)
-            if rotvec is not None and x is y is z is None:
-                goal = replace(goal, asked=goal.asked - {"position"})
-            elif rotvec is None:
-                goal = replace(goal, asked=goal.asked - {"attitude"})
+            anywhere = rotvec is not None and x is y is z is None
+            place = None if anywhere else [x or 0.0, y or 0.0, z or 0.0]
+            goal = changed_goal(NO_GOAL, position=place, rotvec=rotvec)
         controls = "coordinated_control" in self.nodes and "planner" not in self.nodes
         self._sent += 1
         client = MissionClient(
