@@ -128,13 +128,11 @@ def estimate_payload(
 ) -> PayloadEstimate:
     """Return the parameters of a held body, by least squares with errors in all variables.
 
-    Errors in the measured velocities enter both sides of the equation. The error covariance is
-    computed from second differences, and subtracted from the normal equations. An error-free motion
-    also satisfies the differenced equation, so no information is lost.
-
-    Errors of successive states are not independent: impulse errors accumulate. In a cosine
-    transform over time, the modes of white noise and of a random walk are independent; each mode is
-    weighted by its inverse variance. The mean, which contains the unknown P_0, is omitted.
+    Errors in the measured velocities enter both sides of the equation; their covariance, from
+    second differences, is subtracted from the normal equations (docs/theory/capture.md). Errors of
+    successive states are not independent: impulse errors accumulate. In a cosine transform over
+    time, the modes of white noise and of a random walk are independent; each mode is weighted by
+    its inverse variance. The mean, which contains the unknown P_0, is omitted.
 
     Parameters
     ----------

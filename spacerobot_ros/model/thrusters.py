@@ -304,13 +304,10 @@ class Allocation:
 
 
 class ThrusterAllocation:
-    """Distributes wrenches over push-only thrusters at minimal cost.
+    """Distributes wrenches over push-only thrusters at minimal cost; see docs/theory/thrusters.md.
 
-    The levels solve ``wrenches @ levels = wanted`` with ``0 <= levels <= most``. The levels are
-    found by non-negative least squares (Lawson and Hanson) with an extra row for the cost: as the
-    weight of this row tends to zero, the solution tends to the cheapest exact solution. If a level
-    would exceed its upper bound, a linear programme finds the largest achievable fraction of the
-    wrench and its cheapest allocation: the wrench keeps its direction, as in
+    The levels solve ``wrenches @ levels = wanted`` with ``0 <= levels <= most``. If a level would
+    exceed its upper bound, the wrench becomes smaller but keeps its direction, as in
     :class:`spacerobot_ros.control.ActuatorLimits`. If a wrench is outside the thrusters' cone, the
     nearest wrench in the cone is allocated, with torques weighted by the mean lever arm.
 
@@ -390,15 +387,11 @@ class ThrusterAllocation:
 class ThrusterModulator:
     """Converts a desired wrench into thruster on-times, one control period at a time.
 
-    Sigma-delta modulation with minimum pulse lengths is used. ``pending_impulse`` grows by the
-    desired wrench times the period and shrinks by the impulse of each fired pulse. The pending
-    impulse is reallocated every period, so that opposite contributions cancel. The pending impulse
-    is therefore at most one shortest pulse of each thruster: with the shortest on-time ``t`` and
-    the period ``h``, ``allocation <= t + h - (remaining part of a shortest pulse)`` holds in every
-    period if the desired wrench is achievable. A wrench beyond the available thrust is dropped and
-    not compensated for later.
-
-    A pulse begins at the start of a period and may end at any time within a period.
+    This is a sigma-delta modulation with minimum pulse lengths; see docs/theory/thrusters.md. With
+    the shortest on-time ``t`` and the period ``h``, ``allocation <= t + h - (remaining part of a
+    shortest pulse)`` holds in every period if the desired wrench is achievable. A wrench beyond the
+    available thrust is dropped and not compensated for later. A pulse begins at the start of a
+    period and may end at any time within a period.
 
     Parameters
     ----------

@@ -215,7 +215,7 @@ def test_status_events_and_summary_of_a_goal_that_is_reached_partly_agree(tmp_pa
     quick: dict[str, Any] = {"square_path.t1": 0.5, "square_path.t2": 0.75, "square_path.t3": 1.25}
     quick |= {"square_path.t4": 1.5, "method": "square_path"}
     scenario = load_scenario("planar_chain").with_overrides("planner", quick)
-    cases: tuple[tuple[Any, str, list[bool]], ...] = (
+    cases: tuple[tuple[dict[str, Any], str, list[bool]], ...] = (
         ({"rotvec": [0.0, 0.0, 0.2]}, "reached", [True] * 3),
         ({"pose": [1.0, 0.0, 0.0], "rotvec": [0.0, 0.0, 0.2]}, "reached_partly", [False] * 3),
     )
