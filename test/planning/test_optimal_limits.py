@@ -104,6 +104,31 @@ def test_joints_stay_out_of_a_box(arm: SpaceRobot) -> None:
     assert of_arm(arm, turn, keep_out=box).positions[:, 1].max() <= -0.7
 
 
+def test_accelerations_are_limited_where_the_base_may_end_anywhere(arm: SpaceRobot) -> None:
+    """Held commands that are too fast are changed, and nothing but the shape counts at the end."""
+    start, final = np.array([-0.8, 0.0, 0.0]), np.array([-0.3, 0.2, -0.7])
+    velocity, acceleration = np.array([0.3, 0.3, 0.5]), np.array([0.9, 0.3, 1.0])
+    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), start)
+    schedule = plan(
+        arm,
+        start=state,
+        joint_positions=final,
+        base_attitude=0,
+        base_position=2,
+        max_velocity=velocity.tolist(),
+        max_acceleration=acceleration.tolist(),
+        **QUICK,
+    )
+    np.testing.assert_array_equal(schedule.positions[-1], final)
+    steps = np.diff(np.vstack([start, start, schedule.positions, final]), axis=0)
+    changes = np.abs(np.diff(steps, axis=0)).max(axis=0) / schedule.control_period**2
+    assert np.all(changes <= acceleration * (1 + 1e-6))
+    assert (changes / acceleration).max() > 0.999
+    # No faster than the slowest joint allows, from rest to rest.
+    way = np.abs(final - start)
+    assert schedule.duration >= (way / velocity + velocity / acceleration).max()
+
+
 def test_margins_are_kept_but_where_the_goal_is_in_them(arm: SpaceRobot) -> None:
     turn, margin = [0.2, -0.1, 0.3], np.array([2.5, 1.0, 0.0])
     schedule = of_arm(arm, turn, joint_margin=margin.tolist())

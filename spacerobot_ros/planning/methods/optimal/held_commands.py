@@ -467,7 +467,7 @@ def _least_change(
         return None
     # Unknowns are fractions of a tick at full speed.
     scale = limits.speeds(positions[0]) * period
-    scaled = (rows[:, moving] * scale).reshape(len(rows), -1)
+    scaled = (rows[:, moving] * scale).reshape(len(rows), count * n)
     weight = 1.0 / np.maximum(np.linalg.norm(scaled, axis=1), 1e-12)
 
     steps = ca.DM.eye(N + 1)[:, moving]
