@@ -25,8 +25,7 @@ import casadi as ca
 from spacerobot_ros.collision.distances import Solid
 from spacerobot_ros.collision.geometry import CollisionGeometry
 from spacerobot_ros.model import symbolic_rotations
-from spacerobot_ros.model.description import JointKind, RobotDescription
-from spacerobot_ros.model.kinematics import TreeKinematics, joint_positions, tree_kinematics
+from spacerobot_ros.model.kinematics import TreeKinematics, tree_kinematics
 
 PLANE_SIZE = 7
 """Number of entries for a plane and a point."""
@@ -142,65 +141,23 @@ def support_distance(
     along the normal is ``sum h_i |n e_i| + radius``. So the distance is valid for any rotation, and
     underestimates the distance of the shape in the box.
     """
-    robot, of_obstacle = geometry.robot, bool(geometry.with_obstacles[pair])
-    n = len(robot.joint_names)
+    tree, of_obstacle = tree_kinematics(geometry.robot), bool(geometry.with_obstacles[pair])
+    n = tree.n
     y, plane = ca.SX.sym("y", n + 7 if of_obstacle else n), ca.SX.sym("plane", PLANE_SIZE)
-    q, normal = y[:n], plane[:3]
     first, second = (geometry.solids[i] for i in geometry.pairs[pair])
+    solid = first if of_obstacle else second
+    R, r, _ = tree.frame(solid.link)
     if of_obstacle:
         X, r_C = y[n : n + 4], y[n + 4 :]
-        solid = first
-        R, r = _pose_of_link(robot, first, _chain_of(robot, first.body), joint_positions(robot, q))
         R_X = symbolic_rotations.matrix_from_quaternion(X / ca.norm_2(X))
-        R, r = R_X @ R, r_C + R_X @ (r - center_of_mass(q))
+        R, r = R_X @ R, r_C + R_X @ (r - center_of_mass(tree.q))
     else:
-        solid = second
-        (R_A, r_A), (R_P, r_P) = _relative_poses(robot, first, second, q)
-        R, r = R_A.T @ R_P, R_A.T @ (r_P - r_A)
+        R_A, r_A, _ = tree.frame(first.link)
+        R, r = R_A.T @ R, R_A.T @ (r - r_A)
+    R, r = ca.substitute([R, r], [tree.q], [y[:n]])
+    normal = plane[:3]
     box = solid.enclosure
     along = ca.DM(box.pose.R).T @ R.T @ normal
     extent = ca.dot(ca.DM(box.half), ca.sqrt(along**2 + _EDGE_ROUNDING**2)) + box.radius
     d = ca.dot(normal, r + R @ ca.DM(box.pose.r)) - extent - plane[3]
     return ca.Function("support", [y, plane], [ca.cse(d)])
-
-
-def _relative_poses(
-    robot: RobotDescription, first: Solid, second: Solid, q: ca.SX
-) -> list[tuple[ca.SX, ca.SX]]:
-    """Return the link poses of two solids in the outermost body that carries both."""
-    theta = joint_positions(robot, q)
-    chains = [_chain_of(robot, each.body) for each in (first, second)]
-    common = len([1 for a, b in zip(*chains, strict=False) if a == b])
-    return [
-        _pose_of_link(robot, solid, chain[common:], theta)
-        for solid, chain in zip((first, second), chains, strict=True)
-    ]
-
-
-def _pose_of_link(
-    robot: RobotDescription, solid: Solid, chain: Sequence[int], theta: ca.SX
-) -> tuple[ca.SX, ca.SX]:
-    """Return the pose of a solid's link in the body that carries the first of a chain."""
-    R, r = ca.SX.eye(3), ca.SX(3, 1)
-    for index in chain:
-        body = robot.bodies[index]
-        joint = body.joint
-        if joint is None:
-            continue
-        r = r + R @ ca.sparsify(ca.DM(body.origin.r))
-        R = R @ ca.sparsify(ca.DM(body.origin.R))
-        if joint.kind is JointKind.PRISMATIC:
-            r = r + R @ ca.sparsify(ca.DM(joint.axis)) * theta[index - 1]
-        else:
-            R = R @ symbolic_rotations.matrix_about_axis(joint.axis, theta[index - 1])
-    _, pose = robot.frames[solid.link]
-    return R @ ca.sparsify(ca.DM(pose.R)), r + R @ ca.DM(pose.r)
-
-
-def _chain_of(robot: RobotDescription, body: int) -> list[int]:
-    """Return the bodies from the base to a given body."""
-    chain = []
-    while body >= 0:
-        chain.append(body)
-        body = robot.bodies[body].parent
-    return chain[::-1]

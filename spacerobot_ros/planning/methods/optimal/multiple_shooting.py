@@ -254,9 +254,9 @@ class MultipleShooting:
                 return None
             # On the way to a clear path, the last iterate has better planes than the guess.
             x = x if self._monitor.best is None else self._monitor.best
-        trajectory = self._unpack_trajectory(x)
         self.lack = float(x[-1]) if layout.has_lack else 0.0
-        return trajectory
+        h, (X, s, v, _) = float(x[0]), (x[each] for each in layout.knots())
+        return Trajectory(h, s - h * v / 2, v, X)
 
     def _initial_variables(self, guess: Trajectory, lack: float) -> Array:
         h, v = guess.step, guess.velocities
@@ -265,10 +265,6 @@ class MultipleShooting:
         if self._layout.has_lack:
             x[-1] = lack / 2
         return x
-
-    def _unpack_trajectory(self, x: Array) -> Trajectory:
-        h, (X, s, v, _) = float(x[0]), (x[each] for each in self._layout.knots())
-        return Trajectory(h, s - h * v / 2, v, X)
 
 
 def build_solver(

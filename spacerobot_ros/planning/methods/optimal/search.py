@@ -35,6 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spacerobot_ros.collision import Approach
+from spacerobot_ros.collision.planes import PlaneDistances
 from spacerobot_ros.errors import NotFoundError, PlanningError, counted
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_multiply
@@ -390,7 +391,7 @@ class ManoeuvreSearch:
         if key not in self._solvers:
             stages = self._stages[position, drifting]
             if pairs and model.distances is not None:
-                rows = model.distances.of(pairs)
+                rows = PlaneDistances.of(model.distances.clearance.geometry, pairs)
                 stages = stages.with_distances(rows, instants_of(grid.intervals))
             self._solvers[key] = MultipleShooting(stages, *grid)
         return self._solvers[key]

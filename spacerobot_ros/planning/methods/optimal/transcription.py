@@ -101,7 +101,7 @@ class ConstraintBlock:
 
         Derivatives are compiled if the block is ``repeated`` in a program.
         """
-        key, derived = hash_of(facts), cache(derive)
+        key, derived = hashlib.sha256("\n".join(facts).encode()).hexdigest(), cache(derive)
         jacobian = cached_function(f"{name}_jac", key, lambda: derived().jacobian)
         hessian = cached_function(f"{name}_hess", key, lambda: derived().hessian)
         if repeated:
@@ -256,11 +256,6 @@ def _cached_interval(
         facts,
         lambda: _interval_block(robot, constraints, inequality, drifting=drifting),
     )
-
-
-def hash_of(facts: Sequence[str]) -> str:
-    """Return the cache key for an object derived from ``facts``."""
-    return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
 
 def _interval_block(
