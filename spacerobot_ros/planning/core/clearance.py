@@ -234,7 +234,8 @@ class Clearance:
             (N + 1, n) shapes at the ticks, m or rad.
         required
             (P,) required distances, m; None: as returned by :meth:`required` for the first shape.
-            base Base poses at the ticks; None: obstacles are ignored.
+        base
+            Base poses at the ticks; None: obstacles are ignored.
         """
         if not len(self.geometry.pairs):
             return []

@@ -91,21 +91,6 @@ class SquarePathOptions:
 
 
 @dataclass(frozen=True)
-class _SquareLoop:
-    """A square in the plane (psi_i, psi_j) of a ``pair`` of joints that rotates the base by the
-    desired angle: ``centre`` (2,) ``psi*`` and ``side`` ``z*`` in rad, and ``corners`` (4, n) in
-    the order of travel, beginning with the one nearest to ``psi_e``.
-    """
-
-    pair: tuple[int, int]
-    centre: Array
-    side: float
-    loops: int
-    clockwise: bool
-    corners: Array
-
-
-@dataclass(frozen=True)
 class _SquareFamily:
     """Squares of increasing side for one pair of joints: centres (R, 2), sides (R,), phases (R,)
     counter-clockwise."""
@@ -175,17 +160,9 @@ class SquarePathGait(GaitMethod):
         legs = [(psi_e, duration_1)]
         loop_notes: Notes = {"loops": 0.0}
         if abs(wanted) > max(_ZERO_ROTATION_ANGLE, _MIN_CORRECTED_SHARE * tolerance.attitude):
-            loop = self._find_loop(psi_e, wanted)
-            around = [(corner, duration_3 / 4) for corner in np.roll(loop.corners, -1, axis=0)]
-            legs += [(loop.corners[0], duration_2), *loop.loops * around, (psi_e, duration_4)]
-            loop_notes = {
-                "joints": ", ".join(self.robot.joint_names[i] for i in loop.pair),
-                "psi_star": loop.centre.tolist(),
-                "z_star": loop.side,
-                "loops": float(loop.loops),
-                "direction": "clockwise" if loop.clockwise else "counter-clockwise",
-                "corner": loop.corners[0].tolist(),
-            }
+            corners, loops, loop_notes = self._find_loop(psi_e, wanted)
+            around = [(corner, duration_3 / 4) for corner in np.roll(corners, -1, axis=0)]
+            legs += [(corners[0], duration_2), *loops * around, (psi_e, duration_4)]
         longest = self.options.longest
         positions = straight_motion(self.robot, state.q, legs, self.control_period, longest)
         path = self._prediction.path(state, positions)
@@ -211,8 +188,10 @@ class SquarePathGait(GaitMethod):
         twist = 2 * math.atan2(float(axis @ turn[:3]), float(turn[3]))
         return math.remainder(twist, 2 * math.pi)
 
-    def _find_loop(self, psi_e: Array, wanted: float) -> _SquareLoop:
-        """Return the loop for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,).
+    def _find_loop(self, psi_e: Array, wanted: float) -> tuple[Array, int, Notes]:
+        """Return the square for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,):
+        its corners (4, n) in the order of travel, beginning with the one nearest to ``psi_e``, the
+        number of loops, and notes.
 
         Among all joint pairs, the one with the fewest loops is chosen, and among those the one with
         the smallest square; if links come too close on all of these, more loops around smaller
@@ -245,7 +224,18 @@ class SquarePathGait(GaitMethod):
                 shapes = np.vstack([psi_e, corners, corners[0], psi_e])
                 too_near = self._too_near(shapes, at_ticks=False)
                 if not too_near:
-                    return _SquareLoop(candidates.pair, centre, side, loops, clockwise, corners)
+                    return (
+                        corners,
+                        loops,
+                        {
+                            "joints": ", ".join(self.robot.joint_names[i] for i in candidates.pair),
+                            "psi_star": centre.tolist(),
+                            "z_star": side,
+                            "loops": float(loops),
+                            "direction": "clockwise" if clockwise else "counter-clockwise",
+                            "corner": corners[0].tolist(),
+                        },
+                    )
                 obstacle = obstacle or too_near
         raise PlanningError(
             f"On square loops within the joint limits, links come too close to each other with up "

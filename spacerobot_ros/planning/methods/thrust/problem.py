@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.errors import NotFoundError, ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.model.rotations import compose_poses, relative_pose
+from spacerobot_ros.model.description import Array, Pose, RobotDescription
+from spacerobot_ros.model.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm, is_reached
+from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion, relative_pose
 from spacerobot_ros.model.target_motion import TorqueFreeMotion
 from spacerobot_ros.model.thrusters import ThrusterTable
 from spacerobot_ros.parameters import parameter
@@ -200,3 +201,24 @@ def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Ar
     still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     there = np.concatenate(end_effector_pose(robot, link, still[:3], still[3:], shape))
     return compose_poses(hand, relative_pose(there, still))
+
+
+def shape_for_hand(robot: SpaceRobot, link: str, base: Array, hand: Array, q: Array) -> Array:
+    """Return the shape (n,) close to ``q`` in which a link has a pose (7,), with the base at one.
+
+    Raises
+    ------
+    NotFoundError
+        No such shape was found.
+    """
+    poses = [Pose(matrix_from_quaternion(each[3:]), each[:3]) for each in (base, hand)]
+    arm = FixedBaseArm(robot, link, poses[0])
+    found, distance = arm.nearest_shape(q, poses[1])
+    if distance > REACHED_DISTANCE:
+        found, distance, angle = arm.search_shape(q, poses[1])
+        if not is_reached(distance, angle):
+            raise NotFoundError(
+                f"No joint positions were found that put '{link}' at its goal while the base is at "
+                f"its goal: {distance:.3g} m and {angle:.3g} rad remain."
+            )
+    return found

@@ -20,11 +20,10 @@ from functools import cache, cached_property, partial
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.errors import PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array, Pose, RobotDescription
+from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import RobotMotion
-from spacerobot_ros.model.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm, is_reached
 from spacerobot_ros.model.rotations import (
     attitude_error,
     matrices_from_quaternions,
@@ -51,6 +50,7 @@ from spacerobot_ros.planning.methods.thrust.problem import (
     ThrustGoal,
     ThrustOptions,
     base_for_hand,
+    shape_for_hand,
 )
 from spacerobot_ros.planning.methods.thrust.transcription import (
     DEFECT_SIZE,
@@ -78,8 +78,7 @@ _ROUNDINGS = (0.1, 0.01, 0.003)
 steps."""
 
 _NEAREST = Weights(0.0, 0.0, 1e4, 1e4)
-"""Weights of the nearest motion: large, so that the barrier does not push levels off their bounds.
-"""
+"""Weights of the nearest motion, so large that the barrier pushes no levels off their bounds."""
 
 _EXACT_END, _NEAR_END, _LARGEST_END_ERROR, _MAX_CORRECTIONS = 1e-5, 1e-2, 1e-3, 10
 """Errors at the end, m and rad: to be achieved, below which the nearest exact motion is searched
@@ -267,7 +266,7 @@ class ThrustPlanner:
         given = np.isfinite(shape) & ~self._wheels
         q, reach = np.where(given, shape, start.q), np.where(given, 0.0, np.inf)
         if hand is not None:
-            q = np.where(given, q, self._shape_at(goal.base, hand, q))
+            q = np.where(given, q, shape_for_hand(robot, self.link, goal.base, hand, q))
             # Close to this family of shapes: others may lie beyond a contact of the arm.
             reach[~given & ~self._wheels] = _END_REACH
         for i in np.flatnonzero((q < limits.lower) | (q > limits.upper))[:1]:
@@ -285,20 +284,6 @@ class ThrustPlanner:
             # Both ends are given by other rows.
             s[:, 1:-2, given] = start.q[given]
         return boundary, q
-
-    def _shape_at(self, base: Array, hand: Array, q: Array) -> Array:
-        """Return the shape (n,) close to another in which the end-effector is at a pose."""
-        poses = [Pose(matrix_from_quaternion(each[3:]), each[:3]) for each in (base, hand)]
-        arm = FixedBaseArm(self.robot, self.link, poses[0])
-        found, distance = arm.nearest_shape(q, poses[1])
-        if distance > REACHED_DISTANCE:
-            found, distance, angle = arm.search_shape(q, poses[1])
-            if not is_reached(distance, angle):
-                raise NotFoundError(
-                    f"No joint positions were found that put '{self.link}' at its goal while the "
-                    f"base is at its goal: {distance:.3g} m and {angle:.3g} rad remain.",
-                )
-        return found
 
     def guess(
         self, boundary: ThrustBoundary, base: Array, end: Array, bow: Array | float = 0.0
