@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.collision import ObstaclePair
-from spacerobot_ros.control import ControlState, approach
+from spacerobot_ros.control import ControlState
 from spacerobot_ros.control.approach import NearestLinks, TargetClearance
 from spacerobot_ros.control.detumbling import (
     Detumbling,
@@ -375,11 +375,12 @@ def test_a_body_that_is_always_in_the_way_is_named() -> None:
     assert said.endswith("s, link 'arm' would touch 'core' of the target.")
 
 
-def test_the_number_of_ways_past_a_body_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(approach, "_MAX_BLOCKED_PATHS", 5)
+def test_the_number_of_ways_past_a_body_is_limited() -> None:
+    """There are a thousand up to this horizon."""
     answers: Any = Answers(0.01)
-    assert "come within 0.01 m" in refusal(NEAR, clearance=answers)
-    assert answers.asked == 5
+    far = replace(OPTIONS, horizon=40.0)
+    assert "come within 0.01 m" in refusal(NEAR, clearance=answers, options=far)
+    assert answers.asked <= 100
 
 
 def test_a_path_in_the_world_joins_motion_and_standoff() -> None:

@@ -425,6 +425,10 @@ def test_a_reset_drops_goals_and_the_first_state_is_held_again() -> None:
     loop.place = np.array([0.5, 0.0, 0.0])
     np.testing.assert_allclose(np.concatenate(loop.answer()), 0.0, atol=1e-12)
     assert (loop.state, loop.status.goal_id) == ("holding", "")
+    assert_one_sentence(loop.status.message, "Waiting for a goal; holding, 0 m")
+    loop.executive.reset()
+    loop.answer(measured=False)
+    assert loop.state == "waiting"
 
 
 # -- references from outside -----------------------------------------------------------------

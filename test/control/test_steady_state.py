@@ -517,16 +517,3 @@ def test_errors_that_have_begun_to_shrink_on_the_way_are_no_stall(decay: float) 
         loop.place = base.position - [error, 0.0, 0.0]
         loop.answer()
         assert loop.state == "tracking", (time, loop.status.message)
-
-
-def test_before_a_first_measurement_a_controller_waits() -> None:
-    loop = ExecutiveLoop()
-    loop.answer(measured=False)
-    assert (loop.state, loop.status.state.level) == ("waiting", 0)
-    assert_one_sentence(loop.status.message, "Waiting for states on 'odom'")
-    loop.answer()
-    assert loop.state == "holding"
-    assert_one_sentence(loop.status.message, "Waiting for a goal; holding, 0 m")
-    loop.executive.reset()
-    loop.answer(measured=False)
-    assert loop.state == "waiting"

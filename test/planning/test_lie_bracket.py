@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning.sliding_robots import Slider, SlidingRobot, paper_robot, random_sliding_robot
 from scipy.spatial.transform import Rotation
-from support.planners import planner_of
-from support.planning_refusals import refusal_in
+from support.planners import planner_of, refusal_in
 from support.slides_and_turns import (
     PERIOD,
     TIGHT,

@@ -12,8 +12,7 @@ from planning.sliding_robots import Slider, SlidingRobot, paper_robot
 from scipy.spatial.transform import Rotation
 from support.planar_manoeuvres import phase_density
 from support.planner_loop import NEAR, TICK, Loop, StubMethod
-from support.planners import planner_of
-from support.planning_refusals import refusal_in
+from support.planners import planner_of, refusal_in
 from support.slides_and_turns import PERIOD as GAIT_PERIOD
 from support.slides_and_turns import goal_at, note, origin, state_at
 from support.slides_and_turns import planner as gait_planner

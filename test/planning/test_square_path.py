@@ -30,7 +30,7 @@ from support.planar_manoeuvres import (
     wrapped,
 )
 from support.planar_trees import Part, PlanarTree, random_tree
-from support.planning_refusals import refusal_in
+from support.planners import refusal_in
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot

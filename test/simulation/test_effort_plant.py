@@ -38,7 +38,7 @@ from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.effort_plant import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.simulation.effort_plant import DEFAULT_INTEGRATION_STEP, JointStops
 
 
 class MujocoFlight(MujocoOracle):
@@ -327,13 +327,13 @@ def test_a_tick_without_limits_is_taken_once(monkeypatch: pytest.MonkeyPatch) ->
     """Stops are only looked at where a joint touches one: a tick is one compiled function."""
     plant = EffortPlant(robot_of(random_urdf(0)), TICK)
     taken: list[Any] = []
-    advance = plant._stops.advance
+    advance = JointStops.advance
 
     def counted(*arguments: Any) -> Any:
         taken.append(arguments)
         return advance(*arguments)
 
-    monkeypatch.setattr(plant._stops, "advance", counted)
+    monkeypatch.setattr(JointStops, "advance", counted)
     for _ in range(20):
         assert plant.step([0.01, -0.02, 0.01], [0.1, 0, 0, 0, 0, 0]) is False
     assert taken == []

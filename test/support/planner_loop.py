@@ -145,7 +145,7 @@ class HeldWorker(PlanningWorker):
         super().__init__(robot, config, method)
         self.plans_in_background = True
         self.task: PlanningTask | None = None
-        self.cancelled = self.released = False
+        self.cancelled = self.released = self.plans_with_stuck_joints = False
         self.tasks: list[PlanningTask] = []
 
     @property
@@ -167,6 +167,8 @@ class HeldWorker(PlanningWorker):
         task, self.task = self.task, None
         if self.cancelled:
             return None
+        if self.plans_with_stuck_joints:
+            task = replace(task, stuck_joint_positions={})
         try:
             return Planned(self.plan(task, Cancellation()), 0.25)
         except PlanningError as refusal:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+import pytest
+
+from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning import (
@@ -46,3 +50,13 @@ def planner_of(
     """Return a method of the registry with options by name."""
     chosen = method_options(name, options)
     return Planner(METHODS[name](robot, control_period, integration_step, chosen), tolerance)
+
+
+def refusal_in(plan: Callable[[], object]) -> str:
+    """Return the one sentence with which a plan is refused."""
+    with pytest.raises(PlanningError) as refusal:
+        plan()
+    text = str(refusal.value)
+    assert text.endswith(".")
+    assert "\n" not in text
+    return text
