@@ -58,10 +58,9 @@ def message_class(type_name: str) -> Any:
 
 @dataclass(frozen=True)
 class Recorded:
-    """One message of a bag: its times in ns, and what it says."""
+    """One message of a bag: when it was written, ns, and what it says."""
 
     log_ns: int
-    publish_ns: int
     message: Any
 
 
@@ -79,7 +78,7 @@ class BagContent:
                 if channel.topic in WRITTEN_BY_THE_RECORDER:
                     continue
                 message = deserialize_message(record.data, message_class(schema.name))
-                entry = Recorded(record.log_time, record.publish_time, message)
+                entry = Recorded(record.log_time, message)
                 self.by_topic.setdefault(channel.topic, []).append(entry)
             self.metadata = {m.name: dict(m.metadata) for m in reader.iter_metadata()}
             self.attachments = {a.name: (a.media_type, a.data) for a in reader.iter_attachments()}
