@@ -271,7 +271,10 @@ def test_a_part_that_was_asked_for_and_is_not_controlled_is_not_reached(tmp_path
     ("fault", "state", "named"),
     [
         ("thruster_off all at 1", "failed", "Thruster 'all' has been off since 1 s."),
-        ("thruster_stuck force_x 400 at 1.5", "aborted", "has been stuck since 1.5 s."),
+        pytest.param(
+            *("thruster_stuck force_x 400 at 1.5", "aborted", "has been stuck since 1.5 s."),
+            marks=pytest.mark.slow,
+        ),
         ("thruster_off all at 1 until 2", "failed", ""),
     ],
 )
