@@ -375,24 +375,26 @@ def test_automatic_gains_in_lanes_are_those_of_the_controller() -> None:
 
 
 @on_targets("registers")
-def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller(target_name: str) -> None:
+@pytest.mark.parametrize(
+    ("shape", "limits"),
+    [
+        (np.array([0.3, 0.02]), {}),
+        pytest.param(SHAPE, {"joint_rates": 0.02, "profile": "step"}, marks=pytest.mark.slow),
+    ],
+    ids=["singular", "slow joints"],
+)
+def test_what_the_law_cannot_give_in_one_step_is_given_by_the_controller(
+    target_name: str, shape: Array, limits: dict[str, Any]
+) -> None:
     """Through a singularity, and with joints that are held within a small rate."""
     planar = share_directory() / "urdf" / "planar_manipulator.urdf"
-    cases: tuple[dict[str, Any], ...] = (
-        {"law": "model_based", "shape": np.array([0.3, 0.02]), "gains": Gains.uniform(4.0, 4.0)},
-        {
-            **{"law": "model_based", "shape": SHAPE, "gains": Gains.uniform(4.0, 4.0)},
-            **{"joint_rates": 0.02, "profile": "step"},
-        },
-    )
-    for case in cases:
-        shape = case.pop("shape")
-        tip = SpaceRobot.from_file(planar).link_pose("end_effector", shape)[1]
-        held = np.array([*tip, *BASE[3:]])
-        flights = controlled("planar_manipulator", shape, ticks=120, end_effector=held, **case)
-        here, there = fly_lanes(flights, target_named(target_name)), fly_one_by_one(flights)
-        assert_same(here, there)
-        assert 0 < here.fallback_ticks.sum() <= 9 * 120
+    tip = SpaceRobot.from_file(planar).link_pose("end_effector", shape)[1]
+    case = {"law": "model_based", "gains": Gains.uniform(4.0, 4.0), **limits}
+    case["end_effector"] = np.array([*tip, *BASE[3:]])
+    flights = controlled("planar_manipulator", shape, ticks=120, **case)
+    here, there = fly_lanes(flights, target_named(target_name)), fly_one_by_one(flights)
+    assert_same(here, there)
+    assert 0 < here.fallback_ticks.sum() <= 9 * 120
 
 
 def test_a_controller_at_another_rate_is_refused() -> None:
