@@ -444,6 +444,7 @@ def test_interrupted_run_leaves_a_complete_bag(tmp_path: Path) -> None:
     result = run_scenario(papers_own(), tmp_path / "run.mcap", progress)
     assert result.summary["state"] == "interrupted"
     assert not result.succeeded
+    assert result.summary["verdict"] == result.message
     assert 0 < result.summary["sim_time_s"] < 4900
     assert read_bag(tmp_path / "run.mcap").message_count("/odom") == result.summary["ticks"] + 1
 
