@@ -10,6 +10,7 @@ import json
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -67,7 +68,8 @@ def write_flights(folder: Path, made: Campaign, better: float = 0.0) -> None:
             left = "needed corrections" if number < 50 else "It is too far."
         passed = passes_criteria(made.criteria, outcome, metrics)
         engine = "flights" if left else "lanes"
-        rows.append(Row(draw, outcome, reason, metrics, passed, engine, left, 0.125, number / 256))
+        of = replace(draw, fallback=left)
+        rows.append(Row(of, outcome, reason, metrics, passed, engine, 0.125, number / 256))
     dataset = Dataset(folder)
     dataset.begin(made)
     dataset.add(rows)
