@@ -457,7 +457,7 @@ def labels_of(flights: Sequence[FlightReport]) -> list[str]:
     for names in (methods, [path.stem for path in paths]):
         if all(names) and len(set(names)) == len(names):
             return names
-    return list(map(str, paths))
+    return [f"{path.parent.name}/{path.stem}" for path in paths]
 
 
 def joint_unit(flight: FlightReport, name: str) -> str:
