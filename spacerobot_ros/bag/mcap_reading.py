@@ -116,15 +116,10 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
 
 
 class RecordedChannel(NamedTuple):
-    """A channel in a file: a topic from one publisher."""
+    """A channel in a file, which is a topic from one publisher, and the definition of its type."""
 
-    number: int
-    topic: str
-    encodings: tuple[str, str]
-    """Encoding of the messages, and encoding of their definition."""
-    type_name: str
-    definition: bytes
-    offered_qos: str
+    channel: Channel
+    schema: Schema
     message_count: int
     """According to the file."""
 
@@ -162,17 +157,8 @@ class BagFile:
         counts, schemas = self.statistics.channel_message_counts, self.summary.schemas
         nothing = Schema(id=0, data=b"", encoding="", name="")
         self.channels = [
-            RecordedChannel(
-                number=channel.id,
-                topic=channel.topic,
-                encodings=(channel.message_encoding, schema.encoding),
-                type_name=schema.name,
-                definition=schema.data,
-                offered_qos=channel.metadata.get("offered_qos_profiles", ""),
-                message_count=counts.get(channel.id, 0),
-            )
-            for channel in self.summary.channels.values()
-            for schema in [schemas.get(channel.schema_id, nothing)]
+            RecordedChannel(each, schemas.get(each.schema_id, nothing), counts.get(each.id, 0))
+            for each in self.summary.channels.values()
         ]
 
     @contextmanager
@@ -442,9 +428,9 @@ class _Wanted:
     ) -> None:
         places = {topic: number for number, topic in enumerate(topics)}
         self.numbers = np.full(_MOST_CHANNELS, _NOT_WANTED, np.intp)
-        for channel in file.channels:
+        for channel in file.summary.channels.values():
             if channel.topic in places:
-                self.numbers[channel.number] = places[channel.topic]
+                self.numbers[channel.id] = places[channel.topic]
         self.start_ns, self.end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
 
     def may_be_in(self, index: ChunkIndex) -> bool:

@@ -150,14 +150,14 @@ class Bag(Mapping[str, TopicSeries]):
     @cached_property
     def _channels_by_topic(self) -> dict[str, list[RecordedChannel]]:
         found: dict[str, list[RecordedChannel]] = {}
-        for channel in (each for file in self._files for each in file.channels):
-            found.setdefault(channel.topic, []).append(channel)
+        for each in (each for file in self._files for each in file.channels):
+            found.setdefault(each.channel.topic, []).append(each)
         return found
 
     @cached_property
     def topics(self) -> dict[str, str]:
         """Type of every recorded topic by topic name, including topics without messages."""
-        return {name: each[-1].type_name for name, each in self._channels_by_topic.items()}
+        return {name: each[-1].schema.name for name, each in self._channels_by_topic.items()}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.topics)
@@ -286,7 +286,8 @@ class Bag(Mapping[str, TopicSeries]):
 
     def qos(self, topic: str) -> list[QosProfile]:
         """Return the recorded QoS of a topic's publishers."""
-        texts = [c.offered_qos for c in self._channels(topic)]
+        channels = (each.channel for each in self._channels(topic))
+        texts = [channel.metadata.get("offered_qos_profiles", "") for channel in channels]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
 
     def times(self, topic: str) -> NDArray[np.float64]:
@@ -434,24 +435,23 @@ class Bag(Mapping[str, TopicSeries]):
                 f"{_format_list(list(self.topics))}."
                 f"{suggestion(topic, [*self.topics, *(name[1:] for name in self.topics)])}"
             )
-        if len({(each.type_name, each.definition) for each in channels}) > 1:
+        if len({(each.schema.name, each.schema.data) for each in channels}) > 1:
             raise RecordingError(f"The topic {topic} of the bag {self.path} has several types.")
         return channels
 
     def _message_type(self, topic: str) -> MessageType:
-        recorded = self._channels(topic)[0]
-        encoding, schema = recorded.encodings
-        if (encoding, schema) != ("cdr", "ros2msg"):
+        channel, schema, _ = self._channels(topic)[0]
+        if (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
             raise RecordingError(
                 f"The topic {topic} of the bag {self.path} does not use ROS 2's encoding ('cdr' "
-                f"defined by 'ros2msg'), but {encoding!r} defined by {schema!r}."
+                f"defined by 'ros2msg'), but {channel.message_encoding!r} defined by "
+                f"{schema.encoding!r}."
             )
         try:
-            return message_type(recorded.type_name, recorded.definition)
+            return message_type(schema.name, schema.data)
         except ValueError as error:
             raise RecordingError(
-                f"The definition of {recorded.type_name} in the bag {self.path} cannot be read: "
-                f"{error}."
+                f"The definition of {schema.name} in the bag {self.path} cannot be read: {error}."
             ) from error
 
     def _read_together(self, types: Mapping[str, MessageType]) -> None:

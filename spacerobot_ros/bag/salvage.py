@@ -119,7 +119,7 @@ def is_complete(path: Path) -> bool:
     """Whether every message of a bag can be read without repairing the bag."""
     try:
         for file in map(BagFile, bag_files(path)):
-            topics = [channel.topic for channel in file.channels]
+            topics = [each.channel.topic for each in file.channels]
             held = sum(len(messages) for *_, messages in blocks_in_time_order([file], topics))
             if held != file.statistics.message_count:
                 return False
