@@ -79,11 +79,8 @@ class FlightData:
     joint_names
         The joints, in the order of the columns.
     series
-        All plant quantities by name, each with its times (s). The true quantities are ``pose`` (N,
-        7), position (m) and quaternion (x, y, z, w) of the base in the world; ``twist`` (N, 6),
-        base velocities in the base frame, m/s and rad/s; ``q``, ``qdot``, ``effort`` (N, n), joint
-        positions (m or rad), rates and actuator efforts; ``momentum`` (N, 7), linear (kg m/s) and
-        angular momentum (kg m^2/s) in the world and kinetic energy (J). For other quantities see
+        All plant quantities by name, each with its times (s): the true quantities :attr:`pose`,
+        :attr:`twist`, :attr:`q`, :attr:`qdot`, :attr:`effort` and :attr:`momentum`, and
         :attr:`quantities`.
     commands
         The commands by topic.

@@ -64,9 +64,6 @@ class EngineComparison:
 class EngineFlight:
     """Flies a robot in MuJoCo alongside a plant, tick by tick.
 
-    In each tick, the engine receives the external loads, and the joint rates (or efforts and
-    wrench) realised by the plant's actuators after limits and faults.
-
     Parameters
     ----------
     plant
