@@ -13,7 +13,7 @@ import pickle
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -25,6 +25,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from importlib.util import find_spec
 from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
@@ -52,6 +53,8 @@ _POLL_PERIOD = 0.2
 
 _NO_WORKER_WARNING_DELAY = 5.0
 """Wall time without workers after which a warning is printed, s."""
+
+_PACKAGE_NAME = "spacerobot_ros"
 
 _THREAD_COUNT_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -215,6 +218,7 @@ class DaskWorkers:
     def __init__(self, client: Any) -> None:
         self._client = client
         self._executor = client.get_executor(pure=False, retries=0)
+        self._checked: set[str] = set()
         self._empty_since = math.inf
         """Monotonic time at which the scheduler lost its last worker; infinite if it has a
         worker."""
@@ -225,12 +229,13 @@ class DaskWorkers:
         Raises
         ------
         SpaceRobotError
-            The scheduler is no longer available.
+            The scheduler is no longer available, or a worker does not have this package.
         """
         try:
             if self._client.status != "running":
                 raise _lost_scheduler_error()
             threads = self._client.nthreads()
+            self._require_package(threads)
         except (OSError, AttributeError) as error:  # The client has not noticed it yet.
             raise _lost_scheduler_error() from error
         workers = sum(threads.values())
@@ -272,6 +277,21 @@ class DaskWorkers:
                 f"({str(error).splitlines()[0]}): the scheduler and all workers require "
                 f"spacerobot_ros[campaign] {__version__}."
             ) from error
+
+    def _require_package(self, workers: Iterable[str]) -> None:
+        """Refuse workers without this package, which would end when they receive a task."""
+        joined = [address for address in workers if address not in self._checked]
+        if not joined:
+            return
+        # A function of the standard library, which every worker can load.
+        found = self._client.run(find_spec, _PACKAGE_NAME, workers=joined, on_error="return")
+        for address, spec in found.items():
+            if spec is None:
+                raise SpaceRobotError(
+                    f"The worker at {address} does not have {_PACKAGE_NAME}: install it there."
+                )
+            if not isinstance(spec, Exception):  # The worker may have left again.
+                self._checked.add(address)
 
 
 def _lost_scheduler_error() -> SpaceRobotError:

@@ -145,9 +145,10 @@ def test_a_worker_that_has_no_package_is_refused(tmp_path: Path) -> None:
             worker.awaited("Registered to")
             with started(tmp_path, *command, address) as run:
                 assert run.process.wait(timeout=_LONGEST) == 2
-                told = run.log.read_text().splitlines()[-1]
-                assert told.startswith("The scheduler or a worker cannot load the task (")
-                assert "the scheduler and all workers require spacerobot_ros[campaign]" in told
+                expected = (
+                    rf"The worker at {ADDRESS} does not have spacerobot_ros: install it there\.\n"
+                )
+                assert re.fullmatch(f"drawn .*\n{expected}", run.log.read_text())
 
 
 @pytest.mark.study
