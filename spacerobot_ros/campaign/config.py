@@ -42,7 +42,10 @@ _CAMPAIGN_KEYS = (
     *("criteria", "metrics", "engine", "description"),
 )
 _MAX_FLIGHTS = 10_000_000
-ENGINES = ("auto", "lanes", "flights", "cuda")
+FLIGHTS = "flights"
+"""Name of the engine that flies draws one by one, the fallback for other engines."""
+
+ENGINES = ("auto", "lanes", FLIGHTS, "cuda")
 """Names of engines that can fly a campaign, besides other devices."""
 
 

@@ -1,35 +1,45 @@
-"""Campaign dataset: its files, with one Parquet row for each finished flight."""
+"""Campaign rows, one for each finished flight, and the files of a dataset of them."""
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
 import json
+import math
 import os
 import platform
 import time
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 from xml.etree.ElementTree import canonicalize
 
 import numpy as np
 import yaml
 
-from spacerobot_ros.campaign.config import FIXED_SIZE_SAMPLERS, Campaign, parse_campaign
-from spacerobot_ros.campaign.draws import require_module
-from spacerobot_ros.campaign.rows import Row
+from spacerobot_ros.campaign.config import (
+    FIXED_SIZE_SAMPLERS,
+    Campaign,
+    parse_campaign,
+    passes_criteria,
+)
+from spacerobot_ros.campaign.draws import Draw, require_module
+from spacerobot_ros.campaign.metrics import own_metrics_of
 from spacerobot_ros.campaign.targets import description_of
-from spacerobot_ros.errors import ParameterError, RecordingError, reason
+from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError, reason
 from spacerobot_ros.files import load_yaml, warn_once, write_whole
-from spacerobot_ros.measures import metric_names
+from spacerobot_ros.measures import Measures, metric_names, metrics_of_each
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.resources import is_path, robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_text
 from spacerobot_ros.simulation.capture import load_target, target_parameters
 from spacerobot_ros.version import __version__, source_hash
+
+if TYPE_CHECKING:
+    from spacerobot_ros.flight.flight import Flight
 
 DRAW_PREFIX = "draw."
 """Prefix of the columns for drawn quantities."""
@@ -40,6 +50,91 @@ _FLIGHTS_FOLDER = "flights"
 _FLUSH_PERIOD, _FLUSH_ROWS = 5.0, 2000
 """Wall time (s) and number of rows after which rows are written; if the process is killed, no more
 than this is lost."""
+
+
+ERROR = "error"
+"""Outcome of a draw that could not be flown."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """The result of one draw.
+
+    Attributes
+    ----------
+    draw
+        The drawn values.
+    outcome, reason
+        Goal outcome, or ``error``, and the message.
+    metrics
+        Metrics by name; empty if nothing was flown.
+    passed
+        Whether the goal was reached and all criteria were met.
+    engine
+        Name of the engine used.
+    wall_time, plan_time
+        Wall time of the flight, and wall time of its planning, s.
+    """
+
+    draw: Draw
+    outcome: str
+    reason: str
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    passed: bool = False
+    engine: str = ""
+    wall_time: float = math.nan
+    plan_time: float = math.nan
+
+    @classmethod
+    def of(cls, campaign: Campaign, draw: Draw, flight: Flight, engine: str) -> Row:
+        """Return a flight's row, including the campaign's user-defined metrics."""
+        measures = flight.measured(clearance=campaign.measures_clearance)
+        own_metrics = own_metrics_of(flight, campaign.own_metrics)
+        (row,) = cls.of_each(campaign, [(draw, measures)], engine, own_metrics)
+        return row
+
+    @classmethod
+    def of_each(
+        cls,
+        campaign: Campaign,
+        flown: Sequence[tuple[Draw, Measures]],
+        engine: str,
+        own_metrics: Mapping[str, float] = MappingProxyType({}),
+    ) -> list[Row]:
+        """Return the rows of flights with the same user-defined metrics."""
+        found = metrics_of_each([each for _, each in flown], description_of(campaign.scenario))
+        rows = []
+        for (draw, measures), metrics in zip(flown, found, strict=True):
+            outcome, metrics = measures.outcome.value, {**metrics, **own_metrics}
+            passed = passes_criteria(campaign.criteria, outcome, metrics)
+            times = measures.wall_time, measures.plan_time
+            rows.append(cls(draw, outcome, measures.message, metrics, passed, engine, *times))
+        return rows
+
+    @classmethod
+    def of_error(cls, draw: Draw, error: BaseException, engine: str) -> Row:
+        """Return the row for a draw that could not be flown."""
+        reason = str(error)
+        if not isinstance(error, SpaceRobotError):
+            reason = f"{type(error).__name__}: {' '.join(reason.split())}"
+        return cls(draw, ERROR, reason, engine=engine)
+
+    def record(self) -> dict[str, Any]:
+        """Return the values of the dataset's columns by name."""
+        return {
+            "flight": self.draw.number,
+            "seed": self.draw.seed,
+            "passed": self.passed,
+            "outcome": self.outcome,
+            "reason": self.reason,
+            **{f"{DRAW_PREFIX}{name}": value for name, value in self.draw.values.items()},
+            **self.metrics,
+            "wall_time_s": self.wall_time,
+            "plan_time_s": self.plan_time,
+            "engine": self.engine,
+            "fallback": self.draw.fallback,
+            "versions": versions_json(),
+        }
 
 
 @lru_cache(maxsize=1)
@@ -255,7 +350,7 @@ class Dataset:
         if not self._rows:
             return
         arrow, parquet = require_module("pyarrow"), require_module("pyarrow.parquet")
-        table = arrow.Table.from_pylist(list(map(_record_of_row, self._rows)), self._schema)
+        table = arrow.Table.from_pylist([row.record() for row in self._rows], self._schema)
         folder = self.folder / _FLIGHTS_FOLDER
         while (path := folder / f"part-{self._part:06d}.parquet").exists():
             self._part += 1
@@ -338,24 +433,6 @@ def _row_schema(campaign: Campaign) -> Any:
     fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
     fields += [("fallback", text), ("versions", text)]
     return arrow.schema(fields)
-
-
-def _record_of_row(row: Row) -> dict[str, Any]:
-    """Return a row as the values of its columns by name."""
-    return {
-        "flight": row.draw.number,
-        "seed": row.draw.seed,
-        "passed": row.passed,
-        "outcome": row.outcome,
-        "reason": row.reason,
-        **{f"{DRAW_PREFIX}{name}": value for name, value in row.draw.values.items()},
-        **row.metrics,
-        "wall_time_s": row.wall_time,
-        "plan_time_s": row.plan_time,
-        "engine": row.engine,
-        "fallback": row.draw.fallback,
-        "versions": versions_json(),
-    }
 
 
 def _fingerprint_of(campaign: Campaign) -> str:

@@ -7,11 +7,11 @@ from functools import cache
 from importlib.util import find_spec
 
 from spacerobot_ros.batch.targets import device_named
-from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.config import FLIGHTS, Campaign
+from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draw
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.campaign.rows import FLIGHTS, Row
 from spacerobot_ros.errors import SpaceRobotError
 
 _FLIGHTS_WORTH_A_DEVICE = 100_000

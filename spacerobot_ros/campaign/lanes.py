@@ -28,6 +28,7 @@ from spacerobot_ros.batch import (
 from spacerobot_ros.batch.flights import BatchResult
 from spacerobot_ros.batch.targets import device_named, vector_unit
 from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draw, drawn_flights
 from spacerobot_ros.campaign.one_by_one import (
     FirstPlans,
@@ -35,7 +36,6 @@ from spacerobot_ros.campaign.one_by_one import (
     nominal_robots,
     plant_robot,
 )
-from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.control.controller import build_controller, controlled_outputs
 from spacerobot_ros.control.goals import decided_message

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.campaign.config import Campaign
+from spacerobot_ros.campaign.config import FLIGHTS, Campaign
+from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
-from spacerobot_ros.campaign.rows import FLIGHTS, Row
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.flight import Flight

@@ -16,10 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.dataset import ERROR, Dataset
 from spacerobot_ros.campaign.metrics import metric_of
 from spacerobot_ros.campaign.results import PASSING, Results
-from spacerobot_ros.campaign.rows import ERROR
 from spacerobot_ros.campaign.statistics import (
     PERCENTILES,
     Influence,

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy.typing as npt
 
-from spacerobot_ros.campaign.config import Campaign, parse_campaign, scenario_of_section
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.config import FLIGHTS, Campaign, parse_campaign, scenario_of_section
+from spacerobot_ros.campaign.dataset import ERROR, Dataset, Row
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
-from spacerobot_ros.campaign.rows import ERROR, FLIGHTS, Row
 from spacerobot_ros.campaign.workers import KILLED, TaskDistributor, Workers, open_workers
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import scenario_to_fly

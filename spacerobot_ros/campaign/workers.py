@@ -32,11 +32,10 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from spacerobot_ros.campaign.config import Campaign, parse_campaign
-from spacerobot_ros.campaign.dataset import self_contained
+from spacerobot_ros.campaign.config import FLIGHTS, Campaign, parse_campaign
+from spacerobot_ros.campaign.dataset import Row, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.engines import engine_by_name, fly_all
-from spacerobot_ros.campaign.rows import FLIGHTS, Row
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.termination import end_with_parent

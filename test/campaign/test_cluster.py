@@ -19,9 +19,8 @@ import yaml
 from support.awaited import await_files
 from support.campaigns import campaign, section
 
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draws
-from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.campaign.workers import (
     open_workers,

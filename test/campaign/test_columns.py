@@ -13,10 +13,9 @@ import pytest
 from support.campaigns import campaign
 
 from spacerobot_ros.campaign.config import Criterion
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.report import metric_label
-from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.measures import (
     METRICS,

@@ -15,11 +15,11 @@ from support.slow import some_fast
 from spacerobot_ros.batch import targets
 from spacerobot_ros.campaign import engines, lanes
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
+from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.engines import fly_all, select_engine
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import RERUN_TOLERANCE, largest_deviation
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw

@@ -17,9 +17,8 @@ from support.campaigns import campaign
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
 from spacerobot_ros.campaign.config import Criterion, passes_criteria
-from spacerobot_ros.campaign.dataset import Dataset, self_contained
+from spacerobot_ros.campaign.dataset import Dataset, Row, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
-from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
 from spacerobot_ros.campaign.statistics import (
     Influence,

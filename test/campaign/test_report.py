@@ -20,7 +20,7 @@ from support.campaigns import campaign
 from support.chromium import browser, chromium
 
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draw, Draws
 from spacerobot_ros.campaign.report import (
     require_same_draws,
@@ -28,7 +28,6 @@ from spacerobot_ros.campaign.report import (
     write_comparison,
 )
 from spacerobot_ros.campaign.results import PASSING, Results
-from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import ParameterError
 

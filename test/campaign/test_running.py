@@ -18,12 +18,11 @@ from support.campaigns import campaign
 
 from spacerobot_ros.campaign import running, workers
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.dataset import ERROR, Dataset, Row
 from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.engines import fly_all
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.results import Results
-from spacerobot_ros.campaign.rows import ERROR, Row
 from spacerobot_ros.campaign.running import (
     RERUN_TOLERANCE,
     Progress,

@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 from support.campaigns import campaign
 
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draw, Draws
-from spacerobot_ros.campaign.rows import Row
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.campaign.workers import (
     TaskDistributor,

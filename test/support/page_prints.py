@@ -21,9 +21,8 @@ from support.figure_prints import prints_of, words_of
 
 from spacerobot_ros.campaign import report
 from spacerobot_ros.campaign.config import Campaign, parse_campaign, passes_criteria
-from spacerobot_ros.campaign.dataset import Dataset
+from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draws
-from spacerobot_ros.campaign.rows import Row
 
 DISPERSED: dict[str, Any] = {
     "mass.mass_1": {"uniform": {"loc": 0.9, "scale": 0.2}},
@@ -68,8 +67,8 @@ def write_flights(folder: Path, made: Campaign, better: float = 0.0) -> None:
             left = "needed corrections" if number < 50 else "It is too far."
         passed = passes_criteria(made.criteria, outcome, metrics)
         engine = "flights" if left else "lanes"
-        of = replace(draw, fallback=left)
-        rows.append(Row(of, outcome, reason, metrics, passed, engine, 0.125, number / 256))
+        draw = replace(draw, fallback=left)
+        rows.append(Row(draw, outcome, reason, metrics, passed, engine, 0.125, number / 256))
     dataset = Dataset(folder)
     dataset.begin(made)
     dataset.add(rows)
