@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from spacerobot_ros.commanding.goal_follower import Status
@@ -133,10 +133,6 @@ class GoalErrors:
                 if value is not None and not math.isnan(getattr(self, name))
             },
         )
-
-    def values(self) -> dict[str, float]:
-        """Return the errors by name."""
-        return {each.name: getattr(self, each.name) for each in fields(self)}
 
 
 @dataclass(frozen=True)

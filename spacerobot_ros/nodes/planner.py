@@ -46,7 +46,6 @@ from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import (
     PlannerState,
-    PlannerStatistics,
     PlannerStatus,
     ScheduleStart,
 )
@@ -76,11 +75,6 @@ class PlannerNode(CommanderNode):
     """FollowJointTrajectory clients, for ``output: trajectory``."""
     _announcement: Thread | None = None
     """Publishes the latest schedule."""
-
-    @property
-    def statistics(self) -> PlannerStatistics:
-        """Numbers and computation times of plans and commands so far."""
-        return self.commander.statistics
 
     # -- life cycle ---------------------------------------------------------------------------
 
@@ -114,7 +108,7 @@ class PlannerNode(CommanderNode):
                 self.create_subscription(kind, topic, partial(take, name), STREAM)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.listen_to_obstacles()
-        self.offer("~/statistics", lambda: self.statistics.to_json())
+        self.offer("~/statistics", lambda: self.commander.statistics.to_json())
 
     def start_message(self) -> str:
         """Return a log message with the method, the robot and the goal topic."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -175,9 +175,9 @@ def test_errors_of_a_status_count_where_the_goal_has_them() -> None:
         end_effector_attitude_error_rad=0.0,
     )
     mixed = own.reported_by(told)
-    assert list(mixed.values().values()) == pytest.approx([0.01, NAN, 0.03, NAN, 0.5], nan_ok=True)
+    assert list(asdict(mixed).values()) == pytest.approx([0.01, NAN, 0.03, NAN, 0.5], nan_ok=True)
     parts = ["position", "attitude"]
-    assert list(mixed.values()) == [*parts, *(f"end_effector_{each}" for each in parts), "joints"]
+    assert list(asdict(mixed)) == [*parts, *(f"end_effector_{each}" for each in parts), "joints"]
     assert own.reported_by(status("aborted", "a")) == own
     assert own.reported_by(ControllerStatus(ControllerState.REACHED)) is own
 

@@ -7,8 +7,8 @@ and ``nav2_msgs/action/NavigateToPose``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from geometry_msgs.msg import PoseStamped
@@ -17,7 +17,7 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.clock import Clock, ClockType
 from rclpy.serialization import deserialize_message
 
-from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, Progress
+from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, GoalErrors, Progress
 from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.messages.builders import goal_message
 from spacerobot_ros.nodes.common.messages import (
@@ -106,13 +106,13 @@ class FlyToAction:
         """Return a goal's progress as a message."""
         message = self.kind.Feedback(phase=progress.phase)
         set_duration(message.remaining_time, progress.remaining_time or 0.0)
-        _set_errors(message.errors, progress.errors.values())
+        _set_errors(message.errors, progress.errors)
         return message
 
     def result(self, result: FlyToResult) -> Any:
         """Return a result as a message."""
         message = self.kind.Result(outcome=result.outcome, message=result.message)
-        _set_errors(message.errors, result.errors.values())
+        _set_errors(message.errors, result.errors)
         return message
 
 
@@ -283,6 +283,6 @@ def set_duration(message: Any, seconds: float) -> None:
     message.sec, message.nanosec = divmod(round(seconds * SECOND), SECOND)
 
 
-def _set_errors(message: Any, errors: Mapping[str, float]) -> None:
-    for name, value in errors.items():
+def _set_errors(message: Any, errors: GoalErrors) -> None:
+    for name, value in asdict(errors).items():
         setattr(message, name, float(value))
