@@ -74,6 +74,9 @@ class _Path:
 
     @classmethod
     def of(cls, geometry: CollisionGeometry, positions: Array, base: BasePoses | None) -> _Path:
+        if len(positions) == 1:
+            twice = np.zeros(2, dtype=np.int64)
+            positions, base = positions[twice], None if base is None else base.rows(twice)
         bounds = geometry.lower_bounds(geometry.poses(positions, base))
         reaches, from_base = geometry.largest_lever_arms(positions)
         moved = np.abs(np.diff(geometry.moving_positions(positions), axis=0))
@@ -89,8 +92,6 @@ class _Path:
     @property
     def lower_bounds_along_path(self) -> Array:
         """Lower bounds (P,) on the distances along the whole path, m."""
-        if not len(self.largest_motions):
-            return np.asarray(self.distance_bounds.min(axis=0))
         return np.asarray(
             ((self.distance_bounds[:-1] + self.distance_bounds[1:] - self.largest_motions) / 2).min(
                 axis=0
@@ -99,8 +100,6 @@ class _Path:
 
     def interpolated(self, ticks: Array) -> tuple[Array, BasePoses | None]:
         """Return shapes (K, n) and base poses at times (K,) in ticks."""
-        if len(self.positions) == 1:
-            return self.positions, self.base
         before = np.minimum(ticks.astype(int), len(self.positions) - 2)
         share = (ticks - before)[:, np.newaxis]
         shapes = (1 - share) * self.positions[before] + share * self.positions[before + 1]
@@ -161,16 +160,6 @@ def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) 
     def distances(ticks: Array) -> Array:
         return geometry.distances(pair, geometry.poses(*path.interpolated(ticks)))
 
-    def approach(distance: float, tick: float) -> Approach:
-        shapes, base = path.interpolated(np.array([tick]))
-        place = None
-        if base is not None and geometry.with_obstacles[pair]:
-            place = geometry.nearest_point_on_obstacle(pair, shapes[0], base)
-        return Approach(geometry.links_of(pair), pair, distance, tick, shapes[0], place)
-
-    if not len(motion):
-        distance = float(distances(np.zeros(1))[0])
-        return approach(distance, 0.0) if distance < limit else None
     close = (bounds[:-1, pair] + bounds[1:, pair] - motion[:, pair]) / 2 < limit
     starts = np.flatnonzero(close)
     if not len(starts):
@@ -196,4 +185,10 @@ def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) 
         left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
         d_0, d_1 = np.concatenate([d_0, d]), np.concatenate([d, d_1])
         v = np.concatenate([v, v]) / 2
-    return approach(best, at) if best < limit else None
+    if best >= limit:
+        return None
+    shapes, base = path.interpolated(np.array([at]))
+    place = None
+    if base is not None and geometry.with_obstacles[pair]:
+        place = geometry.nearest_point_on_obstacle(pair, shapes[0], base)
+    return Approach(geometry.links_of(pair), pair, best, at, shapes[0], place)

@@ -194,36 +194,6 @@ class ConnectionBounds:
         turn = np.where(np.isnan(turn), np.inf, turn)
         return cls(_coupled(robot, turn), _coupled(robot, center), least)
 
-    def of_link(self, robot: SpaceRobot, link: str) -> LinkBounds:
-        """Return bounds on the motion of a link of the robot."""
-        tree, (body, pose) = (
-            _Tree.of(robot, robot.lower, robot.upper),
-            robot.description.frames[link],
-        )
-        far = tree.reach(body, pose.r)
-        turning, levers = tree.chain(body, pose.r)
-        place = self.turn * far + self.center + _coupled(robot, levers)
-        return LinkBounds(self.turn + _coupled(robot, turning), place, far)
-
-
-@dataclass(frozen=True)
-class LinkBounds:
-    """Bounds on the motion of a link at zero momentum, for all shapes within the joint limits.
-
-    Attributes
-    ----------
-    turn
-        (n,) largest link rotation caused by each joint, rad per rad or m.
-    place
-        (n,) largest displacement of the link origin, m per rad or m.
-    distance
-        Largest distance of the link origin from the centre of mass, m.
-    """
-
-    turn: Array
-    place: Array
-    distance: float
-
 
 def _coupled(robot: SpaceRobot, values: Array) -> Array:
     """Return bounds (n,) per coordinate from bounds (m,) per moving joint."""
@@ -484,20 +454,25 @@ def link_demands(
     """Yield the end-effector motions that the goals in a request require; each is reduced by the
     tolerances."""
     state, tolerance, drift = request.state, request.tolerance, connection.drift(boundary)
+    tree = _Tree.of(robot, robot.lower, robot.upper)
     for goal in request.goal.end_effectors:
-        of_link = connection.of_link(robot, goal.link)
+        body, pose = robot.description.frames[goal.link]
+        # From the centre of mass, farther than the origin of the link in any shape.
+        far = tree.reach(body, pose.r)
+        turning, levers = (_coupled(robot, each) for each in tree.chain(body, pose.r))
         position, quaternion = end_effector_pose(
             robot, goal.link, state.position, state.quaternion, state.q
         )
         way = float(np.linalg.norm(goal.position - position)) - tolerance.position
         moves = f"'{goal.link}' moves by {way:.4g} m {_WITHIN} of the joints"
-        yield Demand(of_link.place, way, moves, drift * of_link.distance)
+        place = connection.turn * far + connection.center + levers
+        yield Demand(place, way, moves, drift * far)
         if goal.quaternion is None:
             continue
         turn = quaternion_multiply(quaternion_inverse(quaternion), goal.quaternion)
         angle = _least_turn(turn, np.eye(3)) - tolerance.attitude
         turns = f"'{goal.link}' rotates by {angle:.4g} rad {_WITHIN} of the joints"
-        yield Demand(of_link.turn, angle, turns, drift)
+        yield Demand(connection.turn + turning, angle, turns, drift)
 
 
 def _shortest_times(demands: Sequence[Demand], limits: MotionLimits, ends: Array) -> Array:

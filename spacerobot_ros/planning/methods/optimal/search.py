@@ -139,8 +139,8 @@ quadruped's plan took 1.75 instead of 1.00 s."""
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
 ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
-12 and 36 s of an idle core (0.5 us per nonzero). With 1.25e5, two arms took 40 s for the same
-plan."""
+8 and 25 s of an idle core (0.35 us per nonzero). With 1.25e5, two arms took 60 % longer for the
+same plan."""
 
 _MAX_STALLED_ROUNDS, _STALLED_SHARE = 3, 0.9
 """Number of successive paths, on the way to a clear path, that still lack more than this
@@ -677,17 +677,19 @@ class _Search:
         if options.duration > 0:
             duration = self._given_duration
         kept = kept.beside(path)
+        first = 1.0
         if self._clears_coarsely:
             path, _ = self._clear(kept, self._coarse, path, duration, reach)
             path, _ = self._shorten(kept.beside(path, _NEAR), self._coarse, path, None)
             # A path that is clear on the coarse grid is mostly clear on the full one, and as fast.
+            first = 1 / _REACH_DIVISOR
             kept, path = kept.beside(path, _NEAR), path.stretched(_RESAMPLED_TIME_FACTOR)
-            path, made = self._shorten(kept, grid, path, None, 1 / _REACH_DIVISOR)
+            path, made = self._shorten(kept, grid, path, None, first)
             duration, reach = _RECLEARED_TIME_FACTOR * path.duration, 1.0
         if made is None:
             path, made = self._clear(kept, grid, path, duration, reach)
             if options.duration == 0:
-                path, made = self._shorten(kept.beside(path, _NEAR), grid, path, made)
+                path, made = self._shorten(kept.beside(path, _NEAR), grid, path, made, first)
         assert made is not None
         if made.duration > max(options.longest, options.duration) + self._period / 2:
             raise UnusableCandidateError(_NO_PATH_FOUND)
