@@ -53,7 +53,7 @@ def instants_of(intervals: int) -> int:
 
 
 class DistanceLibrary:
-    """What the pairs of one robot are kept apart by.
+    """Clearance of one robot, with what planes between its pairs are computed from.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class KeptDistances:
     Parameters
     ----------
     library
-        The rows.
+        The clearance and the poses of the robot.
     boundary
         Both ends.
     required

@@ -150,6 +150,8 @@ class MultipleShooting:
 
     def __init__(self, stages: Stages, intervals: int, tolerance: float = TOLERANCE) -> None:
         self.intervals = intervals
+        self.feasible = False
+        """Whether the last solution satisfies the constraints."""
         self.converged = False
         """Whether the solver converged to the last solution."""
         self.lack = 0.0
@@ -189,7 +191,8 @@ class MultipleShooting:
     ) -> Trajectory | None:
         """Return the fastest trajectory near ``guess``; None if none.
 
-        If links may be closer than required, it may be the last iterate, which is not feasible.
+        If links may be closer than required, it may be the last iterate, which is not
+        :attr:`feasible`.
 
         For a fixed time, return the trajectory of least effort, that is, of the least mean square
         of accelerations divided by joint speeds.
@@ -246,13 +249,13 @@ class MultipleShooting:
         )
         stats = solver.stats()
         self.converged = bool(stats["success"])
+        self.feasible = self.converged or self._monitor.best is not None
         x = result["x"].full().ravel()
         if not self.converged:
             # If the goal drifts away, no duration compensates for the violations in each interval.
             infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
-            if infeasible or (self._monitor.best is None and not lack):
+            if infeasible or not (self.feasible or lack):
                 return None
-            # On the way to a clear path, the last iterate has better planes than the guess.
             x = x if self._monitor.best is None else self._monitor.best
         self.lack = float(x[-1]) if layout.has_lack else 0.0
         h, (X, s, v, _) = float(x[0]), (x[each] for each in layout.knots())

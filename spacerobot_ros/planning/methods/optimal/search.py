@@ -713,6 +713,10 @@ class _Search:
         for _ in range(_MAX_CLEARING_ROUNDS):
             path = self._solve_apart(kept, grid, path, duration, around)
             lack = self._lack
+            # An infeasible path near a solution has better planes than that solution; from a guess,
+            # such paths took most of the time, and none of them led to a clear one.
+            if reach > 1 and not self._feasible:
+                raise UnusableCandidateError(_NO_PATH_FOUND)
             near, made = self._approaches(kept, grid, path)
             if not near:
                 return path, made
@@ -841,7 +845,7 @@ class _Search:
             aim or problem.boundary, limits, guess, stop, bounds, near, refining=refining
         )
         problem.cancellation.raise_if_requested()
-        self._lack = solver.lack
+        self._lack, self._feasible = solver.lack, solver.feasible
         if solution is None:
             raise UnusableCandidateError(_NO_PATH_FOUND)
         if pairs:
