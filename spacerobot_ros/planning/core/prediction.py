@@ -39,14 +39,10 @@ def coasting_positions(
         Times (K,), s; shapes (K, n), m or rad; and quaternions (K, 4) of R_WB, (x, y, z, w).
     """
     start = matrix_from_quaternion(state.quaternion) @ robot.center_of_mass(state.q)
-    r_cm = state.position + start
-    drift = state.linear_momentum / robot.total_mass
-    return np.array(
-        [
-            r_cm + t * drift - matrix_from_quaternion(quaternion) @ robot.center_of_mass(q)
-            for t, q, quaternion in zip(time, shapes, quaternions, strict=True)
-        ]
-    )
+    drift = np.multiply.outer(time, state.linear_momentum / robot.total_mass)
+    c = robot.function("center_of_mass", compile=False)(shapes.T).full().T
+    R_WB = matrices_from_quaternions(quaternions)
+    return np.asarray(state.position + start + drift - np.einsum("nab,nb->na", R_WB, c))
 
 
 class BasePrediction:
@@ -128,11 +124,7 @@ class BasePrediction:
         """
         if attitudes is None:
             attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)
-        R_0B = matrix_from_quaternion(state.quaternion)
-        r_WC = state.position + R_0B @ self._robot.center_of_mass(state.q)
-        centers = self._robot.function("center_of_mass", compile=False)(positions.T).full().T
-        R_WB = matrices_from_quaternions(attitudes)
-        return BasePoses(r_WC - np.einsum("nab,nb->na", R_WB, centers), attitudes)
+        return BasePoses(self.positions(state, np.zeros(1), positions, attitudes), attitudes)
 
     def path(self, state: RobotState, positions: Array, attitudes: Array | None = None) -> BasePath:
         """Return the base path for the shapes ``positions`` (N + 1, n), at some of the ticks.
