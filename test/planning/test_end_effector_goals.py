@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from support.hand_motion import end_of_motion
+from support.planner_loop import robot_of
 
 from spacerobot_ros.errors import GoalError, NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
@@ -35,10 +36,6 @@ ARM = np.array([0.4, -0.9, 1.1])
 
 def urdf_of(robot: str) -> str:
     return (FOLDER / f"{robot}.urdf").read_text("utf-8")
-
-
-def robot_of(name: str) -> SpaceRobot:
-    return SpaceRobot.from_file(FOLDER / f"{name}.urdf")
 
 
 def at_rest(q: npt.ArrayLike) -> RobotState:

@@ -46,7 +46,6 @@ from support.planner_phases import (
 )
 
 from spacerobot_ros.errors import PlanningError
-from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
@@ -428,29 +427,23 @@ def test_a_tracking_error_that_cannot_be_measured_is_none() -> None:
 # -- events -----------------------------------------------------------------------------------
 
 
-def events_of(loop: Loop) -> list[tuple[str, str]]:
-    """Return kind and goal of every event of an executive, in order."""
-    events = [output for output in loop.outputs if isinstance(output, FlightEvent)]
-    return [(event.kind.value, event.goal_id) for event in events]
-
-
 def test_each_change_of_a_goal_is_one_event() -> None:
     loop = resting()
     stub_of(loop).overshoot = 0.1
     assert loop.decide(NEAR).corrections == 1
     planned = [("plan_started", "goal-1"), ("plan_ready", "goal-1")]
-    assert events_of(loop) == [
+    assert loop.event_kinds == [
         *planned,
         ("goal_accepted", "goal-1"),
         ("correction", "goal-1"),
         *planned,
     ]
-    first = next(output for output in loop.outputs if isinstance(output, FlightEvent))
+    first = loop.events[0]
     assert first.time_s == 0.0
     assert dict(first.about) == {"reason": "new goal"}
     loop.outputs.clear()
     loop.decide(FAR)
-    assert events_of(loop) == [("plan_started", "goal-2")]
+    assert loop.event_kinds == [("plan_started", "goal-2")]
 
 
 def test_no_joint_is_stuck_at_a_plant_where_no_command_is_in_force() -> None:
@@ -467,11 +460,7 @@ def test_stuck_joints_are_an_event_that_names_them() -> None:
     loop = long_flight()
     quick_without_joints(loop)
     stuck(loop)
-    (event,) = [
-        output
-        for output in loop.outputs
-        if isinstance(output, FlightEvent) and output.kind is EventKind.STUCK_JOINT
-    ]
+    (event,) = [event for event in loop.events if event.kind is EventKind.STUCK_JOINT]
     assert (event.level, event.goal_id, dict(event.about)) == (1, "goal-1", {"joints": "slider_1"})
 
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from support.hand_motion import end_of_motion
-from support.planner_loop import Loop
+from support.planner_loop import Loop, robot_of
 
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
@@ -35,10 +35,6 @@ ARM = np.array([0.4, -0.9, 1.1])
 LINK = "left_link_7"
 DUAL = np.array([0.2, -0.3, 0.4, 0.5, 0.1, -0.2, 1.0, 1.2, 0.3, 0.1, 0.6, 0.7, -0.1, 0.2])
 PERIOD = 0.08
-
-
-def robot_of(name: str) -> SpaceRobot:
-    return SpaceRobot.from_file(FOLDER / f"{name}.urdf")
 
 
 def poses(robot: str, positions: Array, *links: str) -> dict[str, Pose]:

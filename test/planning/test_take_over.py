@@ -22,7 +22,7 @@ from support.planner_loop import (
 )
 from support.planner_phases import FAR, OTHER, stub_of
 
-from spacerobot_ros.events import Event as FlightEvent
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
@@ -57,11 +57,6 @@ def tracker_of(loop: Loop) -> TrajectoryTracker:
 
 def phase_of(loop: Loop) -> Phase:
     return loop.executive.phase
-
-
-def events_of(loop: Loop) -> list[tuple[str, str]]:
-    events = [output for output in loop.outputs if isinstance(output, FlightEvent)]
-    return [(event.kind.value, event.goal_id) for event in events]
 
 
 # -- another goal -----------------------------------------------------------------------------
@@ -132,7 +127,7 @@ def test_a_late_plan_is_tried_for_once_more_and_then_from_rest() -> None:
     loop.held.release()
     loop.tick()
     assert phase_of(loop) is Phase.BRAKING
-    assert [kind for kind, _ in events_of(loop)].count("plan_late") == 2
+    assert [kind for kind, _ in loop.event_kinds].count("plan_late") == 2
     loop.tick(20)
     assert phase_of(loop) is Phase.PLANNING
     loop.held.release()
@@ -203,7 +198,10 @@ def test_of_many_goals_only_the_newest_is_planned_for(held: bool) -> None:
         loop.held.release()
     assert loop.statuses[-1].state is PlannerState.REACHED
     assert loop.statuses[-1].goal_id == newest
-    assert [goal for kind, goal in events_of(loop) if kind == "goal_accepted"] == ["goal-1", newest]
+    assert [goal for kind, goal in loop.event_kinds if kind == "goal_accepted"] == [
+        "goal-1",
+        newest,
+    ]
     assert len(loop.starts) == 2
     assert loop.error_to(OTHER)[0] < 1e-3
 
@@ -316,17 +314,13 @@ def test_a_take_over_is_one_event() -> None:
     loop.outputs.clear()
     loop.propose_goal(OTHER)
     loop.until(PlannerState.REACHED)
-    assert events_of(loop) == [
+    assert loop.event_kinds == [
         ("plan_started", "goal-2"),
         ("plan_ready", "goal-2"),
         ("goal_accepted", "goal-2"),
         ("plan_taken_over", "goal-2"),
     ]
-    (taken,) = [
-        output
-        for output in loop.outputs
-        if isinstance(output, FlightEvent) and output.kind.value == "plan_taken_over"
-    ]
+    taken = loop.events[-1]
     assert taken.time_s == loop.starts[-1].stamp_ns / 1e9
     assert taken.about["reason"] == "new goal in motion"
 
@@ -340,11 +334,8 @@ def test_the_remaining_motion_is_planned_again_where_it_leads_beside_the_goal() 
     stub_of(loop).wrong_path = 0.05
     loop.propose_goal(([0.05, 0.0, 0.0], [0.0, 0.0, 0.0]))
     loop.tick(200)
-    reasons = [
-        output.about["reason"]
-        for output in loop.outputs
-        if isinstance(output, FlightEvent) and output.kind.value == "plan_taken_over"
-    ]
+    taken = [event for event in loop.events if event.kind is EventKind.PLAN_TAKEN_OVER]
+    reasons = [event.about["reason"] for event in taken]
     assert reasons[0] == "new goal in motion"
     assert set(reasons[1:]) == {"shrinking horizon"}
     stamps = [start.stamp_ns for start in loop.starts[1:]]

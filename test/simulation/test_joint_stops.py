@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.effort_flights import robot_of
 from support.oracles import Array
 from support.random_robots import random_robot_urdf
 from support.slow import some_fast
@@ -32,11 +33,6 @@ SLEDGE = f"""<robot name="sledge">
     <axis xyz="1 0 0"/><limit lower="-{STROKE}" upper="{STROKE}" velocity="1" effort="100"/></joint>
 </robot>"""
 REDUCED = MASS * SLIDER / (MASS + SLIDER)  # kg: of the slide, momentum given
-
-
-@cache
-def robot_of(urdf: str) -> SpaceRobot:
-    return SpaceRobot.from_urdf(urdf)
 
 
 @cache

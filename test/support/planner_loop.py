@@ -353,10 +353,18 @@ class Loop:
         return [output for output in self.outputs if isinstance(output, ScheduleStart)]
 
     @property
+    def events(self) -> list[Event]:
+        return [output for output in self.outputs if isinstance(output, Event)]
+
+    @property
+    def event_kinds(self) -> list[tuple[str, str]]:
+        """Kind and goal of every event, in order."""
+        return [(event.kind.value, event.goal_id) for event in self.events]
+
+    @property
     def plan_reasons(self) -> list[PlanReason]:
         """Why plans were requested."""
-        events = [output for output in self.outputs if isinstance(output, Event)]
-        started = [each for each in events if each.kind is EventKind.PLAN_STARTED]
+        started = [each for each in self.events if each.kind is EventKind.PLAN_STARTED]
         return [PlanReason(each.about["reason"]) for each in started]
 
     @property
