@@ -168,7 +168,7 @@ def scheduler() -> Iterator[Any]:
     """Return a scheduler of dask.distributed in this process, and its one worker."""
     distributed = pytest.importorskip("distributed")
     given = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "protocol": "inproc"}
-    with distributed.LocalCluster(**given, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(**given, dashboard_address=":0") as cluster:
         yield cluster
 
 
