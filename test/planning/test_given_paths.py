@@ -11,8 +11,9 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planning.test_resolved_rate import ARM, ATTITUDE, PERIOD, PLACE, poses, robot_of
+from planning.test_resolved_rate import ARM, ATTITUDE, PERIOD, PLACE, poses
 from scipy.spatial.transform import Rotation, Slerp
+from support.planner_loop import robot_of
 
 from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.planning import Goal, RobotState, Tolerance, build_method, plan
