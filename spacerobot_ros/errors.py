@@ -26,7 +26,7 @@ def reason(error: Exception) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number of things in words: ``1 joint``, ``2 joints``."""
+    """Return a count with its noun:  ``1 joint``, ``2 joints``."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 

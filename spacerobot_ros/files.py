@@ -77,7 +77,7 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
 
 
 def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
-    """Write a report, picture or result and create its folders, completely or not at all.
+    """Write a report, picture or result, completely or not at all; create its folders.
 
     ``mode`` specifies the permissions of a new file; an existing file keeps its permissions. A bag
     is not replaced, because it may be the only record of a flight. Devices and pipes are supported.
@@ -245,7 +245,7 @@ class Cache:
         self.folder = folder
 
     def load(self, name: str, key: str) -> tuple[Path, bytes] | None:
-        """Return the path and content of the file stored under this key; None without one."""
+        """Return the path and content of the file stored under this key, or None."""
         path = self.folder / name
         if not path.is_file():
             return None

@@ -355,7 +355,7 @@ METRICS: dict[str, Metric] = {
 def metrics_of_each(
     measures: Sequence[Measures], robot: RobotDescription
 ) -> list[dict[str, float]]:
-    """Return all metrics by name, including joint metrics, for flights of one robot; NaN: none."""
+    """Return all metrics by name, with joint metrics, for flights of one robot; NaN: no value."""
     if not measures:
         return []
     joints: dict[str, Any] = {

@@ -34,8 +34,8 @@ _GROUP_OF_EVERY_NODE = "qos_overrides."
 def is_of_every_node(name: str) -> bool:
     """Whether a parameter is common to all nodes rather than part of a node's configuration.
 
-    rclpy declares such parameters, and they appear in `ros2 param dump` and in bags; ``autostart``
-    is this package's. Such parameters are irrelevant to a flight.
+    rclpy declares such parameters, and they appear in `ros2 param dump` and in bags; this package
+    adds ``autostart``. Such parameters are irrelevant to a flight.
     """
     return name in _OF_EVERY_NODE or name.startswith(_GROUP_OF_EVERY_NODE)
 
@@ -276,7 +276,7 @@ def _declared_in_class(
 
 
 def configured(kind: type[C], values: Mapping[str, Any]) -> C:
-    """Return a configuration with these ``values``, given by full name; omitted parameters have
+    """Return a configuration with these ``values``, given by full name; omitted parameters keep
     their defaults.
 
     Values with other names are ignored; see :func:`require_known`.

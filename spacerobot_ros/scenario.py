@@ -450,7 +450,7 @@ def _described(text: str, file: Path, changed: float) -> RobotDescription:
 
 def scenario_text(scenario: Scenario) -> str:
     """Return the scenario as parameter file text, including its overrides, but not the published
-    values and node kills.
+    values or node kills.
     """
     about: dict[str, Any] = {"description": scenario.description, **scenario._goal_poses()}
     for part, keys in KEYS_OF_PARTS.items():

@@ -109,7 +109,7 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any] | None]:
-    """Return the parameters in a scenario file, as :func:`read_sections`, and the values in its
+    """Return the parameters in a scenario file, as in :func:`read_sections`, and the values in its
     section ``scenario``; None: there is no such section, but the plant has a robot.
 
     Raises

@@ -6,8 +6,8 @@ bag, receives a request instead (:func:`graceful_shutdown`). A second signal, at
 later, ends the process immediately. A timer also ends the process if a library suppresses the
 exception. Python handles signals once a call to C code has returned.
 
-On Linux, if a process ends, the kernel sends a signal to the children that the process started with
-:func:`start_child`.
+On Linux, when a process ends, the kernel sends a signal to the children that the process started
+with :func:`start_child`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Terminated(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """Exit code with which shells report this signal."""
+        """Exit code that shells report for this signal."""
         return 128 + self.number
 
 
@@ -173,7 +173,7 @@ def guarded() -> Iterator[bool]:
 def graceful_shutdown(
     on_request: Callable[[], None] = lambda: None,
 ) -> Iterator[Callable[[], bool]]:
-    """Convert signals to a request while work is completed.
+    """Convert signals to a termination request while work is completed.
 
     Yields a function that returns whether termination was requested; the code in the context calls
     it regularly.

@@ -42,8 +42,8 @@ class Arrival(NamedTuple):
 class Stack:
     """Context manager for nodes in one executor, in lockstep, in a separate ROS domain.
 
-    The plant starts at the first goal, once all nodes are connected. Simulated time continues
-    while the nodes spin.
+    The plant starts at the first goal, once all nodes are connected. Simulated time advances while
+    the nodes spin.
 
     Parameters
     ----------

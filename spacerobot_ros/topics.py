@@ -101,7 +101,7 @@ class Topic:
 
     @property
     def short_type(self) -> str:
-        """The type as in ROS documents: ``nav_msgs/Odometry``."""
+        """The type in ROS notation, such as ``nav_msgs/Odometry``."""
         return self.type.replace("/msg/", "/")
 
 
@@ -486,7 +486,7 @@ def state_topics(end_effectors: Iterable[str] = ()) -> list[Topic]:
 
 
 class Request(Enum):
-    """A request that a service of the stack performs."""
+    """A request that a service of the stack carries out."""
 
     ABORT = "abort"
     """The planner and the controller drop their goals; the joints brake."""

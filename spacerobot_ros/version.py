@@ -1,4 +1,4 @@
-"""The package version, in the lowest layer; ``package.xml`` has the same version."""
+"""The package version, defined in the lowest layer; ``package.xml`` has the same version."""
 
 import hashlib
 from functools import lru_cache

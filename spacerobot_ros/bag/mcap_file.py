@@ -282,7 +282,7 @@ class McapFile(Writer):
             raise
 
     def check(self) -> None:
-        """Raise RecordingError unless the path still names this file with its full size."""
+        """Raise RecordingError unless this file still exists at its path, at full size."""
         problem = ""
         try:
             ours, theirs = os.fstat(self._raw.fileno()), os.stat(self.path)
@@ -332,7 +332,7 @@ class McapFile(Writer):
         Writer.flush(self)
 
     def finish(self) -> None:
-        """Complete and close the file; one of ROS 2 ends with rosbag2's metadata."""
+        """Complete and close the file; a ROS 2 bag ends with rosbag2's metadata."""
         try:
             self.flush()
             if self._profile == "ros2":

@@ -116,7 +116,7 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
 
 
 class RecordedChannel(NamedTuple):
-    """A channel in a file, which is a topic from one publisher, and the definition of its type."""
+    """A channel in a file (a topic from one publisher), and its type definition."""
 
     channel: Channel
     schema: Schema
@@ -163,7 +163,7 @@ class BagFile:
 
     @contextmanager
     def open(self) -> Iterator[BinaryIO]:
-        """Open the file; convert every defect into a one-sentence error.
+        """Open the file; report any defect as a one-sentence error.
 
         Raises
         ------
@@ -285,7 +285,7 @@ def records_in_chunk(data: bytes, place: int) -> Iterator[tuple[int, int]]:
 
 
 def parse_record(record: bytes) -> McapRecord | None:
-    """Return a record, or None if MCAP does not define its kind; a chunk remains packed."""
+    """Return a record, or None if MCAP does not define its kind; a chunk is not unpacked."""
     if record[0] not in _OPCODES:
         return None
     return next(StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records)

@@ -84,7 +84,7 @@ _STATUS_FORMAT = KeyValueFormat(
 
 @dataclass(frozen=True)
 class ReplayMessage:
-    """One message to publish: its topic in the bag, log time in nanoseconds, serialised form."""
+    """One message to publish: its topic in the bag, its log time (ns) and its serialised form."""
 
     topic: str
     log_time_ns: int
@@ -228,12 +228,12 @@ class Playback:
         return min(now, max(self._next_message.log_time_ns, self.start_ns))
 
     def run(self, clock_ns: int) -> None:
-        """Let time advance; ``clock_ns`` is the current clock time."""
+        """Start or resume the replay; ``clock_ns`` is the current clock time."""
         if self._clock_ns is None:
             self._clock_ns = clock_ns
 
     def pause(self, clock_ns: int) -> None:
-        """Stop time."""
+        """Pause the replay; ``clock_ns`` is the current clock time."""
         self._bag_ns, self._clock_ns = self._time(clock_ns), None
 
     def take_due(self, clock_ns: int, max_count: int) -> Iterator[ReplayMessage]:

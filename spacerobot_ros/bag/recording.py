@@ -15,7 +15,7 @@ from spacerobot_ros.times import SECOND
 
 
 class RecordingState(Enum):
-    """Handling of messages that arrive at a recorder."""
+    """What a recorder does with incoming messages."""
 
     PAUSED = "paused"
     """Messages are dropped; the last message of each latched topic is kept until recording
@@ -55,7 +55,7 @@ class _EarlyMessage(NamedTuple):
 
 
 class Recording:
-    """Writes messages with one time base for the whole bag; it is initially paused.
+    """Writes messages with one time base for the whole bag; recording is initially paused.
 
     Messages are logged at the published clock time; earlier messages are logged at the time of the
     first clock message. If no clock is published for ``clock_wait``, or too many messages wait for
@@ -141,7 +141,7 @@ class Recording:
     def record(self, channel: int, message: bytes, published_ns: int = 0) -> None:
         """Write a message, or keep it until the bag's time base is chosen.
 
-        ``published_ns`` is the publish time of the message; 0 selects the recording time.
+        ``published_ns`` is the publication time of the message; 0 selects the recording time.
         """
         if self.state is not RecordingState.ON_CLOCK:
             arrival_ns = self._wall_time()
@@ -174,7 +174,7 @@ class Recording:
         self._fail_on_error(self.writer.flush)
 
     def check(self) -> None:
-        """Check that the bag file still exists with its full size."""
+        """Check that the bag file still exists and has its full size."""
         self._fail_on_error(self.writer.check)
 
     def describe(self, name: str, values: dict[str, str]) -> None:

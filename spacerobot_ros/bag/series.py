@@ -72,7 +72,7 @@ class TopicSeries:
 
     @property
     def paths(self) -> list[str]:
-        """Field paths, for :meth:`field`; a list of messages has one path."""
+        """Field paths, for :meth:`field`; a field that is a list of messages has one path."""
         return list(self._leaf_paths(self.type_name, ""))
 
     def _leaf_paths(self, type_name: str, prefix: str) -> Iterator[str]:

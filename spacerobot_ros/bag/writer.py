@@ -246,7 +246,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def close(self) -> None:
         """Write pending messages and the summary, and close the file; further calls do nothing.
 
-        After a failure, the file is closed although it is incomplete: `spacerobot salvage`
+        After a failure, the file is closed even though it is incomplete: `spacerobot salvage`
         completes it.
 
         Raises
@@ -297,7 +297,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                     )
 
     def check(self) -> None:
-        """Check that the bag file still exists with its full size.
+        """Check that the bag file still exists and has its full size.
 
         Raises
         ------

@@ -176,7 +176,7 @@ R = TypeVar("R", InitialStates, SensorErrors, InertialParameters)
 
 
 def joined_rows(each: Sequence[R]) -> R:
-    """Return one object with the concatenated rows of several."""
+    """Return one object with the concatenated rows of several objects."""
     names = [part.name for part in fields(each[0])]
     parts = (np.concatenate([getattr(one, name) for one in each]) for name in names)
     return type(each[0])(*parts)
@@ -202,7 +202,7 @@ class FollowedSchedule:
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Given commands for each tick, independent of measurements."""
+    """Prescribed commands for each tick, independent of measurements."""
 
     table: Array
     """(T, command_size) or (N, T, command_size); see :attr:`Flights.command_size`. Zero after the

@@ -55,7 +55,7 @@ def fly_lanes(
 ) -> BatchResult:
     """Fly many flights at once, one per SIMD lane or device thread.
 
-    Every flight equals the plant's flight with the same values up to rounding (1e-12 in the
+    Every flight matches the plant's flight with the same values up to rounding (1e-12 in the
     benchmark flights). ``stopped`` is called every 2000 ticks; once it returns True, the result is
     incomplete.
 

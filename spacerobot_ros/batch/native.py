@@ -32,7 +32,7 @@ from spacerobot_ros.simulation.effort_plant import JointStops
 
 
 class Program(IntEnum):
-    """Command kind: constant, along a schedule, from a controller, or set before each step."""
+    """Kind of command: constant, along a schedule, from a controller, or set before each step."""
 
     HELD = 0
     FOLLOWED = 1
@@ -91,11 +91,11 @@ class RowLayout:
         return self.slices[name]
 
     def first_row(self, name: str, offset: int = 0) -> int:
-        """Return the first row with a name, or the row ``offset`` rows later."""
+        """Return the first row with the given name, or the row ``offset`` rows later."""
         return int(self.slices[name].start) + offset
 
     def row_count(self, name: str) -> int:
-        """Return the number of rows with a name."""
+        """Return the number of rows with the given name."""
         rows = self.slices[name]
         return int(rows.stop - rows.start)
 
@@ -124,7 +124,7 @@ class CompiledTick:
     def of(
         cls, flights: Flights, model: ModelFunctions, target: Target, link: str = ""
     ) -> CompiledTick:
-        """Compile the tick for flights, or return it from an earlier compilation.
+        """Compile the tick for flights, or reuse an earlier compilation.
 
         If ``link`` is given, reports end with the position (3) of that link in B, m.
 

@@ -184,12 +184,12 @@ class SteppedFlights:
         self._begin(chosen)
 
     def remember_starts(self) -> None:
-        """Keep the states and masses with which flights on a device began, for :meth:`restart`."""
+        """Store the states and masses with which flights on a device began, for :meth:`restart`."""
         self._lanes.remember_starts()
 
     def restart(self, rows: Any, starts: Any) -> None:
         """Restart some flights on a device (K,), each as the remembered flight in ``starts`` (K,)
-        began; both are flight indices on the device, which no other processor reads."""
+        began; both are arrays of flight indices on the device, and are not copied to the host."""
         self._write_reports(rows, self._lanes.restart(rows, starts))
 
     @property
@@ -198,7 +198,7 @@ class SteppedFlights:
         return self._engine
 
     def require_startable(self, starts: InitialStates, inertial: InertialParameters | None) -> None:
-        """Validate start states (K rows) and masses as in :meth:`reset`, without a reset.
+        """Validate start states (K rows) and masses as in :meth:`reset`, without resetting.
 
         Raises
         ------
@@ -216,7 +216,7 @@ class SteppedFlights:
         self.has_not_ended[self.arrays.asarray(rows, dtype=np.int64)] = False
 
     def step(self, commands: Array, ticks: int = 1) -> None:
-        """Advance all flights in progress by some ticks under held commands.
+        """Advance all flights in progress by several ticks under held commands.
 
         Parameters
         ----------

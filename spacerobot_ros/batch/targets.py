@@ -139,7 +139,7 @@ class Target:
     def source(
         self, functions: Mapping[str, ca.Function], declarations: str, libmvec: str = ""
     ) -> str:
-        """Return the program, as C++ that CUDA compiles too; see :meth:`compile`."""
+        """Return the program, as C++ code that CUDA also compiles; see :meth:`compile`."""
         given = list(functions.values())
         parts = [
             self._definitions(given, libmvec),
@@ -210,7 +210,7 @@ class CudaDevice(Target):
 
     @classmethod
     def of(cls, number: int = 0, *, single: bool = False) -> CudaDevice:
-        """Return the device with an index; it computes with 64-bit or 32-bit numbers."""
+        """Return the device with the given index; it computes with 64-bit or 32-bit numbers."""
         cupy = optional_module("cupy", "cuda", "Flights on a GPU require")
         runtime = cupy.cuda.runtime
         try:
@@ -252,7 +252,7 @@ class CudaDevice(Target):
 
     @contextmanager
     def named_errors(self) -> Iterator[Any]:
-        """Yield CuPy; errors of the device become a SpaceRobotError with a remedy."""
+        """Yield CuPy; device errors become a SpaceRobotError that suggests a remedy."""
         cuda = self.arrays.cuda
         errors = cuda.runtime.CUDARuntimeError, cuda.driver.CUDADriverError
         try:

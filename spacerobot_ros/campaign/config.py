@@ -255,7 +255,7 @@ def parse_campaign(
 
 
 def require_engine(name: str) -> None:
-    """Raise ParameterError if there is no engine with a name."""
+    """Raise ParameterError if no engine has the given name."""
     if not is_device_name(name):
         _require_known("engine", name, ENGINES)
 

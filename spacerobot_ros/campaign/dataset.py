@@ -1,4 +1,4 @@
-"""Campaign rows, one for each finished flight, and the files of a dataset of them."""
+"""Campaign rows, one for each finished flight, and the dataset files that contain them."""
 
 from __future__ import annotations
 

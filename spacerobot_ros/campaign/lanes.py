@@ -1,9 +1,9 @@
 """Flies campaign draws in SIMD lanes or on a device.
 
-A lane, or a thread of a device, can follow one schedule to the end of the schedule and evaluate the
-goal, or fly under coordinated control until the outcome is known. A draw that requires more (a
-correction, a joint at a limit, a loss of control) is passed on to engine ``flights``;
-the resulting rows of the dataset are the same.
+A lane, or a thread of a device, can follow one schedule to its end and evaluate the goal, or fly
+under coordinated control until the outcome is known. A draw that requires more (a correction, a
+joint at a limit, a loss of control) is passed on to engine ``flights``; the resulting rows of the
+dataset are the same.
 """
 
 from __future__ import annotations
@@ -268,7 +268,7 @@ class _ScheduledLanes:
     def prepare_draw(
         self, campaign: Campaign, draw: Draw, flight: DrawnFlight
     ) -> _PreparedDraw | str:
-        """Plan for the first state of a draw; return the reason for a fallback if that fails."""
+        """Plan for the first state of a draw; if planning fails, return the reason."""
         began = time.perf_counter()
         schedule, goal = self._plans.schedule(flight), flight.scenario.goal
         if schedule is None:

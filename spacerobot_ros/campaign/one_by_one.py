@@ -154,7 +154,7 @@ class FirstPlans:
         """The last plan made from a noise-free state, and the values that determine this plan."""
 
     def schedule(self, flight: DrawnFlight) -> GaitSchedule | None:
-        """Return the schedule from the first state; None if no complete one begins there."""
+        """Return the schedule from the first state; None if no complete schedule begins there."""
         if self._last_scenario is None or self._last_scenario[0] is not flight.scenario:
             self._last_scenario = flight.scenario, _planned_values(flight.scenario)
         values = self._last_scenario[1]

@@ -1,4 +1,4 @@
-"""Reports on one campaign, and on two with the same draws: self-contained HTML files."""
+"""Reports on one campaign, or comparing two with the same draws: self-contained HTML files."""
 
 from __future__ import annotations
 

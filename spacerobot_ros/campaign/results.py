@@ -205,8 +205,8 @@ class Results:
         return [*(name for name in self.campaign.names if name not in self.drawn_numbers), *causes]
 
     def success_by_bins(self, name: str) -> list[Bin]:
-        """Return the shares of flights that passed as a function of the drawn values with a given
-        name."""
+        """Return the shares of flights that passed as a function of the values drawn for a given
+        dispersion."""
         return success_by_bins(self.columns[f"{DRAW_PREFIX}{name}"], self.passed)
 
     def worst_rows(self) -> list[int]:

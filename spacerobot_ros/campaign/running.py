@@ -268,7 +268,7 @@ def stored_flight(dataset: Dataset, number: int) -> tuple[str, str, dict[str, fl
 def largest_deviation(
     expected: Mapping[str, float], found: Mapping[str, float]
 ) -> tuple[float, str]:
-    """Return the largest deviation of a metric (relative for values above 1), and the name of the
+    """Return the largest deviation of a metric (relative for values above 1), and the name of that
     metric."""
     largest, at = 0.0, ""
     for name, value in expected.items():

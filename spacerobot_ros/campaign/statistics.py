@@ -39,7 +39,7 @@ class Share:
 
     @property
     def value(self) -> float:
-        """The share, 0 to 1; NaN without flights."""
+        """The share, 0 to 1; NaN if there are no flights."""
         return self.count / self.total if self.total else float("nan")
 
     def __str__(self) -> str:
@@ -50,7 +50,7 @@ class Share:
 
 
 def share(flags: Flags) -> Share:
-    """Return the share of flights (N,) with a flag; without flights, its intervals are 0 to 1."""
+    """Return the share of flights (N,) with a flag; for no flights, its intervals are 0 to 1."""
     count, total = int(np.count_nonzero(flags)), len(flags)
     if not total:
         return Share(0, 0, 0.0, 1.0, (0.0, 1.0))
@@ -186,9 +186,9 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
 
 
 def rank_correlation(x: Array, y: Array) -> tuple[float, float]:
-    """Return Spearman's correlation of varying samples (N,), and its p-value.
+    """Return Spearman's correlation of non-constant samples (N,), and its p-value.
 
-    For few samples, the p-value is computed by counting permutations. For three perfectly ordered
+    For small samples, the p-value is computed by counting permutations. For three perfectly ordered
     samples, it is one third; the Student's t approximation used for many samples would yield a
     p-value of zero.
     """
@@ -246,7 +246,7 @@ def sobol_indices(
 
 
 def percentiles(values: Array) -> list[float]:
-    """Return the :data:`PERCENTILES` of the finite values; NaN without any."""
+    """Return the :data:`PERCENTILES` of the finite values; NaN if there are none."""
     there = values[np.isfinite(values)]
     if not there.size:
         return [float("nan")] * len(PERCENTILES)
@@ -299,7 +299,7 @@ def paired_difference(metric: str, first: Array, second: Array) -> PairedDiffere
 
 def paired_success(first: Flags, second: Flags) -> tuple[int, int, float]:
     """Return the number of draws that passed only in the first campaign, the number that passed
-    only in the second, and McNemar's exact p."""
+    only in the second, and McNemar's exact p-value."""
     from scipy.stats import binomtest
 
     only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())

@@ -108,7 +108,7 @@ class MassFactors:
 
     @property
     def differ(self) -> npt.NDArray[np.bool_]:
-        """(N,) whether flights differ from the nominal robot."""
+        """(N,) whether the mass properties differ from those of the nominal robot."""
         changed = (self.mass != 1.0) | (self.inertia != 1.0) | self.com.any(axis=-1)
         return np.asarray(changed.any(axis=-1))
 

@@ -171,7 +171,7 @@ class LocalWorkers:
             raise WorkerDeath from error
 
     def close(self) -> None:
-        """End the processes, and no other child of this process."""
+        """End the processes, but no other child of this process."""
         for process in self._context.made:
             if process.is_alive():
                 process.kill()
@@ -203,8 +203,8 @@ def _end_with_campaign() -> None:
 class DaskWorkers:
     """Workers of a dask.distributed scheduler.
 
-    A scheduler runs code from anyone who can reach its port: protect the scheduler by a private
-    network or TLS.
+    A scheduler runs code from anyone who can reach its port: protect it with a private network or
+    TLS.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ Workers = LocalWorkers | DaskWorkers
 
 @contextmanager
 def open_workers(flights: int, workers: int, scheduler: str = "") -> Iterator[Workers]:
-    """Yield ``workers`` processes on this machine, no more than flights, or the workers of a
+    """Yield ``workers`` processes on this machine, at most one per flight, or the workers of a
     dask.distributed ``scheduler``.
 
     Raises
@@ -360,7 +360,7 @@ class TaskDistributor:
     The fallbacks of an engine are passed to engine ``flights``, in tasks with fewer flights.
 
     If a worker dies, each flight in its lost tasks is repeated alone, while no other task runs.
-    If a worker dies again, that flight has killed it and is reported.
+    If a worker dies again, the flight that it was flying is the cause and is reported.
 
     Parameters
     ----------
@@ -396,7 +396,7 @@ class TaskDistributor:
         """Draws in tasks whose worker has died."""
 
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
-        """Yield the rows of draws as their tasks finish, and empty lists while no task finishes."""
+        """Yield the rows of draws as their tasks finish; empty lists while none finishes."""
         waiting = deque(numbers)
         while (
             waiting or self._fallbacks or self._retry_alone or self._running

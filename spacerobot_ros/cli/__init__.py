@@ -13,7 +13,7 @@ from spacerobot_ros.termination import Terminated, announce, guarded
 
 
 def start(prog_name: str = "spacerobot") -> NoReturn:
-    """Run the command; signals end it with one line, even during imports."""
+    """Run the command; a signal ends it with a one-line message, even during imports."""
     with guarded():
         try:
             from spacerobot_ros.cli.main import main

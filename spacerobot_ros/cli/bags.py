@@ -102,7 +102,7 @@ _several_bags = click.argument("bags", metavar="BAG...", type=PATH, nargs=-1, re
 def figures_command(
     bags: tuple[Path, ...], only: str, format_name: str, out: Path | None, **options: Any
 ) -> None:
-    """Draw figures for a paper from a BAG, one file each.
+    """Draw figures for a paper from a BAG, one file per figure.
 
     Several bags are drawn in the same panels. Existing files with these names are replaced. Exit
     code 1: the bags lack the data for a figure named by --only, or for every figure.

@@ -55,7 +55,7 @@ class _CampaignGroup(click.Group):
 def campaign_command() -> None:
     """Fly a scenario many times with dispersed parameters.
 
-    `spacerobot campaign FILE.yaml` is an abbreviation of `spacerobot campaign fly FILE.yaml`.
+    `spacerobot campaign FILE.yaml` is short for `spacerobot campaign fly FILE.yaml`.
     """
 
 
@@ -119,7 +119,7 @@ def fly(
     For --compare, the second file describes the second campaign, for example with `method:
     lie_bracket` below the scenario. More are in examples/campaigns.
 
-    If a campaign was interrupted, the command continues it. Exit code 0: all flights were flown;
+    The command resumes an interrupted campaign. Exit code 0: all flights were flown;
     1: every flight was rejected or failed with an error; 2: bad input; 130: Ctrl-C, finished
     flights are kept.
     """

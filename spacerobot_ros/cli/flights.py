@@ -92,7 +92,7 @@ def run_command(
     """Fly a SCENARIO or a ROBOT to its goal, and record a bag.
 
     A SCENARIO is a name or a parameter file; a ROBOT is a name or a URDF file. The flight needs ROS
-    2 only with --nodes or --realtime. In lockstep, the nodes produce the same states and commands.
+    2 only with --nodes or --realtime. In lockstep, nodes do not change the states or commands.
 
     Exit code 0: the goal was reached within tolerance; 1: it was not; 2: bad input. A signal ends
     the flight early: the bag and the summary cover the flight up to that time, and the exit code is

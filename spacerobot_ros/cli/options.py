@@ -402,7 +402,7 @@ class RegisteredOption(click.Option):
     """An option whose value is a name from registries; the help lists the names."""
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
-        """Return the option and its help, with the names."""
+        """Return the option and its help, including the names."""
         record = super().get_help_record(ctx)
         names = ", ".join(cast("RegisteredName", self.type).choices)
         return None if record is None else (record[0], f"{record[1]} One of {names}.")
@@ -453,8 +453,8 @@ def picture_option(help: str) -> Any:
 
 
 def beside(bag: Path, ending: str) -> Path:
-    """Return a path next to a bag (a file or a folder): the bag name without suffix, plus an
-    ending.
+    """Return a path next to a bag (a file or a folder): the bag name without suffix, followed by
+    ``ending``.
     """
     # The path ``.`` has no name before it is resolved.
     named = bag if bag.name not in ("", "..") else bag.resolve()

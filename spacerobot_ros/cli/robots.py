@@ -86,7 +86,7 @@ def analyze_command(
     target = picture or Path("out") / f"{name}_curvature.png"
     drawn = draw_analysis(found, PictureFormat.of(target))
     if drawn is None:
-        say(f"{'picture':<13}none: no loops of joints that can move rotate the base")
+        say(f"{'picture':<13}none: no loops of movable joints rotate the base")
     else:
         write_output(target, drawn)
         say(f"{'picture':<13}{target}")
@@ -143,7 +143,9 @@ def workspace_lines(found: Analysis) -> list[str]:
         limits = "within joint limits" if each.within_limits else "joints turn freely"
         place = " in a plane" if each.dimensions == 2 else ""
         reach = _interval_text(each.distance_range)
-        count = f", from {each.singular_shapes} singular shapes" if each.singular_shapes else ""
+        count = (
+            f", from {each.singular_shapes} singular configurations" if each.singular_shapes else ""
+        )
         lines += [
             f"'{each.link}', {limits}: {reach} m from the centre of mass{place}",
             f"  path-dependent    {_intervals_text(each.path_dependent)}{count}",

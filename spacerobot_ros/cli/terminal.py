@@ -52,7 +52,7 @@ _UNBROKEN = re.compile(r"`[^`]*`|\d [a-zA-Zµ]")
 
 
 def say(text: str, *, err: bool = False) -> None:
-    """Print a line; on a terminal, long lines are wrapped, below their column if they have a label.
+    """Print a line; on a terminal, wrap a long line and align it after its label, if any.
 
     Commands in backticks stay whole, and numbers stay with their units.
     """
@@ -82,7 +82,7 @@ def fail(message: str = "") -> NoReturn:
 
 
 def end(ending: Terminated) -> NoReturn:
-    """End a command stopped by a signal, with one line."""
+    """Print one line and end a command stopped by a signal."""
     announce(ending)
     sys.exit(ending.exit_code)
 
@@ -138,7 +138,7 @@ _PERIOD, _PERIOD_WITHOUT_TERMINAL = 1.0, 10.0
 
 
 class Display:
-    """A progress line for long work: the task, its duration, and the best result so far.
+    """A progress line for long tasks: the task, the elapsed time, and the best result so far.
 
     On a terminal, each line replaces the previous line. Searches report from other threads and may
     be silent for a long time, so a separate thread writes the line.
@@ -205,7 +205,7 @@ _CLEAR = "\r\x1b[K"
 
 @contextmanager
 def display(label: str) -> Iterator[Display]:
-    """Show the progress of long work within a ``with`` block."""
+    """Show the progress of a long task in a ``with`` block."""
     from spacerobot_ros.planning.core.progress import report_progress
 
     shown = Display(label)

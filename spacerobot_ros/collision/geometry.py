@@ -313,7 +313,7 @@ class CollisionGeometry:
     def nearest_at(
         self, poses: Poses, required: Array | float = 0.0
     ) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Return the smallest distances as :meth:`nearest_along`, from the poses of the links."""
+        """Return the smallest distances, as in :meth:`nearest_along`, given the link poses."""
         R, r = poses
         distances = np.full(len(R), np.inf)
         pairs = np.zeros(len(R), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Nearest approaches along held commands.
+"""Nearest approaches while commands are held.
 
 While a command is held, two solids move relative to each other by at most v per tick
 (``CollisionGeometry.largest_lever_arms``). So their distance during the tick is at least
@@ -99,7 +99,7 @@ class _Path:
         )
 
     def interpolated(self, ticks: Array) -> tuple[Array, BasePoses | None]:
-        """Return shapes (K, n) and base poses at times (K,) in ticks."""
+        """Return configurations (K, n) and base poses at times (K,) in ticks."""
         before = np.minimum(ticks.astype(int), len(self.positions) - 2)
         share = (ticks - before)[:, np.newaxis]
         shapes = (1 - share) * self.positions[before] + share * self.positions[before + 1]
@@ -136,7 +136,7 @@ def nearest_approaches(
 def nearest_approach(
     geometry: CollisionGeometry, positions: Array, base: BasePoses | None = None
 ) -> Approach | None:
-    """Return the nearest approach of all pairs along a path (N + 1, n); None without pairs.
+    """Return the nearest approach of all pairs along a path (N + 1, n); None: no pairs.
 
     ``base`` contains the base poses at the ticks; None: obstacles are ignored.
     """

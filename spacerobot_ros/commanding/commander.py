@@ -422,8 +422,7 @@ class Commander(ABC):
         self.inputs.note_state()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Process an odom message with the current time, and handle its state if the state is
-        complete."""
+        """Process an odom message with a current stamp, and handle its state if complete."""
         if self.states.put_odom(stamp_ns, odom):
             # A single contradiction: the plant was reset or restarted; its status arrives later.
             since = (stamp_ns - self._contradicted_ns) / SECOND
@@ -438,7 +437,7 @@ class Commander(ABC):
             self.answer()
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Process joint states with the current time, and handle the state if it is complete."""
+        """Process joint states with a current stamp, and handle their state if complete."""
         self.states.put_joints(stamp_ns, joints)
         if not self.config.tick_rate:
             self._follow_rate()
@@ -496,7 +495,7 @@ class Commander(ABC):
             self._report_present_status()
 
     def answer_latest(self) -> None:
-        """Handle the latest received state, after work during which states were waiting."""
+        """Handle the latest received state, after work that kept states waiting."""
         self._take_states(*self.host.waiting_states())
         self.answer()
 

@@ -162,7 +162,7 @@ class ControllerCommander(Commander):
         self.answer()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
-        """Process an odom message with the current time, after handling any state whose reference
+        """Process an odom message with a current stamp, after handling any state whose reference
         never arrived."""
         missing = self.states.missing
         if missing and self.active and self.executive is not None:
@@ -219,7 +219,7 @@ class ControllerCommander(Commander):
         super()._publish_status(status)
 
     def take_joints(self, stamp_ns: int, joints: Any) -> None:
-        """Process joint states with the current time, after handling any state whose odom message
+        """Process joint states with a current stamp, after handling any state whose odom message
         never arrived."""
         overdue = None
         if self.active and self.executive is not None and not self._waits_for_first_pose():

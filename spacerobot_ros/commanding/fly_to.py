@@ -224,7 +224,7 @@ class FlyToGoals:
         """Ids of accepted goals that were not rejected later, from actions or topics, in order."""
 
     def __bool__(self) -> bool:
-        """Whether a client waits."""
+        """Whether a client is waiting."""
         return self._clients > 0
 
     def begin(

@@ -1,4 +1,4 @@
-"""Commander statuses: the topics of the statuses, and tracking of the statuses of one goal."""
+"""Commander statuses: their topics, and tracking of the statuses of one goal."""
 
 from __future__ import annotations
 

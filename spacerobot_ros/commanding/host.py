@@ -43,7 +43,7 @@ class CommanderHost(Protocol):
         references."""
 
     def log(self, level: LogLevel, message: str) -> None:
-        """Write a line into the log."""
+        """Write a line to the log."""
 
     def has_publisher(self, topic: str) -> bool:
         """Whether a publisher of odom, or of a reference, is connected."""

@@ -124,7 +124,7 @@ class StampFilter:
         return ahead <= self._longest_step + _PACE_SLACK * pace * (self._clock() - self._wall)
 
     def accepts_joints(self, stamp_ns: int, joints: Any) -> bool:
-        """Return whether joint states have the current time; defer other joint states."""
+        """Return whether joint states have a current stamp; defer other joint states."""
         if not self.is_present(stamp_ns):
             if self._jump.message is None:
                 self._jump_wall = self._clock()
@@ -142,7 +142,7 @@ class StampFilter:
         return True
 
     def accepts_odom(self, stamp_ns: int, odom: Any) -> bool:
-        """Return whether a pose has the current time; defer other poses.
+        """Return whether a pose has a current stamp; defer other poses.
 
         A pose may arrive before or after the joints with the same stamp.
         """
@@ -380,7 +380,7 @@ class PlantListener:
 
     @property
     def paused(self) -> bool:
-        """Whether the plant's time is stopped."""
+        """Whether the plant is paused."""
         return self.status.state is PlantState.PAUSED
 
     def update(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
@@ -455,7 +455,7 @@ class InputWatch:
         self.begin()
 
     def begin(self) -> None:
-        """Begin to wait for states."""
+        """Start waiting for states."""
         self._begun = self._heard = self._checked = self._clock()
 
     def note_state(self) -> None:
@@ -468,7 +468,7 @@ class InputWatch:
         return self._clock() - self._begun < _LONGEST_SILENCE
 
     def excuse_suspension(self) -> None:
-        """Exclude the time during which this process itself was suspended from the silence."""
+        """Do not count as silence the time during which this process itself was suspended."""
         now = self._clock()
         if now - self._checked > _SUSPENSION_TIME:
             self._heard += now - self._checked

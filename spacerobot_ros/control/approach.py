@@ -88,7 +88,7 @@ class ApproachOptions:
     )
     patience: float = parameter(
         3.0,
-        "time, from contact on, within which the target must be captured",
+        "time after contact within which the target must be captured",
         unit="s",
         minimum=0.0,
     )
@@ -193,8 +193,8 @@ class ArmReach:
         return self._arm.nearest_shape(self.q, Pose(motion.R[k], motion.r[k]))[1]
 
     def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
-        """Return the arm shapes (K, n) along a motion, from the current shape, and the reason why
-        the arm cannot follow; empty if it can follow.
+        """Return the arm configurations (K, n) along a motion, from the current one, and the reason
+        why the arm cannot follow; empty if it can follow.
 
         ``period`` is the time between successive poses of the motion, s.
         """

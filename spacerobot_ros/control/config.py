@@ -43,7 +43,7 @@ class ErrorMargin:
 
 
 def waypoints_refusal(count: int) -> str:
-    """Return the message for a goal with waypoints that no planned motion passes."""
+    """Return the message for a goal whose waypoints need a planned motion."""
     return (
         f"The goal has {counted(count, 'waypoint')}, which only a planned motion passes: set "
         "profile to planned."

@@ -170,7 +170,7 @@ class CoordinatedController:
 
     def motion_to(self, time: float, state: ControlState, **aims: Unpack[Aims]) -> GoalMotion:
         """Return the motion from the reference at a given time to goals as in
-        :meth:`set_goals`, with the base poses (7,) where it rests on the way."""
+        :meth:`set_goals`, and the base poses (7,) at which it rests on the way."""
         base, end_effector = aims.get("base"), aims.get("end_effector")
         joints = aims.get("joints")
         if self.coming_to_rest:
@@ -213,7 +213,7 @@ class CoordinatedController:
             self.law.start(time, profile.start, profile.goal)
 
     def require_bounded_duration(self, state: ControlState, goals: Reference) -> None:
-        """Reject goals whose reference would take longer than any flight.
+        """Reject goals whose reference would take too long.
 
         Raises
         ------
@@ -379,8 +379,8 @@ class CoordinatedController:
     ) -> Saturated:
         """Return the realised part of a command held for several control periods.
 
-        Thruster limits apply to the difference from a wrench ``around_B`` (6,) that was planned for
-        the actual thrusters, which may exceed them.
+        Thruster limits apply to the difference from a wrench ``around_B`` (6,), which was planned
+        for the actual thrusters and may exceed these limits.
         """
         given = self._realised(commanded, around_B)
         kept = self.joint_rate_limits.apply(state, given, self.limits.effort, periods)
@@ -460,7 +460,7 @@ class CoordinatedController:
         return self.law.outputs.selection.distance(self.law.error)
 
     def distance_between(self, state: ControlState, goal: Reference) -> OutputDistance:
-        """Return the distance between the outputs in a state and a goal for all outputs."""
+        """Return the distance of the outputs in a state from a goal for all outputs."""
         outputs = self.law.outputs
         return outputs.selection.distance(outputs.errors(state, goal))
 

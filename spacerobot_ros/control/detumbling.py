@@ -37,10 +37,10 @@ class DetumbleOptions:
         0.0, "largest grasp torque on the target; 0: no limit", "N m"
     )
     rate: float = parameter(
-        0.002, "largest base and joint rates considered to be at rest", "rad/s or m/s", minimum=1e-9
+        0.002, "largest base and joint rates of a robot at rest", "rad/s or m/s", minimum=1e-9
     )
     speed: float = parameter(
-        0.002, "largest centre-of-mass speed considered to be at rest", "m/s", minimum=1e-9
+        0.002, "largest centre-of-mass speed of a robot at rest", "m/s", minimum=1e-9
     )
     settle_time: float = nonnegative(1.0, "time at rest", "s")
 
@@ -68,7 +68,7 @@ def shortest_detumbling(momentum: float, torque: float) -> float:
 def largest_feasible_share(start: Array, change: Array, limit: float) -> float:
     """Return the largest fraction ``s`` in [0, 1] with ``|start + s change| <= limit``.
 
-    If there is no such fraction, return the fraction with the smallest norm.
+    If there is no such fraction, return the one that minimises the norm.
     """
     square, along = float(change @ change), float(start @ change)
     if square == 0.0:

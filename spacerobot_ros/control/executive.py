@@ -254,7 +254,7 @@ class ControlExecutive:
         return True
 
     def take_contacts(self, contacts: tuple[str, ...], time: float) -> None:
-        """Set the links that are in contact from a time (s) on; a new contact during the motion
+        """Set the links in contact from a given time (s) on; a new contact during the motion
         makes a goal fail."""
         self._watch.take_contacts(contacts, time, pursues=self._pursues)
 
@@ -263,7 +263,7 @@ class ControlExecutive:
         self._plan_next(_Next.HOLD)
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Plan around other obstacles from now on; None: around none.
+        """Plan around other obstacles from now on; None: no obstacles.
 
         A plan in progress is restarted. If the rest of the current motion comes too close to an
         obstacle, the motion is replanned: while moving if there is time, otherwise from a held
@@ -358,8 +358,8 @@ class ControlExecutive:
     ) -> Saturated:
         """Return the actuation for a state; see :meth:`CoordinatedController.command`.
 
-        ``reference`` is a planner's reference for this state; groups that the reference lacks hold
-        their pose.
+        ``reference`` is a planner's reference for this state; groups missing from the reference
+        hold their pose.
 
         Raises
         ------

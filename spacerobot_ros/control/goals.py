@@ -86,7 +86,7 @@ def with_later_goals(
 ) -> dict[str, IdentifiedGoal]:
     """Return the goals pursued together after later goals were accepted, by frame.
 
-    A goal of both frames ends if a later goal replaces one of them; its other frame keeps its pose
+    A goal for both frames ends if a later goal replaces one of them; its other frame keeps its pose
     as a part of the later goal.
     """
     *_, latest = later.values()
@@ -156,7 +156,7 @@ def _require_controlled(
     n = law.robot.n if wheels is None else law.robot.n + len(wheels.wheels)
     if goal.joint_positions is not None and len(goal.joint_positions) != n:
         raise PlanningError(
-            f"The goal has a shape of {len(goal.joint_positions)} joints; robot "
+            f"The goal has {len(goal.joint_positions)} joint positions; robot "
             f"'{law.robot.description.name}' has {n}."
         )
     if goal.waypoints is not None and controller.planner is None:
@@ -204,7 +204,7 @@ def require_controlled_axes(
 def aims_of(
     controller: CoordinatedController, goals: Mapping[str, IdentifiedGoal], state: ControlState
 ) -> Aims:
-    """Return the goal poses and the goal shape in a state."""
+    """Return the goal poses and joint positions, given a state."""
     poses, shapes, waypoints = {}, [], ()
     for key, identified in goals.items():
         goal = identified.goal
@@ -284,7 +284,7 @@ class GoalWatch:
         """First contact during the motion to the current goal, and its time; empty: none."""
 
     def begin(self, time: float) -> None:
-        """Begin a goal or a task at a time, s."""
+        """Begin a goal or a task at a given time (s)."""
         self.monitor.begin(time)
         self._begin_motion()
 
@@ -298,17 +298,17 @@ class GoalWatch:
         self._error_bounds = None
 
     def shift_time(self, jump: float) -> None:
-        """Continue after a time jump, s."""
+        """Continue after a time jump (s)."""
         self.monitor.shift_time(jump)
         self.stall.restart()
 
     def forget_touch(self, time: float) -> None:
-        """Begin a motion at a time, s; current contacts also count as contacts during the
+        """Begin a motion at a given time (s); current contacts also count as contacts during the
         motion."""
         self.touched = _touch(self._contacts, time)
 
     def take_contacts(self, contacts: tuple[str, ...], time: float, *, pursues: bool) -> None:
-        """Set the links that are in contact from a time (s) on; a new contact during the motion is
+        """Set the links in contact from a given time (s) on; a new contact during the motion is
         recorded."""
         met = [each for each in contacts if each not in self._contacts]
         self._contacts = contacts
@@ -340,7 +340,7 @@ class GoalWatch:
     def decision(
         self, controller: CoordinatedController, time: float, config: ControllerConfig
     ) -> ControllerState | None:
-        """Return the state of a goal that is decided at a time, s; None: not decided yet."""
+        """Return the state of a goal decided at a given time (s); None: not decided yet."""
         at_rest, ends = controller.reference_at_rest(time), controller.reference_ends
         assert ends is not None
         if not at_rest and not self.monitor.is_late(time, ends, config):

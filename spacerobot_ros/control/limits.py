@@ -53,11 +53,11 @@ class MotionLimits:
     ) -> MotionLimits:
         """Return the limits with accelerations lowered to what the thrusters can produce.
 
-        The robot is treated as one rigid body in the shape ``q`` (n,): the linear acceleration is
-        at most the force divided by the total mass, the angular acceleration at most the torque
-        divided by the largest moment of inertia about the centre of mass. The thrusters can also
-        balance the torque of their force if the centre of mass is not at the base origin. Without
-        thrusters, the limits are unchanged.
+        The robot is treated as one rigid body in the configuration ``q`` (n,): the linear
+        acceleration is at most the force divided by the total mass, the angular acceleration at
+        most the torque divided by the largest moment of inertia about the centre of mass. The
+        thrusters can also balance the torque of their force if the centre of mass is not at the
+        base origin. Without thrusters, the limits are unchanged.
         """
         force, torque = (_REFERENCE_THRUST_SHARE * x for x in (actuators.force, actuators.torque))
         lever = float(np.linalg.norm(robot.center_of_mass(q)))

@@ -397,7 +397,7 @@ def _joint_parts(joints: JointReference | None) -> list[Array]:
 
 
 def require_finite(name: str, memory: Array) -> None:
-    """Reject non-finite values: NotFiniteError, which names them."""
+    """Raise NotFiniteError, with this name, if a value is not finite."""
     # One call: the square sum of finite numbers of any sensible size is finite.
     if not math.isfinite(memory.dot(memory)):
         raise NotFiniteError(f"The {name} contains a non-finite value.")

@@ -1,4 +1,4 @@
-"""References from plans under thrust."""
+"""References from thrust-limited plans."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class PlannedReference(ReferenceProfile):
         return bisect_right(self._begins[1:], time)
 
     def configurations(self) -> Samples:
-        """Return the plan at many instants."""
+        """Return samples of the plan."""
         paths = [leg.path() for leg in self._legs]
         times = [begin + path.times for begin, path in zip(self._begins, paths, strict=True)]
         base = zip(*(path.base for path in paths), strict=True)
@@ -138,7 +138,7 @@ class PlannedReference(ReferenceProfile):
 
 
 class GrappleReference(PlannedReference):
-    """A planned motion to a target, followed by the motion together with the target.
+    """A planned motion to a target, followed by motion with the target.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ class ReferencePlanner:
         )
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Use other obstacles from the next plan on; None: around none."""
+        """Use other obstacles from the next plan on; None: no obstacles."""
         self._planner.use_obstacles(world)
 
     def time_until_blocked(self, profile: PlannedReference, time: float) -> float:

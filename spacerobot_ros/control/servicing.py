@@ -147,7 +147,7 @@ class MeasuredTarget:
         return self._count > 0 and self._count % _AVERAGED == 0
 
     def free_motion(self) -> TorqueFreeMotion:
-        """Return the predicted motion from the last measurement on, of a target with a body."""
+        """Return the predicted motion of a described target from the last measurement on."""
         assert self.body is not None
         assert self.motion is not None
         if self._count < 2:
@@ -502,7 +502,7 @@ class Servicing:
         self._present: ApproachTask | DetumblingTask | None = None
 
     def configure(self, config: ControllerConfig) -> None:
-        """Use other time settings from the next task on."""
+        """Use another configuration from the next task on."""
         self._config = config
 
     @property

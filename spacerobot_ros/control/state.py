@@ -131,7 +131,7 @@ class JointReference:
 
     @classmethod
     def at_rest(cls, q: Array) -> JointReference:
-        """Return a reference that holds a shape."""
+        """Return a reference that holds a configuration."""
         return cls(q, np.zeros(len(q)), np.zeros(len(q)))
 
 
@@ -187,8 +187,8 @@ class DeadReckoning:
 
     The integrated state is the state of :mod:`spacerobot_ros.model.composite_rigid_body`, with both
     momenta and the centre of mass, which joint motion does not change. Measured joint positions and
-    rates replace the predicted ones, and the base rotates according to the connection ``A``. Only
-    thruster effects then accumulate errors.
+    rates replace the predicted ones, and the base rotates according to the connection ``A``. Errors
+    then accumulate only in the effects of the thrusters.
 
     Parameters
     ----------

@@ -194,7 +194,7 @@ class WheelControl:
 
     @property
     def rank(self) -> int:
-        """Number of independent axes among the wheels in use."""
+        """Number of linearly independent axes of the wheels in use."""
         return self._allocate.rank
 
     @property
@@ -208,7 +208,7 @@ class WheelControl:
     def observe(
         self, measured: ControlState | None, q: Array, qdot: Array
     ) -> tuple[ControlState | None, Array, Array]:
-        """Take a robot state and return the gyrostat state."""
+        """Process a robot state and return the gyrostat state."""
         wheels = self.wheels
         self._q, self.rates = q, qdot[wheels.index]
         q, qdot = q[wheels.other], qdot[wheels.other]
@@ -229,7 +229,7 @@ class WheelControl:
         return replace(reference, joints=joints)
 
     def shape_with_wheels(self, q: Array) -> Array:
-        """Return the robot shape (n,) from the gyrostat's joint positions (n - k,)."""
+        """Return the robot's joint positions (n,) from the gyrostat's (n - k,)."""
         whole = np.zeros(len(self.wheels) + len(self.wheels.other))
         whole[self.wheels.other] = q
         return whole
@@ -275,7 +275,7 @@ class WheelControl:
         self.torque, self.thrust = np.zeros(len(self.wheels)), np.zeros(6)
 
     def limits_with_wheels(self, motion: MotionLimits, q: Array) -> MotionLimits:
-        """Return reference limits within which wheels alone suffice, for a shape (n - k,)."""
+        """Return reference limits for which wheels suffice, in a configuration (n - k,)."""
         if self.has_thrusters or self.rank < 3:
             return motion
         wheels, used = self.wheels, self._used

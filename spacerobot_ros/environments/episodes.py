@@ -88,7 +88,7 @@ class EpisodeConfig:
         (), "command for an action whose entries are all 1; empty: limits"
     )
     device: str = parameter(
-        "", "device of a vector environment, such as cuda; its arrays are of CuPy; empty: lanes"
+        "", "device of a vector environment, such as cuda; its arrays are CuPy arrays; empty: lanes"
     )
     reward: Mapping[str, float] | None = None
 
@@ -418,8 +418,8 @@ class Episodes:
         goal: Any = None,
         start: Any = None,
     ) -> None:
-        """Restart the episodes in some rows, given the random generators of all rows, or the one
-        of a device.
+        """Restart the episodes in some rows, given the random generators of all rows, or a device's
+        single generator.
 
         ``goal``, either (goal_size,) for all rows or (N, goal_size) with one goal per row,
         overrides the drawn goals. ``start``, either one dictionary for all rows or one per row,

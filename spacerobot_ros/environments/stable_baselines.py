@@ -35,7 +35,7 @@ class SpaceRobotVecEnv(VecEnv):
         super().__init__(num_envs, made.single_observation_space, made.single_action_space)
 
     def reset(self) -> Any:
-        """Start all episodes with the seeds and options set before."""
+        """Start all episodes with the seeds and options set previously."""
         options = {name: [each[name] for each in self._options] for name in self._options[0]}
         seen, infos = self.env.reset(seed=self._seeds, options=options)
         self.reset_infos = [{"error": error} for error in infos["error"]]

@@ -2,8 +2,8 @@
 
 All functions take the states of N robots at once, so the same code can observe one robot in a
 plant, many robots in lanes, or a robot controlled through ROS topics. NumPy's functions also work
-on device arrays, and return such arrays; constants are moved there by ``np.asarray(constant,
-like=array)``. A custom task is a class derived from :class:`Task`.
+on device arrays, and return device arrays; constants are moved to the device by
+``np.asarray(constant, like=array)``. A custom task is a class derived from :class:`Task`.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class RewardWeights:
 
     @classmethod
     def of(cls, changes: Mapping[str, float] | None) -> RewardWeights:
-        """Return the weights after some changes; raise ParameterError if a change is invalid."""
+        """Return the weights with some changes; raise ParameterError if a change is invalid."""
         require_names("The reward has no weight", changes or {}, [x.name for x in fields(cls)])
         for name, value in (changes or {}).items():
             if not (isinstance(value, numbers.Real) and np.isfinite(value)):

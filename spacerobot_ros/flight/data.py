@@ -1,4 +1,4 @@
-"""The data of one flight: arrays over time, reports, and what follows from them directly.
+"""The data of one flight: arrays over time, reports, and quantities derived from them.
 
 A bag need not contain everything: all components are optional.
 """
@@ -279,7 +279,7 @@ class FlightData:
 
     @property
     def sentence(self) -> str:
-        """Earlier name of :attr:`message`; deprecated."""
+        """Former name of :attr:`message`; deprecated."""
         return self.message
 
     @property

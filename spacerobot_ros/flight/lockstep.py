@@ -288,7 +288,7 @@ class LockstepFlight:
         return self.until_now(time.perf_counter() - began, interrupted)
 
     def interrupt(self) -> None:
-        """End the flight and the plan in progress; this may be called from another thread."""
+        """End the flight and the planning in progress; this may be called from another thread."""
         self._interrupted = True
         for commander in (self._planner, self._controller):
             if commander is not None:

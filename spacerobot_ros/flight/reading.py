@@ -1,4 +1,4 @@
-"""Reads a flight from its bag; data missing in the bag are empty.
+"""Reads a flight from its bag; data missing from the bag are empty.
 
 :func:`read_flight` reads bags from any stack; :func:`read_run` reads complete bags recorded by
 ``spacerobot run``.
@@ -231,7 +231,7 @@ class FlightBag(RecordedRobot):
             yield time_ns, replace(event, node=message.name.strip("/"))
 
     def goals(self, link: str = "") -> tuple[SentGoal, ...]:
-        """Return the valid goals of the base, or of an end-effector, in the odometry frame; of a
+        """Return the valid goals of the base, or of an end-effector, in the odometry frame; for a
         path, the last pose is the goal."""
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
@@ -537,7 +537,7 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
 
 
 def recorded_actuation(robot: FlightBag) -> str:
-    """Return the commanded quantity for a robot in a bag: ``velocity``, ``effort``, or nothing.
+    """Return the commanded quantity for a robot in a bag: ``velocity`` or ``effort``.
 
     The quantity is read from the plant's status. In bags without a plant status, efforts are
     assumed if there are wrench commands.

@@ -1,4 +1,4 @@
-"""Comparison of a recorded flight with another engine under the same commands.
+"""Comparison of a recorded flight with its re-simulation in another engine.
 
 In each tick, the engine receives the external loads, and the joint rates (or efforts and wrench)
 realised by the plant's actuators after limits and faults. The engine's states are compared with
@@ -28,7 +28,7 @@ AGREEMENT_TOLERANCE = 1e-8
 
 @dataclass(frozen=True)
 class EngineComparison:
-    """The largest differences between a flight and another engine under the same commands.
+    """The largest differences between a flight and its re-simulation in another engine.
 
     Attributes
     ----------

@@ -214,7 +214,7 @@ def try_method(
 def compare(problem: PlanningProblem) -> dict[str, PlanEvaluation | SpaceRobotError]:
     """Return every method's evaluation, or the reason for its rejection, by name.
 
-    Methods that support only end-effectors are omitted for base goals.
+    Methods for end-effector goals only are omitted for base goals.
     """
     found: dict[str, PlanEvaluation | SpaceRobotError] = {}
     for name, method in METHODS.items():

@@ -36,7 +36,7 @@ class Picture(Figure):
 
 
 class Animation:
-    """An HTML animation that notebooks show; :meth:`save` writes it as a page.
+    """An HTML animation that notebooks display; :meth:`save` writes it as a page.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Animation:
         return f"<Animation, {size:.1f} MB of HTML: show it in a notebook or call save(PATH)>"
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the animation as a separate page; an existing file is replaced.
+        """Write the animation as a stand-alone page; an existing file is replaced.
 
         Raises
         ------

@@ -233,7 +233,7 @@ def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
 def goal_messages(
     goal: Goal, end_effector: Goal | None, frame: str, stamp_ns: int
 ) -> dict[str, bytes]:
-    """Return the messages of one goal by topic; ``end_effector`` is a controller's own, if any."""
+    """Return the messages of one goal by topic; ``end_effector`` is a controller's goal, if any."""
     paths = {} if goal.waypoints is None else {"goal_path": goal.path_values}
     poses = {"goal_pose": goal} if goal.base and not paths else {}
     if end_effector is not None:

@@ -504,7 +504,7 @@ class CommandReader:
 
 def actuation_of(message: Any) -> str:
     """Return the command type of a JointState, ``velocity`` or ``effort``; empty if it cannot be
-    determined, as at rest.
+    determined, e.g. at rest.
 
     The nodes in this package fill both arrays, one of them with zeros.
     """

@@ -279,7 +279,7 @@ def compilation_settings() -> tuple[str, ...]:
 
 
 def c_compiler() -> str | None:
-    """Return the C compiler in use: ``$CC``, ``cc``, ``gcc`` or ``clang``; None without one."""
+    """Return the C compiler in use: ``$CC``, ``cc``, ``gcc`` or ``clang``, or None."""
     return _compiler(os.environ.get("CC"), "cc", "gcc", "clang")
 
 

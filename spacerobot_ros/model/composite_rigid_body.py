@@ -22,10 +22,10 @@ algorithm, although the cost of the latter grows only linearly.
 
 :func:`state_rate` computes the motion under joint efforts and a base wrench, with the total momenta
 as part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
-shape, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular momentum
-about the system's centre of mass (kg m^2/s), and position of the centre of mass (m), the last three
-in W. The base twist is not a state: it follows from the momenta and joint rates. Without thrusters,
-the momenta are therefore constant to the last bit, for any step size:
+joint positions, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular
+momentum about the system's centre of mass (kg m^2/s), and position of the centre of mass (m), the
+last three in W. The base twist is not a state: it follows from the momenta and joint rates. Without
+thrusters, the momenta are therefore constant to the last bit, for any step size:
 
 * ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
 * ``K qddot = Q`` with the ``omega_WB_B`` that follows from the momenta.
@@ -221,8 +221,8 @@ def motion_forces(
     the rates ``omega_WB_B`` (3,) and ``qdot`` (n,), constant ``omega``, and joint accelerations
     ``qddot`` (n,), by default zero.
 
-    This is the recursive Newton-Euler algorithm (Featherstone, table 5.1). If body k rotates at
-    ``omega_k`` and ``alpha_k``, its point x accelerates by ``A_k x``,
+    This is the recursive Newton-Euler algorithm (Featherstone, table 5.1). If body k has the
+    angular velocity ``omega_k`` and acceleration ``alpha_k``, its point x accelerates by ``A_k x``,
     ``A_k = hat(alpha_k) + hat(omega_k)^2``, relative to the body's origin. The base origin is
     assumed not to accelerate: in ``Q_j``, a common acceleration cancels between ``S_j' f_j`` and
     ``B_j' f_0``.

@@ -264,8 +264,8 @@ class RobotDescription:
 
     @property
     def shape_box(self) -> tuple[Array, Array]:
-        """Finite lower and upper bounds (n,) of the shapes: one revolution or 2 m for unlimited
-        joints."""
+        """Finite lower and upper bounds (n,) of joint positions: one revolution or 2 m for
+        unlimited joints."""
         joints = self.movable_joints
         half = np.array([1.0 if x.kind is JointKind.PRISMATIC else np.pi for x in joints])
         lower, upper = self.limits("lower"), self.limits("upper")
@@ -331,7 +331,7 @@ class RobotDescription:
 
 
 def leading_limit(limits: JointLimits, mimic: Mimic, kind: str) -> float:
-    """Return the limit of a leading joint that follows from a limit of its mimic joint."""
+    """Return the limit of a leading joint implied by a limit of its mimic joint."""
     k = mimic.multiplier
     if kind == "velocity":
         return limits.velocity / abs(k)

@@ -5,9 +5,9 @@ are ``z0dot = [v_cm; omega; qdot]``, of which the first two are in the base fram
 the equations do not depend on the robot pose. Inertias are composite-rigid-body inertias
 (:mod:`.composite_rigid_body`).
 
-Momentum, and the resulting base motion. At zero total momentum, the base moves only if the
-shape changes: ``[v; omega]_B = -A(q) qdot``, the mechanical connection (paper 1). A closed shape
-loop causes a net base motion: to first order, the curvature times the loop area (paper 2).
+Momentum determines the base motion: at zero total momentum, the base moves only if the shape
+changes, by the mechanical connection ``[v; omega]_B = -A(q) qdot`` (paper 1). A closed shape loop
+causes a net base motion: to first order, the curvature times the loop area (paper 2).
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
     """Return ``0J+`` (6, 6 + n) for the origin of a link frame, eq. (10), in the base frame.
 
     The matrix maps ``[v_cm; omega; qdot]`` to the linear velocity of the point and the angular
-    velocity of its body. ``J_12`` is the shape derivative of ``rho = sum_i v_ik,m``, which for
-    revolute joints is the paper's ``-sum_i skew(v_ik,m) F_i``.
+    velocity of its body. ``J_12`` is the derivative of ``rho = sum_i v_ik,m`` with respect to q;
+    for revolute joints, it is the paper's ``-sum_i skew(v_ik,m) F_i``.
     """
     _, point, body = kin.frame(link)
     rho = point - kin.r_BC_B
@@ -34,8 +34,8 @@ def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
 
 
 def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
-    """Return ``C+`` (6 + n,) according to d'Alembert's principle: the generalised force that keeps
-    ``z0ddot`` at zero.
+    """Return ``C+`` (6 + n,) by d'Alembert's principle: the generalised force that keeps ``z0ddot``
+    at zero.
 
     An outward recursion yields the velocity-product accelerations, and an inward recursion sums the
     inertia forces. Accelerations are relative to the system's centre of mass, which itself
@@ -155,7 +155,7 @@ def base_twist(
 
 
 def connection(kin: TreeKinematics, inertia: Composites) -> ca.SX:
-    """Return ``A(q)`` (6, n) of ``[v_WB_B; omega_WB_B] = -A(q) qdot`` at zero momentum (papers 1,
+    """Return ``A(q)`` (6, n) in ``[v_WB_B; omega_WB_B] = -A(q) qdot`` at zero momentum (papers 1,
     3).
 
     The lower half is ``D^-1 D_q``; the upper half keeps the system's centre of mass at rest:
@@ -192,16 +192,16 @@ def curvature(A: ca.SX, q: ca.SX) -> list[list[ca.SX]]:
 def momentum_derivatives(
     parts: Composites, omega: ca.SX, qdot: ca.SX, eta: ca.SX
 ) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    """Return the derivatives in a configuration, at zero linear momentum: ``dL/dq`` (3, n) of the
+    """Return the derivatives at a configuration and zero linear momentum: ``dL/dq`` (3, n) of the
     angular momentum L, and the second derivatives of ``eta' L`` with respect to q and q (n, n), q
     and qdot (n, n), and q and omega (n, 3).
 
     ``eta' L`` is a sum over the bodies of products of two motions: ``rigid``, the rotation of the
     whole system at ``eta``, and ``motion``, at ``omega`` and ``qdot``. If joint i moves, the former
     changes by ``a_i`` and the latter, at the joint, by ``b_i``; the momenta of the bodies that the
-    joint carries change by ``y1_i`` and ``y2_i``. Joints on different branches have no second
-    derivative, except for products of linear momenta, which keep the centre of mass at rest. The
-    formulas, derived in docs/theory/model.md, need a tenth of the operations of CasADi's
+    joint carries change by ``y1_i`` and ``y2_i``. Second derivatives for joints on different
+    branches are zero, except for products of linear momenta, which keep the centre of mass at rest.
+    The formulas, derived in docs/theory/model.md, need a tenth of the operations of CasADi's
     derivatives.
 
     Parameters

@@ -72,7 +72,7 @@ class ExternalLoads:
     def momentum_rates(
         self, R_WB: ca.SX, p_W: ca.SX, L_W: ca.SX, mass: float | ca.SX
     ) -> tuple[ca.SX, ca.SX]:
-        """Return the derivatives of both total momenta due to the loads, N and N m, in W."""
+        """Return the rates of change of both total momenta due to the loads, N and N m, in W."""
         moment, force = self.composites[0][:3], self.composites[0][3:]
         return (
             R_WB @ force + mass * self.gravity_W - self.friction * p_W,

@@ -1,9 +1,9 @@
 """Grasp of a floating body by a floating robot, modelled as an inelastic impact.
 
-The equations are derived in docs/theory/capture.md. The grasp impulse on the robot makes the
-velocities of the end-effector and of the grasped point equal. The joints are free: no motor or
-brake exerts an impulse. Momentum is conserved, because the impulse acts on the robot and the body
-with opposite signs. The formulation follows Yoshida and Nenchev, and Dimitrov and Yoshida.
+The equations are derived in docs/theory/capture.md. The grasp impulse makes the velocities of the
+end-effector and the grasped point equal. The joints are free: no motor or brake exerts an impulse.
+Momentum is conserved, because the impulse acts on the robot and the body with opposite signs. The
+formulation follows Yoshida and Nenchev, and Dimitrov and Yoshida.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ class BodyMotion:
         return inertia.mass * moving.v, self.R_WT @ inertia.about_com @ self.R_WT.T @ self.omega
 
     def with_momenta(self, inertia: Inertia, momenta: Array) -> BodyMotion:
-        """Return the motion from the same pose with other :meth:`momenta` (6,), linear first."""
+        """Return the motion at the same pose with different :meth:`momenta` (6,), linear first."""
         R = self.R_WT
         omega = R @ np.linalg.solve(inertia.about_com, R.T @ momenta[3:])
         v = momenta[:3] / inertia.mass - cross(omega, R @ inertia.com)

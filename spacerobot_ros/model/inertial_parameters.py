@@ -225,7 +225,7 @@ class MassProperties:
         """Return the second moment of mass ``tr(I)/2 1 - I`` (3, 3) of body k rotated by R, kg m^2.
 
         Along principal axes ``u``: ``J = lambda 1 + sum (lambda_u - lambda) u u'``. If ``lambda``
-        is the middle moment, only the symmetry axis is needed for a body that has one.
+        is the intermediate principal moment, a body with a symmetry axis needs only this axis.
         """
         about = self._inertias[k].about_com
         moments, axes = np.linalg.eigh(np.trace(about) / 2 * np.eye(3) - about)
@@ -283,8 +283,8 @@ def possibly_nonzero_entries(nominal: InertialParameters) -> npt.NDArray[np.bool
     """Return a mask (10 B,) of the vector entries that can be nonzero for robots with the given
     structure.
 
-    All masses may. Centre coordinates and products of inertia that are zero stay zero; principal
-    moments are either all zero (a point mass) or all free.
+    All masses can be. Coordinates of centres of mass and products of inertia that are zero stay
+    zero; principal moments are either all zero (a point mass) or all free.
     """
     rows = nominal.vector.reshape(-1, NUMBERS_PER_BODY) != 0.0
     rows[:, 0] = True
@@ -301,10 +301,10 @@ def rotational(J: ca.SX) -> ca.SX:
 
 
 def symmetric(matrix: ca.SX) -> ca.SX:
-    """Return a symmetric matrix whose mirrored entries share one expression."""
+    """Return a symmetric matrix whose off-diagonal pairs share one expression each."""
     return ca.tril2symm(ca.tril(matrix))
 
 
 def sparse_constant(array: Array) -> ca.DM:
-    """Return constants for expressions, in which zeros cost no operations."""
+    """Return constants for use in expressions; their zeros cost no operations."""
     return ca.sparsify(ca.DM(array))

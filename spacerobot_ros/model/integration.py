@@ -1,4 +1,4 @@
-"""Runge-Kutta 4 steps under held commands, as CasADi functions."""
+"""Fourth-order Runge-Kutta steps under held commands, as CasADi functions."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def count_steps(control_period: float, integration_step: float) -> int:
 
 
 def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
-    """Return one Runge-Kutta 4 step ``(x, held arguments of rate, h) -> x``.
+    """Return one fourth-order Runge-Kutta step ``(x, held arguments of rate, h) -> x``.
 
     If ``p`` (mass properties) is the last argument of the rate, it remains the last argument, after
     ``h``.
@@ -72,7 +72,8 @@ def repeat_step(step: ca.Function, count: int) -> ca.Function:
 
 
 def divided_step(name: str, step: ca.Function, count: int) -> ca.Function:
-    """Return the function that takes a step ``(x, u, loads, h) -> x`` as ``count`` equal steps."""
+    """Return the function that divides a step ``(x, u, loads, h) -> x`` into ``count`` equal
+    steps."""
     x, (u, loads, h, *p) = _symbols_for_inputs(step)
     x_next = repeat_step(step, count)(x, u, loads, h / count, *p)
     return ca.Function(name, [x, u, loads, h, *p], [x_next])
@@ -84,8 +85,8 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     This step reconstructs the base motion from the joint motion, one held command at a time. Joint
     velocities are constant over the step (servos hold them), so the configuration is exact; the
     base position follows from the centre of mass. Only the attitude is integrated:
-    ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3, with an
-    angular momentum that need not be zero), as a quaternion in R^4, normalised.
+    ``R_WB_dot = R_WB hat(omega)``, ``omega = D^-1 (R_WB' L_W - D_q qdot)`` (paper 1, eq. 3,
+    extended to nonzero angular momentum), as a quaternion in R^4, normalised.
 
     ``locked_inertia`` is the function ``q -> (D, D_q)``; if it takes a second argument ``p`` (mass
     properties), so does the step, as its last argument.

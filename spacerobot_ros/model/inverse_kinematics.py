@@ -1,7 +1,6 @@
-"""Inverse kinematics of an arm on a fixed base: starting from the current configuration, or by a
-search.
+"""Inverse kinematics of an arm on a fixed base, from the current configuration or by a search.
 
-A controller that keeps its base in place follows a path with the arm alone. The web page checks
+A controller that keeps the base in place follows a path with the arm alone. The web page checks
 whether the arm can reach a goal. The controller and the page use the same errors and the same
 Jacobian.
 """
@@ -79,7 +78,7 @@ class FixedBaseArm:
         return error[self._rows], J_W[self._rows]
 
     def nearest_shape(self, q: Array, goal: Pose) -> tuple[Array, float]:
-        """Return the configuration (n,) whose end-effector is closest to a pose, found by a search
+        """Return the configuration (n,) that brings the end-effector closest to a pose, by a search
         from ``q``.
 
         Also return the largest remaining error, m or rad. The search uses damped least squares
@@ -98,12 +97,12 @@ class FixedBaseArm:
         return q, distance
 
     def search_shape(self, q: Array, goal: Pose) -> tuple[Array, float, float]:
-        """Return the configuration (n,) within the joint limits whose end-effector is closest to a
-        pose.
+        """Return the configuration (n,) within joint limits that brings the end-effector closest to
+        a pose.
 
         Also return the remaining distance and angle along the controlled axes, m and rad.
-        The search starts at
-        ``q`` and at random configurations; identical arguments yield identical results.
+        The search starts at ``q`` and at random configurations; identical arguments yield identical
+        results.
         """
         # Imported here because scipy.optimize loads slowly.
         from scipy.optimize import least_squares
@@ -138,5 +137,5 @@ class FixedBaseArm:
 
 
 def is_reached(distance: float, angle: float) -> bool:
-    """Whether an arm reaches its goal, given the remaining error after a search, m and rad."""
+    """Whether an arm reaches its goal, given the errors that remain after a search, m and rad."""
     return distance <= 2 * _SEARCH_TOLERANCE and angle <= 4 * _SEARCH_TOLERANCE

@@ -37,7 +37,7 @@ from spacerobot_ros.model.symbolic_rotations import quaternion_from_matrix as sy
 
 @dataclass(frozen=True)
 class TreeKinematics:
-    """Body poses, centres of mass and inertias as functions of the shape q.
+    """Body poses, centres of mass and inertias as functions of the configuration q.
 
     For body k, in the base frame: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
     origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
@@ -266,8 +266,8 @@ def joints_outward(robot: RobotDescription) -> list[Joint]:
 class ForwardKinematics:
     """Link poses of a robot from its joint positions.
 
-    Transforms consist of a position (m) and a quaternion (x, y, z, w), side by side: (k, 7).
-    Quaternions depend on half the joint angle, so they are continuous over several revolutions.
+    Transforms (k, 7) are rows of a position (m) followed by a quaternion (x, y, z, w). Quaternions
+    depend on half the joint angle, so they are continuous over several revolutions.
 
     Parameters
     ----------
@@ -311,8 +311,8 @@ class ForwardKinematics:
         ]
 
     def transforms_at(self, q: Array) -> Array:
-        """Return the poses (..., k, 7) of the moving children in their parents for joint positions
-        (..., n), m or rad.
+        """Return the poses (..., k, 7) of the moving child links in their parent frames at joint
+        positions (..., n), m or rad.
         """
         moved = self._factor * q[..., self._index] + self._offset
         half = (self._half * moved)[..., None]

@@ -54,7 +54,7 @@ Faces = npt.NDArray[np.int32]
 class TriangleMesh:
     """Triangles: ``vertices`` (N, 3) in m, ``faces`` (M, 3) of vertex indices.
 
-    Face corners keep their order in the file, normally counterclockwise viewed from outside.
+    Face corners keep their order in the file, normally counter-clockwise viewed from outside.
     """
 
     vertices: Array
@@ -119,7 +119,7 @@ def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
 
 
 def mesh_beside(resource: str, folder: Path) -> Path | None:
-    """Return the file of a mesh given relative to a folder; None if the path is absolute."""
+    """Return the file of a mesh named relative to a folder; None if the path is absolute."""
     scheme, mark, rest = resource.partition("://")
     if not mark:
         found = folder / resource
@@ -192,7 +192,7 @@ def read_mesh(path: str | Path) -> TriangleMesh:
     try:
         if (size := path.stat().st_size) > _MAX_MESH_BYTES:
             raise MeshError(
-                f"The mesh {path} has {size / 1e6:.0f} MB; at most "
+                f"The mesh {path} is {size / 1e6:.0f} MB; at most "
                 f"{_MAX_MESH_BYTES / 1e6:.0f} MB are read. Make it coarser."
             )
         data = read_regular(path)
@@ -328,7 +328,7 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
         vertices = np.asarray(found.vertices, dtype=float).reshape(-1, 3)
         faces = np.asarray(found.faces, dtype=np.int32).reshape(-1, 3)
     except Exception as error:  # Each trimesh parser raises its own exceptions.
-        raise _DamagedError(f"trimesh says {type(error).__name__}") from error
+        raise _DamagedError(f"trimesh raised {type(error).__name__}") from error
     return TriangleMesh(vertices * _unit_in_metres(path, data), faces)
 
 

@@ -86,7 +86,7 @@ class ModelFunctions:
         return _model_of_key(_RobotKey.of(robot, robot))
 
     def function(self, name: str, *, compile: bool = True) -> ca.Function:
-        """Return a model function by name, with an argument after a colon for some.
+        """Return a model function by name; some names take an argument after a colon.
 
         ``compile=False`` returns the symbolic function, for building larger functions.
         """
@@ -117,7 +117,7 @@ class ModelFunctions:
 
     @cached_property
     def equations_key(self) -> str:
-        """Hash of the equations at zero momentum, identical for robots with the same motion."""
+        """Hash of the equations at zero momentum, identical for robots with identical equations."""
         digest = hashlib.sha256()
         for name in ("locked_inertia", "center_of_mass"):
             digest.update(self.function(name, compile=False).serialize().encode())

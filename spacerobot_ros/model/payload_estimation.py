@@ -126,7 +126,7 @@ def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
 def estimate_payload(
     link: str, regressors: Array, known: Array, mass: float, radius: float
 ) -> PayloadEstimate:
-    """Return the parameters of a held body, by least squares with errors in all variables.
+    """Return the parameters of a held body, by errors-in-variables least squares.
 
     Errors in the measured velocities enter both sides of the equation; their covariance, from
     second differences, is subtracted from the normal equations (docs/theory/capture.md). Errors of

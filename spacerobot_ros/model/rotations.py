@@ -93,7 +93,7 @@ def matrices_from_quaternions(quaternions: Array) -> Array:
 
 
 def rows_from_quaternion(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
-    """Return the rows of a rotation matrix, of numbers, arrays or symbols x, y, z and w."""
+    """Return the rows of a rotation matrix from numbers, arrays or symbols x, y, z and w."""
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],

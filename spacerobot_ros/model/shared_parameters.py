@@ -36,7 +36,7 @@ Config = TypeVar("Config", bound="CommanderConfig")
 
 
 def automatic_tolerance(robot: RobotDescription) -> float:
-    """Return the automatic position tolerance for a robot, m, rounded to one digit."""
+    """Return the automatic position tolerance for a robot, m, to one significant digit."""
     tolerance = min(max(_TOLERANCE_SHARE * robot.size, _SMALLEST_TOLERANCE), _LARGEST_TOLERANCE)
     return float(f"{tolerance:.1g}")
 

@@ -1,8 +1,9 @@
 """Model of one robot: its compiled equations as methods.
 
-Frames: world W, base link B. Vectors with the suffix ``_B`` are in the base frame. The shape ``q``
-(n,) is in the order of ``joint_names``. The methods return new arrays; code that runs every control
-period uses a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and works in place.
+Frames: world W, base link B. Vectors with the suffix ``_B`` are in the base frame. The joint
+positions ``q`` (n,) are in the order of ``joint_names``. The methods return new arrays; code that
+runs every control period uses a :class:`BufferedFunction` from :meth:`SpaceRobot.buffered` and
+works in place.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ class SpaceRobot:
         return cls(parse_robot(text))
 
     def with_inertial(self, parameters: InertialParameters) -> SpaceRobot:
-        """Return the robot with other masses, centres of mass and inertias.
+        """Return the robot with new masses, centres of mass and inertias.
 
         All variants of the robot with different values share their compiled functions. If the
         values are unchanged, the robot itself is returned.
@@ -350,11 +351,11 @@ class SpaceRobot:
     def view(
         self, key: Hashable, make: Callable[[], ca.Function]
     ) -> tuple[ca.Function, BufferedFunction]:
-        """Return a function made from :meth:`expressions`, and the same compiled with its own
+        """Return a function made from :meth:`expressions`, and its compiled version with its own
         buffers, whose argument ``p``, if any, is set to this robot's mass properties.
 
-        It is made and compiled once per key for all robots that share the expressions: robots with
-        equal mass properties, or with mass properties as an argument.
+        The function is made and compiled once per key for all robots that share the expressions:
+        robots with equal mass properties, or with mass properties as an argument.
         """
         derived = self._model.derived
         if key not in derived:

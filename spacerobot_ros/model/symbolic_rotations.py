@@ -51,7 +51,7 @@ def quaternion_multiply(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 def relative_vector(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Return the vector part (3,) of the rotation from a to b: zero for either sign of b."""
+    """Return the vector part (3,) of the quaternion from a to b: zero if b equals a or -a."""
     return a[3] * b[:3] - b[3] * a[:3] - ca.cross(a[:3], b[:3])
 
 

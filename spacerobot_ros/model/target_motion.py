@@ -375,8 +375,8 @@ class TargetExpression(NamedTuple):
 
     @classmethod
     def at(cls, numbers: ca.SX, time: ca.SX) -> TargetExpression:
-        """Return the target at a time close to the time of ``numbers``
-        (:meth:`TorqueFreeMotion.numbers`), predicted by Euler's equations.
+        """Return the target at a time near that of ``numbers`` (:meth:`TorqueFreeMotion.numbers`),
+        predicted by Euler's equations.
         """
         began, X, L, r, v, mass, about, arm, turn = ca.vertsplit(
             numbers, np.cumsum([0, 1, 4, 3, 3, 3, 1, 6, 3, 4]).tolist()

@@ -85,7 +85,7 @@ class ThrusterTable:
     @property
     def wrenches(self) -> Array:
         """Wrenches (6, m) at full thrust, force (N) and torque (N m) at the base link origin, in
-        base components.
+        the base frame.
         """
         thrust_B = self.direction_B * self.force[:, None]
         return np.vstack([thrust_B.T, np.cross(self.r_B, thrust_B).T])
@@ -471,7 +471,7 @@ class ThrusterModulator:
     def fire(self, wrench: Array) -> Array:
         """Return the on-time of each thruster (m,) in the next period, s.
 
-        ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, base components.
+        ``wrench`` (6,) is force (N) and torque (N m) at the base link origin, in the base frame.
         """
         h = self._control_period
         wanted = self.pending_impulse + h * wrench

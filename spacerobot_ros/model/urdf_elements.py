@@ -1,7 +1,7 @@
 """Reads the elements of a URDF: links, joints, and pairs of links whose contacts are ignored.
 
-Every element and attribute is checked when it is read; messages name the element and its
-correction. Elements that are not read are ignored.
+Every element and attribute is checked when it is read; error messages name the element and the
+remedy. Elements that are not read are ignored.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Robot visuals as triangles and sharp edges, for pictures, pages and the viewer.
 
-Colours, cameras and backgrounds are chosen by pictures, pages and the viewer. Meshes come from
-files (:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), to which a
-recorder adds the result of :func:`meshes_for_bag`; :func:`with_attached_meshes` writes them back to
-files.
+Colours, cameras and backgrounds are chosen there. Meshes come from files
+(:func:`meshes_from_files`) or from a bag (:func:`meshes_from_attachments`), to which a recorder
+adds the result of :func:`meshes_for_bag`; :func:`with_attached_meshes` writes them back to files.
 """
 
 from __future__ import annotations
@@ -196,7 +195,7 @@ def _surface_of_revolution(radii: list[float], heights: Array) -> TriangleMesh:
 
 
 def sharp_edges(mesh: TriangleMesh) -> Edges:
-    """Return the edges of a mesh at its boundary, or whose faces meet at more than 30 degrees."""
+    """Return the mesh edges on its boundary or between faces that meet at over 30 degrees."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)

@@ -159,7 +159,7 @@ class CoordinatedControlNode(CommanderNode):
         self._joint_commands.publish(self._joint_message.serialised(stamp))
 
     def publish_status(self, status: Status) -> None:
-        """Publish a goal status, and log warnings, errors, reached goals and what is awaited."""
+        """Publish a goal status; log warnings, errors, reached goals and what the node awaits."""
         super().publish_status(status)
         awaited = status.message if status.state is ControllerState.WAITING else ""
         decision = status.state, status.goal_id, awaited

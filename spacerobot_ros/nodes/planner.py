@@ -292,7 +292,7 @@ class _Connection:
 
 
 def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
-    """Return a schedule as a trajectory that begins on arrival.
+    """Return a schedule as a trajectory that starts when it is received.
 
     The points have only positions, so that controllers interpolate linearly. This reproduces the
     schedule, whose velocities are constant over a tick.

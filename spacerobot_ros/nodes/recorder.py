@@ -1,4 +1,4 @@
-"""The recorder node: writes every topic as published to an MCAP bag."""
+"""The recorder node: writes every topic, as published, to an MCAP bag."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ class RecorderNode(FlightNode):
 
     @property
     def failure(self) -> RecordingError | None:
-        """Error that ended the recording; None without an error."""
+        """Error that ended the recording; None if there was none."""
         return self.recording.failure if self.recording is not None else None
 
     def describe(self, name: str, values: dict[str, str]) -> None:

@@ -88,7 +88,7 @@ class Analysis:
 
     @property
     def chosen(self) -> str:
-        """Method usually chosen by ``auto``: ``optimal`` if it suits; "" if none does."""
+        """Method usually chosen by ``auto``: ``optimal`` if suitable; "" if no method is."""
         suits = [
             name
             for name, objection in self.objections.items()

@@ -1,4 +1,4 @@
-"""Flight events below the time axes of figures: goals, plans, faults, latches."""
+"""Flight events drawn below the time axes of figures: goals, plans, faults, latches."""
 
 from __future__ import annotations
 

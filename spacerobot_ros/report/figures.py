@@ -132,7 +132,7 @@ def _apply_style(path: Path) -> None:
     warnings: list[str] = []
 
     def collect(record: logging.LogRecord) -> bool:
-        """Suppress a warning, such as one about a style line that matplotlib does not know."""
+        """Collect and suppress a warning, such as one about a style line unknown to matplotlib."""
         if record.levelno < logging.WARNING:
             return True
         warnings.append(record.getMessage().strip().splitlines()[0].rstrip("."))
@@ -188,7 +188,7 @@ def width() -> float:
 
 
 def narrow() -> bool:
-    """Whether a figure fits one column of a paper."""
+    """Whether a figure fits in one column of a paper."""
     return _look.get().width / _look.get().scale < _NARROW_WIDTH
 
 
@@ -360,7 +360,7 @@ _FLIGHT_DASHES = ((), (4.5, 1.2, 1.2, 1.2), (2.0, 1.0), (6.0, 1.2, 1.2, 1.2, 1.2
 
 
 def flight_dashes(number: int) -> tuple[float, ...]:
-    """Return the line dashes for one of several flights in a panel; the first line is solid."""
+    """Return the dash pattern for one of several flights in a panel; the first line is solid."""
     return _FLIGHT_DASHES[number % len(_FLIGHT_DASHES)]
 
 
@@ -549,7 +549,7 @@ class TraceGroup:
         return np.concatenate([np.empty(0), *(each.values.ravel() for each in self.signals)])
 
     def in_unit_of_angles(self) -> TraceGroup:
-        """Return the traces in the selected angle unit: degrees instead of rad, if requested."""
+        """Return the traces in the selected angle unit: degrees instead of radians if requested."""
         if not _look.get().degrees or not self.unit.startswith("rad"):
             return self
         factor, unit = angle_unit()

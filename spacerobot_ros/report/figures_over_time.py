@@ -375,7 +375,7 @@ def _why_no_joints(flight: FlightReport) -> str:
 
 
 def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
-    """Joint velocities; None if all joints are wheels; their rates are shown instead of their
+    """Joint velocities; None if all joints are wheels, whose rates are shown instead of their
     angles."""
     if not flight.joint_names:
         return _why_no_joints(flight)

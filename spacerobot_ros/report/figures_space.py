@@ -105,7 +105,7 @@ def configurations_figure(flight: FlightReport) -> ReportFigure | str:
 
 
 def with_near(points: Array, more: Array, view: View) -> Array:
-    """Return points (k, 3) on a robot, and on other objects that are not far away, m."""
+    """Return points (k, 3) on a robot and on nearby objects, m."""
     both = np.concatenate([points, more])
     shown = np.ptp(view(both), axis=0).max() < _NEAR * np.ptp(view(points), axis=0).max()
     return both if shown else points
@@ -391,7 +391,7 @@ _MIN_LOOPS = 4
 def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     """Attitude, and remaining angle to the goal, at the end of each loop in shape space.
 
-    None if no method repeats cycles, or the joints do not return to the same shape several times.
+    None if no method repeats cycles, or if the joints do not return to one shape several times.
     """
     if not flight.repeats_cycles or not len(flight.q) or len(flight.attitude) != len(flight.q):
         return None
@@ -423,7 +423,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
 
 
 def loop_ends(shape: Signal) -> Indices:
-    """Return the samples at which the joints return to their last shape, closing a loop.
+    """Return the samples at which the joints return to their final shape, closing a loop.
 
     If the joints stop there, the last sample at rest is returned; at the end of the flight, the
     first sample at rest is returned.

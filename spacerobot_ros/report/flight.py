@@ -323,7 +323,7 @@ class FlightReport(Flight):
 
     @property
     def hidden_links_text(self) -> str:
-        """A message about data that are missing for drawing the robot; empty if nothing is
+        """A message about missing data that are needed to draw the robot; empty if nothing is
         missing."""
         lacking = []
         if self.robot is None:

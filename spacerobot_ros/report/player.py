@@ -45,7 +45,7 @@ class View3D:
 
 
 def viewer_script() -> str | None:
-    """Return MeshCat's viewer; None if package ``meshcat`` is not installed."""
+    """Return MeshCat's viewer; None if the package ``meshcat`` is not installed."""
     spec = find_spec("meshcat")
     for folder in (spec.submodule_search_locations or ()) if spec is not None else ():
         path = Path(folder) / "viewer" / "dist" / "main.min.js"

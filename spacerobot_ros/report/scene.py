@@ -1,4 +1,4 @@
-"""Flight scene: bodies with their solids, colors and poses over time.
+"""Flight scene: bodies with their solids, colours and poses over time.
 
 Pictures (:mod:`.solids`) and the 3D view (:mod:`.player`) draw the same bodies; the live page draws
 the same solids (:mod:`spacerobot_ros.model.visuals`).
@@ -49,7 +49,7 @@ class Body:
     color: str = ""
 
     def color_of(self, visual: Visual) -> str:
-        """Return the color of a solid, ``#rrggbb``."""
+        """Return the colour of a solid, ``#rrggbb``."""
         return self.color or to_hex(visual.shape.rgba[:3])
 
 
@@ -60,7 +60,7 @@ def robot_bodies(
     q: Array,
     most: int,
 ) -> list[Body]:
-    """Return the robot links that have solids, with the colors of the joints that move them.
+    """Return the robot links that have solids, with the colours of the joints that move them.
 
     Parameters
     ----------

@@ -62,8 +62,8 @@ def thinned(signal: Signal, slices: int) -> Signal:
 
 
 def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
-    """Drop samples that lie on lines between other samples (Douglas-Peucker); the farthest samples
-    are kept first.
+    """Drop samples that lie on lines between other samples (Douglas-Peucker); the samples farthest
+    from such lines are kept first.
 
     Parameters
     ----------

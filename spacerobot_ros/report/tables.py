@@ -133,7 +133,7 @@ def _extreme_values(flight: FlightReport) -> dict[str, str]:
 
 
 def result_table(flight: FlightReport) -> Table:
-    """Return goals and final poses, an estimated body and the clearance, each if it is in the
+    """Return goals, final poses, the estimated held body and the clearance, each if it is in the
     bag."""
     rows: list[tuple[str, ...]] = []
     last = flight.reports[-1][1].state.value if flight.reports else ""

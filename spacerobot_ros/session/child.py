@@ -1,4 +1,4 @@
-"""A node in a child process, from both ends.
+"""A node in a child process: the parent's side and the child's side.
 
 ``python -m spacerobot_ros.session.child MODULE ...`` starts a node that ends together with its
 supervisor. Signal handlers are set first, because importing a node module takes a second.
@@ -117,7 +117,7 @@ class NodeProcess:
 
     @property
     def log(self) -> str:
-        """Standard error of the node, and standard output unless it goes elsewhere."""
+        """Standard error of the node, and standard output unless it is redirected."""
         return self._log_file.read_text("utf-8", errors="replace")
 
     @property

@@ -40,7 +40,7 @@ from spacerobot_ros.topics import SERVICE_BY_REQUEST, Request
 
 @contextmanager
 def ros() -> Iterator[None]:
-    """Initialise rclpy without its signal handlers; nodes are discovered on this machine.
+    """Initialise rclpy without signal handlers; by default, discover nodes on this machine only.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def run_until_stopped(
     If the planner or the controller dies, it is restarted, at most ``restarts`` times per minute.
     ``supervise`` is called five times per second.
 
-    Returns the bag path, with a new name if the name was in use and ``when_exists`` is next.
+    Returns the bag path, with a new name if the name was in use and ``when_exists`` is ``next``.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def send_goal(
     """Send one goal pose, show its statuses, and return its outcome.
 
     ``timeout`` is a wall time in s; 0 means no limit. The search for a commander ends after
-    ``timeout``, or after ten seconds.
+    ``timeout``, or after ten seconds if that is sooner.
 
     Raises
     ------
@@ -280,7 +280,7 @@ def send_request(request: Request, show: Callable[[str], None], *, namespace: st
             ready = [each for each in services if each.service_is_ready()]
             if not ready:
                 raise SpaceRobotError(
-                    f"No node offers {offered} after {_LONGEST_DISCOVERY:g} s: start a stack, "
+                    f"No node offered {offered} within {_LONGEST_DISCOVERY:g} s: start a stack, "
                     "`spacerobot up SCENARIO`, in the same ROS domain and namespace."
                 )
             succeeded = True
@@ -332,7 +332,7 @@ def _find_goal_commander(
             return client
     listed = "; the planner's parameter end_effectors lists other links" if aims[1:] else ""
     raise SpaceRobotError(
-        f"No commander accepts goals on {topics} after {patience:g} s: start a planner or a "
+        f"No commander accepted goals on {topics} within {patience:g} s: start a planner or a "
         f"controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace{listed}."
     )
 

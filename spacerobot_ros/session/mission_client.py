@@ -162,8 +162,8 @@ class MissionClient:
         return self.node.count_publishers(self._status_topic.topic_name) > 0
 
     def has_late_recorder(self) -> bool:
-        """Whether a node that follows events and states does not subscribe to goals yet: a
-        recorder does once it has discovered this client.
+        """Whether a node that follows events and states has not yet subscribed to goals: a recorder
+        does so once it has discovered this client.
         """
         followers = self._readers("events") & self._readers("odom")
         return bool(followers - self._readers(self._goal_topic))

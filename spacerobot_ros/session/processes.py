@@ -237,7 +237,7 @@ class MultiProcessStack:
         return environment
 
     def start(self, goal: Goal | None, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Activate all nodes and send the goal, if any; the plant starts last. This ends early if
+        """Activate all nodes and send the goal, if any; the plant starts last. Return early if
         ``stopped`` returns true."""
         self.client.node.destroy_subscription(self._heartbeats)
         for name in reversed(self.names[1:]):

@@ -440,7 +440,7 @@ class _JointBrakes:
     def efforts(self) -> Array:
         """Return the efforts (n,) for the next tick, N or N m, before limits are applied.
 
-        The joint rows of ``H+ z0ddot + C+ = Q`` (paper 4, eq. 19), with the base rows inserted.
+        The joint rows of ``H+ z0ddot + C+ = Q`` (paper 4, eq. 19), with base motion eliminated.
         """
         q, qdot = self._plant.q[self._braked], self._plant.qdot[self._braked]
         (H,), (C,) = self._inertia(q), self._bias(q, np.zeros(3), self._plant.twist[3:], qdot)

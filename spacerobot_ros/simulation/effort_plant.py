@@ -13,7 +13,7 @@ inertia matrix in the configuration. Stops have two effects:
   limit. The joint does not rebound; the energy ``(qdot+ - qdot-)' K (qdot+ - qdot-) / 2`` is lost
   (Carnot). The time of arrival is exact up to rounding.
 * Holding: a joint that is on its stop stays there during an integration step if it is pushed
-  outwards. This is the case if its rate is zero in the admissible rates nearest to
+  outwards. This is the case if its rate is zero in the vector of admissible rates nearest to
   ``qdot + h K^-1 Q`` (Gauss's principle of least constraint over a step, Moreau's time stepping).
   The joint leaves its stop with a delay of at most one step. This delay ends the sequence of ever
   shorter rebounds between joints that push each other off their stops.

@@ -294,7 +294,7 @@ class MujocoLoads:
     def apply(self, vector: Array, time: float) -> None:
         """Apply the load vector at a given time (s) to all bodies, given their current motion.
 
-        Body poses and velocities must belong to MuJoCo's current state.
+        Body poses and velocities must correspond to MuJoCo's current state.
         """
         model, data, layout = self._model, self._data, self._layout
         in_link = vector[layout.in_link].reshape(-1, 6)

@@ -447,7 +447,7 @@ class MujocoTarget(Target):
         self.step()
 
     def release(self, motion: BodyMotion) -> None:
-        """Float freely from the current motion."""
+        """Release the target, which keeps its current motion."""
         assert self.plant is not None
         self.plant.unweld()
         self.step()

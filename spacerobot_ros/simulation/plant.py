@@ -41,7 +41,7 @@ class Plant(Protocol):
         (7,) linear momentum (kg m/s), angular momentum about the system's centre of mass
         (kg m^2/s), both in W, and kinetic energy (J), summed over the bodies.
     ``expected_momenta``
-        (6,) linear and angular momentum in W: the initial value plus thrust and loads.
+        (6,) linear and angular momentum in W: initial value plus impulses of thrust and loads.
     ``link_R``, ``link_r``
         (3, 3 L) and (3, L): pose of each link in B, in the order of ``robot.link_names``.
     ``limit_counts``

@@ -41,8 +41,8 @@ class NormalNumbers:
     """Independent standard normal numbers, computed only from a seed and their position.
 
     Row k has the numbers of Philox 4x64 for the counters k B + 1 to (k + 1) B, where B is a quarter
-    of the row's size, rounded up. Pairs become normal by Box and Muller's transform. Therefore,
-    programs of lanes and devices (``batch/driver.hpp``) compute the numbers of any tick.
+    of the row's size, rounded up. Pairs become normal by the Box-Muller transform. So programs for
+    lanes and devices (``batch/driver.hpp``) can compute the numbers of any tick.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ class Sensors:
 
     @property
     def is_imperfect(self) -> bool:
-        """Whether measurements currently differ from the truth."""
+        """Whether measurements currently differ from the true values."""
         return bool(
             self.dropout
             or self._delay

@@ -30,8 +30,7 @@ def latched_text(fault: str) -> str:
 
 
 class PlantState(str, Enum):
-    """State of the plant with regard to time and commands; the value of ``state`` in
-    plant/status."""
+    """Operating state of a plant: the value of ``state`` in plant/status."""
 
     INACTIVE = "inactive"
     """The plant publishes no states and accepts no commands."""

@@ -66,7 +66,7 @@ _ENDED = "The stack has ended: none of its nodes responds."
 
 
 def silence_message(state: StackState) -> str:
-    """Return a message if states have stopped or never arrived, otherwise an empty string."""
+    """Return a message if states no longer arrive or never arrived, otherwise an empty string."""
     if state.replay is not None and (state.replay.paused or state.replay.ended):
         return ""
     if state.age_s == math.inf:
@@ -543,7 +543,7 @@ T = TypeVar("T")
 
 
 class RecentItems(Generic[T]):
-    """Items from the last minutes of simulated time, in order of time, at least one step apart.
+    """Items from the last minutes of simulated time, in time order, at least one step apart.
 
     Parameters
     ----------

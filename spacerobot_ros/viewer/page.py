@@ -73,7 +73,7 @@ _SLIDER_HOLD_S = 1.5
 
 
 class ButtonPanel:
-    """Buttons for requests that the stack performs immediately."""
+    """Buttons for requests that the stack carries out immediately."""
 
     def __init__(
         self,
@@ -146,7 +146,7 @@ class TimeLine:
 
 
 class LookBack:
-    """Slider for looking back in a flight, and a button to return to the current state.
+    """Slider for looking back over a flight, and a button to return to the current state.
 
     Attributes
     ----------

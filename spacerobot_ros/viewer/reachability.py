@@ -4,7 +4,7 @@ arm.
 The process has low priority, so that neither the page nor the plant waits for it. It works on
 one goal at a time: a newer goal cancels the plan in progress. Questions and answers are numbered.
 
-A controller accepts any pose, and reports only in flight if the arm is too short. Goals for a
+A controller accepts any pose; only in flight does it report that the arm is too short. Goals for a
 controller are checked by a search for joint positions at which both the base and the end-effector
 are at their goals.
 """
@@ -408,7 +408,7 @@ def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
 
 
 def main(descriptor: int) -> None:
-    """Answer questions on a connection until it ends."""
+    """Answer questions on a connection until it closes."""
     with guarded(), suppress(Terminated):
         os.nice(_NICENESS)
         connection = Connection(descriptor)

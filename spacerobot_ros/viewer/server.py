@@ -1,9 +1,9 @@
 """The page's web server, and the viewer parameters.
 
 viser accepts websockets from any page that is open in a browser, and connects to the server of
-its vendor if a client requests sharing of the page. This module prevents both of these, so that
-foreign pages in a user's browser cannot steer the robot. For the same reason, other pages cannot
-embed this page in a frame.
+its vendor if a client requests sharing of the page. This module prevents both, so that other pages
+in a user's browser cannot steer the robot. For the same reason, they cannot embed this page in a
+frame.
 """
 
 from __future__ import annotations

@@ -183,7 +183,7 @@ class InjectAction:
 
 @dataclass(frozen=True)
 class SeekAction:
-    """Continue the replay from a time, s after its start."""
+    """Continue the replay from a given time, s, after its start."""
 
     seconds: float
 

@@ -561,7 +561,7 @@ def test_goal_shapes_are_those_of_the_whole_robot() -> None:
     for count, refused in ((1, True), (4, False)):
         goal = Goal.checked([0, 0, 0], [0, 0, 0, 1], [0.1 * (i + 1) for i in range(count)])
         if refused:
-            with pytest.raises(PlanningError, match="a shape of 1 joints; robot 'gyro' has 4"):
+            with pytest.raises(PlanningError, match="1 joint positions; robot 'gyro' has 4"):
                 loop.executive.submit("base", IdentifiedGoal(goal, "g"))
         else:
             loop.executive.submit("base", IdentifiedGoal(goal, "g"))

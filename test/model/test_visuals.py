@@ -318,8 +318,8 @@ def test_a_missing_reader_is_named_with_the_command_that_installs_it(
         ("a.obj", OBJ + b"f 1 2 0\n", "refers to a missing vertex"),
         ("a.obj", OBJ + b"f 1 2 x\n", "is not a number"),
         ("a.obj", OBJ + b"f 1 2 99999999999\n", "is not a number"),
-        ("a.ply", b"secret of the host", "trimesh says [A-Za-z]+[.]$"),
-        ("a.dae", b"secret of the host", "trimesh says [A-Za-z]+[.]$"),
+        ("a.ply", b"secret of the host", "trimesh raised [A-Za-z]+[.]$"),
+        ("a.dae", b"secret of the host", "trimesh raised [A-Za-z]+[.]$"),
         (
             "a.step",
             b"",

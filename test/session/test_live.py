@@ -198,7 +198,7 @@ def test_goals_are_sent_to_a_robot_that_is_up(
         assert (answer.returncode, answer.stderr) == (0, ""), request
     nobody = spacerobot("request", "hold")
     assert nobody.returncode == 2
-    assert nobody.stderr.startswith("No node offers 'replay/pause' after 10 s")
+    assert nobody.stderr.startswith("No node offered 'replay/pause' within 10 s")
     robot.send_signal(signal.SIGINT)
     assert robot.wait(PATIENCE) == 0
     assert robot.stdout is not None
@@ -234,7 +234,7 @@ def test_a_goal_that_nobody_takes_is_one_sentence(spacerobot: Command) -> None:
         assert run.stdout.startswith(told)
         assert run.stdout.count("\n") == bool(told)
         assert run.stderr.count("\n") == 1
-        assert f"after {seconds} s" in run.stderr
+        assert f"within {seconds} s" in run.stderr
         assert "spacerobot up" in run.stderr
 
 

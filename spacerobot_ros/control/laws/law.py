@@ -61,7 +61,7 @@ class GainPair:
     Automatic gains depend on the robot and the control period (:meth:`ControlLaw.set_gains`).
 
     The integral gain removes the steady-state error under constant disturbances. With laws that use
-    the inertia, each error is stable if ``ki < kp kd``; choose a much smaller value.
+    the inertia, each error decays if ``ki < kp kd``; choose a much smaller value.
 
     Commands are held for one control period. If a derivative gain removes more than the whole
     velocity within one period, the loop is unstable: Kd times the period must stay well below 2
@@ -560,8 +560,7 @@ class ControlLaw(ABC):
         return self._out["error"].copy()
 
     def largest_error_share(self, bounds: Array) -> float:
-        """Return the largest error at the last command as a fraction of the positive bound on that
-        error (m,)."""
+        """Return the largest ratio of an error at the last command to its positive bound (m,)."""
         # NumPy's max, as Python's may hide a NaN, which must not count as reached.
         return float(np.abs(self._out["error"] / bounds).max(initial=0.0))
 

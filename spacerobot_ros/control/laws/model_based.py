@@ -53,7 +53,7 @@ class ModelBasedLaw(ControlLaw):
     * The mobility along u, ``s^2 v' H+^-1 v`` with ``J_z' u = s v``, is raised to its value for
       ``s = t``: damping ``d = sqrt(t^2 - s^2)``, which starts from zero at the threshold.
       Accelerations along v stay bounded; other directions are unaffected.
-    * Velocity along v is not visible in the outputs, so the Kd of the outputs does not act on it.
+    * Velocity along v does not appear in the outputs, so the Kd of the outputs does not act on it.
       It is damped directly with the largest Kd. If the reference describes a single motion, motion
       along v follows the joints of that motion instead, with critical damping.
 

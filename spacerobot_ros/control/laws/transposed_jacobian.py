@@ -1,4 +1,4 @@
-"""A PD law for the outputs through the transpose of J_z, without inertia or inverse."""
+"""A PD law for the outputs with the transpose of J_z, without inertia or inverse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Base class of the nodes that command a plant; it converts the messages of a commander."""
+"""Base class of the nodes that command a plant: converts messages for a commander."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ class CommanderNode(FlightNode):
         self.commander.deactivate(self._failure)
 
     def parameters_changed(self) -> None:
-        """Use the new tolerances, times and gains."""
+        """Apply the new tolerances, times and gains."""
         self.commander.reconfigure(self.config)
 
     def interrupt(self) -> None:

@@ -1,4 +1,4 @@
-"""Goals as actions: a commander node's servers, and the conversion of their messages.
+"""Goals as actions: a commander node's action servers and their message conversion.
 
 The types are imported at run time if installed: ``spacerobot_msgs/action/FlyTo`` from this project
 and ``nav2_msgs/action/NavigateToPose``.
@@ -203,7 +203,7 @@ class GoalClient:
 
 
 class GoalActions:
-    """The action servers of a commander node, which exist as long as the node.
+    """The action servers of a commander node, which exist as long as the node does.
 
     Therefore, if a cleanup of the node ends a goal, the client still receives the result. While the
     node is not configured, goals are rejected.

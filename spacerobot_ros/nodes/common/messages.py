@@ -88,7 +88,7 @@ def shape_message(goal: Goal, joint_names: Sequence[str]) -> JointState:
 
 
 def pose_array(position: Any, orientation: Any) -> Array | None:
-    """Return the pose (7,) of a point or vector and a quaternion message, normalised.
+    """Return the pose (7,), normalised, from a point or vector and a quaternion message.
 
     None if a value is not finite or the quaternion is zero.
     """

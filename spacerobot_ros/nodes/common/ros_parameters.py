@@ -32,7 +32,8 @@ _CHECKS_UNTIL_LOST = 50
 
 
 class RemoteParameters:
-    """All parameters of another node, by its full name; call :meth:`look` until it returns True."""
+    """All parameters of another node, given its full name; call :meth:`look` until it returns
+    True."""
 
     def __init__(self, node: Node, name: str) -> None:
         self._node, self.name = node, name

@@ -89,8 +89,8 @@ class PlantReport:
         )
 
     def limited(self) -> None:
-        """Log that limits restricted joints in the last step, except joints that only rest on a
-        stop.
+        """Log that limits restricted joints in the last step, except joints that merely rest
+        against a stop.
         """
         plant, texts = self._node.plant, []
         resting = np.zeros(plant.robot.n, dtype=np.bool_)
@@ -146,7 +146,7 @@ class StatePublisher:
         self.rebuild()
 
     def rebuild(self) -> None:
-        """Create the messages for the state's current quantities."""
+        """Create the messages for the quantities that the state now contains."""
         clock = TOPICS["/clock"]
         streams = [
             (topic, self._output(topic), self._template(topic))
@@ -282,7 +282,7 @@ class ClearancePublisher:
         self.use(node.plant.robot.description, has_contact_forces=has_contact_forces)
 
     def use(self, described: RobotDescription, *, has_contact_forces: bool = False) -> bool:
-        """Measure distances of a robot and its obstacles from now on; return whether links could
+        """Measure distances between links and to obstacles from now on; return whether links could
         touch."""
         # Not every plant measures distances.
         from spacerobot_ros.simulation.clearance import ClearanceMonitor

@@ -187,7 +187,7 @@ class Listener:
         self._clearance: ClearanceStatus | None = None
 
     def use(self, robot: RobotDescription) -> None:
-        """Start reading a robot's joints."""
+        """Start reading a robot's joint states."""
         self._names = robot.joint_names
         self.forget_state()
         if self._last_schedule is not None:

@@ -1,4 +1,4 @@
-"""Background planning jobs, and their cancellation, which long searches poll."""
+"""Background planning jobs, and their cancellation, for which long searches poll."""
 
 from __future__ import annotations
 

@@ -361,7 +361,7 @@ class Goal:
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
     def for_robot(self, robot: RobotDescription) -> Goal:
-        """Return the goal with end-effector names resolved; an empty name is the default
+        """Return the goal with end-effector names resolved; an empty name means the default
         end-effector.
 
         Raises
@@ -643,8 +643,8 @@ class Tolerance:
     shape: float = 1e-3
 
     def require_control(self, goal: Goal, controls: frozenset[Controlled], who: str) -> None:
-        """Reject a goal with these tolerances (0: none) if ``who`` does not control one of its
-        components.
+        """Reject a goal if ``who`` does not control one of its components that has a tolerance here
+        (0: none).
 
         ``controls`` are the goal components controlled by ``who``, a method or a law.
 

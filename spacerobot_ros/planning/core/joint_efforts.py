@@ -52,7 +52,8 @@ class JointEfforts:
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> Array:
-        """Return the efforts under held commands relative to their limits (N + 1, n), at the ticks.
+        """Return the efforts (N + 1, n) at the ticks under held commands, as fractions of their
+        limits.
 
         ``positions`` (N + 1, n) are the shapes at the ticks; the velocities ``velocity`` and
         ``after`` (n,) are held before and after the motion. ``L_B`` (N + 1, 3) is the angular
@@ -83,7 +84,7 @@ class JointEfforts:
         L_B: Array | None = None,
         after: Array | float = 0.0,
     ) -> str:
-        """Return a clause that names the joints exceeding their effort limits; empty: none.
+        """Return a clause that names the joints exceeding their effort limits; empty if none do.
 
         Arguments are as in :meth:`shares`. If there are many ticks, only the ticks with the largest
         accelerations and some in between are checked.

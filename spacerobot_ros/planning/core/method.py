@@ -60,7 +60,7 @@ class InitialMotion:
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Arguments of a plan, in addition to the robot and the method options.
+    """Arguments of a plan request, in addition to the robot and the method options.
 
     Attributes
     ----------
@@ -235,8 +235,8 @@ class GaitMethod(ABC):
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
         ``velocity`` and ``end_velocities`` (n,) are held before and after the motion. A note
-        reports efforts beyond the URDF limits; ``L_B`` (N + 1, 3) is the angular momentum in base
-        components for this check (:class:`JointEfforts`).
+        reports efforts beyond the URDF limits; ``L_B`` (N + 1, 3) is the angular momentum in the
+        base frame for this check (:class:`JointEfforts`).
 
         Raises
         ------
@@ -334,7 +334,7 @@ class GaitMethod(ABC):
         return shape
 
     def require_goal_of_base(self, goal: Goal) -> None:
-        """Reject end-effector goals or path goals: PlanningError."""
+        """Raise PlanningError for end-effector goals or path goals."""
         self._require_no_path(goal)
         if goal.end_effectors:
             names = " and ".join(f"'{each.link}'" for each in goal.end_effectors)

@@ -118,7 +118,7 @@ class BasePrediction:
     def poses(
         self, state: RobotState, positions: Array, attitudes: Array | None = None
     ) -> BasePoses:
-        """Return the base poses at every tick for the shapes (N + 1, n), without linear momentum.
+        """Return the base poses at every tick for the shapes (N + 1, n), at zero linear momentum.
 
         ``attitudes`` (N + 1, 4) at the ticks may be given if already known.
         """

@@ -1,7 +1,7 @@
 """Search progress, and announcements of other long-running work.
 
-Listeners receive the progress of all searches in the process. So progress passes through methods
-that do not handle it, and out of planning threads.
+Listeners receive the progress of all searches in the process. So methods need not pass progress on,
+and it also arrives from planning threads.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def log_progress(logger: logging.Logger, progress: SearchProgress, line: str) ->
 def report_progress(
     show: Callable[[SearchProgress], None], announce: Callable[[str], None] = lambda message: None
 ) -> Iterator[None]:
-    """Call functions with the progress of searches running in this context, in any thread.
+    """While this context is active, call functions with the progress of searches in any thread.
 
     Parameters
     ----------

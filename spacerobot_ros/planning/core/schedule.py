@@ -151,10 +151,10 @@ def straight_motion(
     """Return the shapes (N + 1, n) at the ticks of a path from ``start`` (n,) through ``ends``.
 
     Every leg is a straight line in shape space, from rest to rest (paper 3, section III): under
-    ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a leg D is traversed as
+    ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a displacement D is traversed as
     ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. ``ends`` are shapes
     (n,), each with the duration, s, of the leg that leads to it. A leg takes a whole number of
-    ticks: more of them if a joint is slow, none if nothing moves.
+    ticks: more if a joint is slow, none if no joint moves.
 
     Raises
     ------

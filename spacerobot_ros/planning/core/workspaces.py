@@ -2,16 +2,16 @@
 
 At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of the
 end-effector. If ``J*`` loses rank, there is a direction in which no joint rates can move the
-end-effector: a dynamic singularity. Whether this happens depends on the shape. The distance of the
-end-effector from the system's centre of mass also depends only on the shape: the centre of mass is
-at rest, while the base may have any attitude. A distance attained by some singular shape is
-therefore *path-dependent*: whether the robot is singular there depends on the path that led there.
-Distances not attained by any singular shape are *path-independent* (Papadopoulos and Dubowsky;
-paper 4, section V).
+end-effector: a dynamic singularity. Whether this happens depends on the configuration. The distance
+of the end-effector from the system's centre of mass also depends only on the configuration: the
+centre of mass is at rest, while the base may have any attitude. A distance attained by some
+singular configuration is therefore *path-dependent*: whether the robot is singular there depends on
+the path that led there. Distances not attained by any singular configuration are *path-independent*
+(Papadopoulos and Dubowsky; paper 4, section V).
 
-Singular shapes are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, where ``u`` is the direction
-in which no motion is possible. Starting from seeded shapes spread over the shape space,
-Gauss-Newton iterations find the nearest solutions; from each of these solutions, curves of
+Singular configurations are solutions ``(q, u)`` of ``J*(q)^T u = 0, |u| = 1``, where ``u`` is the
+direction in which no motion is possible. Starting from seeded configurations spread over the shape
+space, Gauss-Newton iterations find the nearest solutions; from each of these solutions, curves of
 solutions are followed to larger and to smaller distances. Distances change continuously on a curve,
 so all distances between its ends are path-dependent.
 """
@@ -29,14 +29,14 @@ from spacerobot_ros.planning.core.controllability import sample_shapes, shape_bo
 
 _SEED = 20
 _SAMPLED_SHAPES = 48
-"""Number of start shapes in the search for singular shapes, and of shapes examined for the
-reach."""
+"""Number of initial configurations in the search for singular configurations, and of configurations
+examined for the reach."""
 
 _EXTREME_STARTS = 3
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
 _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
-"""Number of steps along a curve of singular shapes, and longest and shortest step, rad (or m) of
-the fastest joint."""
+"""Number of steps along a curve of singular configurations, and longest and shortest step, rad (or
+m) of the fastest joint."""
 
 _ZERO_RESIDUAL = 1e-9
 """Largest residual of the dimensionless singularity equations that is treated as zero."""
@@ -64,11 +64,11 @@ class Workspaces:
     distance_range
         The smallest and the largest attainable distance.
     path_dependent
-        Closed intervals of link distances attained by singular shapes, in ascending order.
+        Closed intervals of link distances attained by singular configurations, in ascending order.
     dimensions
         Dimension of the space in which the joints move the link at zero momentum: 2 in a plane.
     singular_shapes
-        Number of singular shapes from which the intervals were found.
+        Number of singular configurations from which the intervals were found.
     """
 
     link: str
@@ -93,8 +93,9 @@ def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
     if there are limits, also within them.
 
     Except for gaps of less than 0.2 % of the reach, all distances in an interval are attained by
-    singular shapes that were found. The intervals are complete only if the seeded shapes lead to
-    all curves of singular shapes: for two joints in a plane, each curve is found many times.
+    singular configurations that were found. The intervals are complete only if the seeded
+    configurations lead to all curves of singular configurations: for two joints in a plane, each
+    curve is found many times.
 
     Raises
     ------
@@ -147,7 +148,8 @@ def _bounds(robot: SpaceRobot, within_limits: bool) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Equations:
-    """Equations of a link's singular shapes, ``J*^T u = 0``, ``|u|^2 = 1``, in units of the reach.
+    """Equations of a link's singular configurations, ``J*^T u = 0``, ``|u|^2 = 1``, in units of the
+    reach.
 
     ``jacobian`` is ``q -> J*`` (m, n), rows along the directions in which the joints move the link;
     ``function`` is ``(q, u) -> equations (n + 1,), derivatives (n + 1, n + m), distance, its
@@ -208,7 +210,8 @@ class _Equations:
         return np.hstack([shapes, np.linalg.svd(J)[0][:, :, -1]])
 
     def reach(self, lower: Array, upper: Array) -> tuple[Interval, Array]:
-        """Return the smallest and the largest distance within bounds, and their shapes (2, n)."""
+        """Return the smallest and the largest distance within bounds, and their configurations (2,
+        n)."""
         from scipy.optimize import minimize
 
         m = self.dimensions
@@ -241,7 +244,7 @@ class _Equations:
 
 
 class _Search:
-    """Search for singular shapes within bounds, many at a time."""
+    """Search for singular configurations within bounds, many at a time."""
 
     def __init__(self, equations: _Equations, lower: Array, upper: Array) -> None:
         m = np.full(equations.dimensions, np.inf)
@@ -249,8 +252,8 @@ class _Search:
         self._lower, self._upper = np.append(lower, -m), np.append(upper, m)
 
     def intervals(self, shapes: Array) -> tuple[list[Interval], int]:
-        """Return the distance intervals of the singular shapes found from shapes (K, n), and the
-        number of singular shapes.
+        """Return the distance intervals of the singular configurations found from configurations
+        (K, n), and their number.
         """
         z = self._project_to_singular_shapes(self._equations.starts(shapes), _NEWTON_STEPS)
         g, _, _, _ = self._equations.evaluate(z)
@@ -264,7 +267,8 @@ class _Search:
         return _union(radii, _MAX_CLOSED_GAP * largest), len(z)
 
     def _project_to_singular_shapes(self, z: Array, steps: int) -> Array:
-        """Return the singular shapes nearest to z (K, n + m), by Gauss-Newton within bounds."""
+        """Return the singular configurations nearest to z (K, n + m), by Gauss-Newton within
+        bounds."""
         z = z.copy()
         moving = np.arange(len(z))
         for _ in range(steps):
@@ -289,7 +293,7 @@ class _Search:
         return np.asarray(1.0 - ((low & (step < 0)) | (high & (step > 0))))
 
     def _follow_singular_curve(self, z: Array, sign: float) -> Array:
-        """Return the ends of curves of singular shapes from z to larger (1) or smaller (-1)
+        """Return the ends of curves of singular configurations from z to larger (1) or smaller (-1)
         distances.
         """
         z, length = z.copy(), np.full(len(z), _LONGEST_STEP / 2)

@@ -200,8 +200,8 @@ class Executive:
     ) -> bool:
         """Abort all goals immediately, because the plant no longer accepts commands.
 
-        If the plant rests because no commands arrived, two kinds of goals continue: goals for which
-        nothing had been commanded, and goals whose planning took so long that no state was
+        If the plant is at rest because no commands arrived, two kinds of goals continue: goals for
+        which nothing had been commanded, and goals whose planning took so long that no state was
         processed. A goal that was about to replace another goal is planned from rest.
         """
         successor = None
@@ -245,7 +245,7 @@ class Executive:
         self._tracker.end_by_result()
 
     def configure(self, config: PlannerConfig) -> None:
-        """From now on, use other tolerances and correction settings."""
+        """Use new tolerances and correction settings from now on."""
         self.config = config
 
     def on_plant_obeying(self) -> None:
@@ -281,7 +281,7 @@ class Executive:
         self._worker.plans_in_background = False
 
     def use_obstacles(self, make_worker: Callable[[], PlanningWorker]) -> None:
-        """Plan around other obstacles from now on.
+        """Plan around new obstacles from now on.
 
         A plan in progress is restarted. If the rest of the current schedule comes too close to
         obstacles, the joints brake, and the remaining motion is planned again. ``make_worker``

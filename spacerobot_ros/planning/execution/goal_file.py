@@ -121,7 +121,7 @@ class GoalFile:
         return ""
 
     def end(self, goal_id: str, *, refused: bool) -> None:
-        """Delete the file when a goal has ended, unless another goal was rejected."""
+        """Delete the file when a goal ends, unless a goal that is not in the file was rejected."""
         if self._ids and (goal_id in self._ids or not refused):
             self.delete()
 

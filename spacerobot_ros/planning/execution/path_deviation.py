@@ -75,8 +75,8 @@ class PathCheck:
     """Compares measured states with a schedule's predicted base path.
 
     At zero momentum, the base motion relative to the current base pose depends only on the shape
-    path. So a base that deviates from the predicted path by a rotation and a displacement continues
-    along that path, rotated and displaced: by the mean deviation of the latest measured poses.
+    path. So a base that deviates from the predicted path continues along that path, rotated and
+    displaced by the mean deviation of the latest measured poses.
 
     Call the other methods only for a state that is :meth:`due`.
 

@@ -42,8 +42,8 @@ class StateAverage:
     """Averages measured states, and estimates the total momenta from states at rest.
 
     While joints move, the momentum of a robot with uncertain masses is uncertain; at rest, it
-    follows from the base motion alone, and without thrust it is constant. So a state gets the last
-    momenta that were measured at rest, if there are any.
+    follows from the base motion alone, and without thrust it is constant. So a state is given the
+    last momenta measured at rest, if there are any.
 
     Parameters
     ----------
@@ -91,8 +91,8 @@ class StateAverage:
         self._shapes.append(q.copy())
 
     def take(self, measured: MeasuredState, *, alone: bool = False) -> bool:
-        """Add a state if its base was measured, as the only state if ``alone``, otherwise to the
-        other states; return whether it was added."""
+        """Add a state if its base was measured, and return whether it was added; if ``alone``, it
+        replaces the other states."""
         base = measured.base
         if base is None:
             return False

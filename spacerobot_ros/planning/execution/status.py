@@ -404,7 +404,7 @@ class ActiveGoal:
         return self.time_left(stamp_ns) < _LATE_TIME_SHARE * self.manoeuvre_time
 
     def reached(self, error: PoseError, tolerance: Tolerance) -> PlannerStatus | None:
-        """Return the status of a goal that is reached with this error; None: not reached."""
+        """Return the status of a goal reached with this error; None if it is not reached."""
         goal, controls = self.identified.goal, self.schedule.controls
         if not tolerance.admits(error, controls):
             return None

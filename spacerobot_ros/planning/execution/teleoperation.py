@@ -3,7 +3,7 @@
 At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the twist of an
 end-effector (Umetani and Yoshida), so ``qdot = J*^+ [v; omega]`` are the smallest rates that
 produce the twist, each relative to the joint's velocity limit. With ``keep_attitude``, the base
-must also not rotate (``-A qdot = 0``), so the rates lie in the reaction null space.
+must not rotate either (``-A qdot = 0``), so the rates lie in the reaction null space.
 """
 
 from __future__ import annotations
@@ -103,8 +103,7 @@ class TwistCommand:
         return cls(link, np.asarray(linear, float), np.asarray(angular, float), found)
 
     def in_base(self, R_WB: Array, R_BE: Array) -> tuple[Array, Array]:
-        """Return the velocity and the angular velocity of a twist, (3,) each, in base
-        components."""
+        """Return the velocity and the angular velocity of a twist, (3,) each, in the base frame."""
         R = {"world": R_WB.T, "base": np.eye(3), "link": R_BE}[self.frame]
         return R @ self.linear, R @ self.angular
 
@@ -168,7 +167,7 @@ class Teleoperation:
         """Stamp, in ns, of the state that preceded the last rejected twist."""
 
     def use_clearance(self, clearance: Clearance | None) -> None:
-        """Use other clearances from now on."""
+        """Use new clearances from now on."""
         self._clearance = clearance
         self._followers.clear()
         if self._following is not None:

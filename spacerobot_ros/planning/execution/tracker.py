@@ -228,7 +228,7 @@ class TrajectoryTracker:
         )
 
     def use_robot(self, robot: SpaceRobot) -> None:
-        """Track subsequent schedules for a robot that has the same joints but other masses."""
+        """Track subsequent schedules for a robot with the same joints but different masses."""
         self._robot = robot
         self._sensitivity = PathSensitivity(robot)
         self._mass_estimate = MassEstimate(self._sensitivity.count)
@@ -265,7 +265,7 @@ class TrajectoryTracker:
 
     def braking(self, stamp_ns: int, state: RobotState) -> tuple[Array | None, Array | None]:
         """Return the shapes (N + 1, n) that the joints would have at the ticks if braking started
-        now, None at rest, and the velocities (n,) held after it, None if they are zero.
+        now, None at rest, and the velocities (n,) held afterwards, None if they are zero.
 
         At rest, these are the wheel velocities in the measured ``state``.
         """
@@ -360,7 +360,7 @@ class TrajectoryTracker:
         self._holds_position = True
 
     def forget_wheels(self) -> None:
-        """Use the measured wheel rates next, not the commanded ones."""
+        """In the next setpoint, use the measured wheel rates, not the commanded ones."""
         self._spins = False
 
     def hold(self, q: Array, qdot: Array | None = None, *, obeyed: bool = True) -> None:

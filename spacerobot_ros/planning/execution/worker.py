@@ -208,15 +208,15 @@ class PlanningWorker:
         self.start(replace(task, braking=shapes))
 
     def start(self, task: PlanningTask) -> None:
-        """Start the work on a task."""
+        """Start planning a task."""
         assert self._job is None, "one plan at a time"
         self._job = PlanningJob(partial(self.plan, task))
         with nullcontext() if self.plans_in_background else self._long_work():
             self._job.start(in_background=self.plans_in_background)
 
     def poll(self, stamp_ns: int) -> Planned | Refused | None:
-        """Return the result of planning when the state with this stamp is processed; None until the
-        plan has ended, or if it was cancelled.
+        """Return the planning result when the state with this stamp is processed; None until
+        planning has ended, or if it was cancelled.
 
         Unexpected method errors are raised here.
         """
@@ -243,7 +243,7 @@ class PlanningWorker:
         return None
 
     def take_result(self) -> Planned | Refused | None:
-        """Return the result of the work, which can be retrieved only once; None until the work has
+        """Return the planning result, which can be retrieved only once; None until planning has
         ended, or if it was cancelled."""
         job = self._job
         if job is None or not job.done:

@@ -9,9 +9,9 @@ attitude.
 All edges are straight lines in shape space, from rest to rest: the base rotation depends only on
 the path, and held commands follow it.
 
-Loops run along joint axes and enclose given areas (figure 5) in the planes of joints (1, 2),
-(2, 3) and (3, 1); an area is positive if the path is counter-clockwise. Six edges of a box enclose
-all three areas at once; rectangles enclose them one by one.
+Loops run along joint coordinate axes and enclose given areas (figure 5) in the planes of joints (1,
+2), (2, 3) and (3, 1); an area is positive if the path is counter-clockwise. Six edges of a box
+enclose all three areas at once; rectangles enclose them one by one.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ the masses to this shape (eq. 10). Step 3 rotates the base by n equal cycles wit
 whose brackets sum to the remaining rotation.
 
 The plant holds each command for one tick. The sliders therefore trace polygons inside the smooth
-curves. The polygon area is smaller by ``sin(x)/x``, where ``x`` is the phase per tick; the
+curves. The polygon area is smaller by a factor ``sin(x)/x``, where ``x`` is the phase per tick; the
 amplitudes compensate for this.
 """
 

@@ -202,8 +202,8 @@ class NominalShapeChooser:
     def best(self, held: Array) -> NominalShape:
         """Return the best nominal shape over all triples; other joints are as in ``held`` (n,).
 
-        Boxes with the longest edges around it fit within the limits. Links have room there if they
-        have room anywhere.
+        Boxes with the longest edges around it fit within the limits. If links have room at any
+        shape, they have room at this one.
         """
         triples = self._best_triples()
         points = _GRID_POINTS.get(len(triples), 5)

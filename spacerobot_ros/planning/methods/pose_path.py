@@ -1,4 +1,4 @@
-"""Given end-effector paths: straight lines through poses, rounded at the corners.
+"""End-effector paths given by poses: straight lines, rounded at the corners.
 
 Within a distance ``d`` of a corner, both lines are blended: the position is ``c - a l_1 + b l_2``,
 with the lines ``l_1`` and ``l_2`` to and from the corner ``c``, ``a = (1 - t)^2 d / |l_1|``, and
@@ -109,7 +109,7 @@ class PosePath:
         tolerance.
 
         ``tolerance`` is in m and rad. (Douglas and Peucker; positions are compared at equal
-        fractions of the length, so that a path there and back is preserved.)
+        fractions of the length, so that an out-and-back path is preserved.)
 
         Raises
         ------
@@ -216,8 +216,8 @@ class RoundedPath:
         return np.asarray(place - a * path.chords[before] + b * path.chords[after]), turned
 
     def derivative(self, share: float) -> tuple[Array, Array]:
-        """Return the derivatives of both by the fraction: velocity (3,), m, and angular velocity
-        (3,), rad."""
+        """Return their derivatives with respect to the fraction: velocity (3,), m, and angular
+        velocity (3,), rad."""
         _, before, after, _, b, a_rate, b_rate = self._blend_at(share)
         chords, turns = self._path.chords, self._path.turns
         carried = matrix_from_quaternion(quaternion_from_rotvec(b * turns[after]))

@@ -3,13 +3,13 @@
 At zero momentum, the generalised Jacobian ``J*(q)`` maps joint rates to the velocity of
 an end-effector in the world (Umetani and Yoshida). The rates that move it along a line (straight,
 through waypoints, or a given path) are ``qdot = J*^+ xdot``. If ``J*`` loses rank, there are no
-such rates: a dynamic singularity. Whether the line meets a singularity depends only on the shape,
+such rates: a dynamic singularity. Whether the line meets one depends only on the configuration,
 which depends on the path that led there (paper 4, section V; path-dependent workspaces).
 
 The path is parametrised by its length, not by time: its tangent is a vector in the null space of
 ``[J*, -x']``, which is finite up to the singularity, where the progress along the line becomes
-zero. The motion along the path is the fastest within the velocity and acceleration limits (a linear
-program in the squared speed). Held commands move the shape along straight lines between
+zero. The motion along the path is the fastest possible within the velocity and acceleration limits
+(a linear program in the squared speed). Held commands move the shape along straight lines between
 ticks, so the shape at each tick is corrected until the end-effectors are on their lines.
 """
 
@@ -155,8 +155,8 @@ class _SmoothPath:
         return np.asarray(self._place(share)), quaternion_from_rotvec(share * self._turn)
 
     def derivative(self, share: float) -> tuple[Array, Array]:
-        """Return the derivatives of both by the fraction: velocity (3,), m, and angular velocity
-        (3,), rad."""
+        """Return their derivatives with respect to the fraction: velocity (3,), m, and angular
+        velocity (3,), rad."""
         return np.asarray(self._rate(share)), self._turn
 
     def travelled_length(self, share: float) -> float:

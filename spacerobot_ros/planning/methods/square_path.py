@@ -1,12 +1,12 @@
 """Square paths in shape space for planar chains: the reorientation of paper 3, section III.
 
 Step 1 moves to the desired shape ``psi_e``. Step 2 moves to the nearest corner of a
-square, step 3 runs around the square, and step 4 returns along the path of step 2. The geometric
-phase of the square is the base rotation that remains after step 1; steps 2 and 4 cancel.
+square, step 3 follows the square, and step 4 returns along the path of step 2. The geometric phase
+of the square is the base rotation that remains after step 1; steps 2 and 4 cancel.
 
 Every leg is a straight line in shape space, from rest to rest; the paper's laws also start from
 nonzero joint rates (its property 3), for which this method does not plan. The plant holds each
-velocity for a tick. So the shape moves along the same straight lines, at other speeds within a
+velocity for a tick. So the shape moves along the same straight lines, at different speeds within a
 tick, and the geometric phase, which depends only on the path, is exactly that of the smooth motion.
 
 The side ``z*`` of the square solves ``phase(z*) = wanted phase``; its centre ``psi*`` is where the
@@ -103,7 +103,7 @@ class _SquareFamily:
 
     @property
     def largest(self) -> float:
-        """Largest base rotation by one loop, rad."""
+        """Largest base rotation produced by one loop, rad."""
         return float(np.abs(self.geometric_phases).max())
 
 

@@ -110,7 +110,7 @@ class LinkDirections:
 
 
 class EndEffectorRows:
-    """Rows that vanish if a robot's links are at their goals.
+    """Constraint rows that vanish if a robot's links are at their goals.
 
     Parameters
     ----------
@@ -358,7 +358,7 @@ class EndEffectorSpecification:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3), base components, along which the base attitude must be reached."""
+        """Directions (m, 3), in the base frame, along which the base attitude must be reached."""
         if self.ends_in_one_shape:
             return self.rows.axes
         return self.base.base_rotations.axes if self.attitude else np.zeros((0, 3))

@@ -107,7 +107,7 @@ class GoalSpecification:
 
     @property
     def axes(self) -> Array:
-        """Directions (m, 3), base components, along which the attitude must be reached."""
+        """Directions (m, 3), in the base frame, along which the attitude must be reached."""
         return self.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
     def require_suitable(self, robot: SpaceRobot) -> None:
@@ -405,7 +405,7 @@ def _shape_for_center(
 def nearest_shape_for_center(
     robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
 ) -> Array | None:
-    """Return the shape nearest to ``near`` whose centre of mass is exactly at ``wanted`` (3,)."""
+    """Return the shape nearest to ``near`` that puts the centre of mass at ``wanted`` (3,)."""
     q = near.copy()
     for _ in range(20):
         miss = wanted - robot.center_of_mass(q)

@@ -1,25 +1,24 @@
-"""Converts smooth trajectories to commands that are held for one tick each and end exactly at the
-goal.
+"""Converts smooth trajectories to commands, each held for one tick, that end exactly at the goal.
 
 The shapes at the ticks are points on the trajectory; between them, the shape moves along chords,
-with velocities averaged over a tick. So joints, velocities and accelerations stay within
-their limits, but chord loops enclose slightly different areas than the curves, and the attitude of
-the solution differs slightly from the attitude integrated by the plant. Newton's method adds a few
-smooth waves to the path until the plant's own prediction ends at the goal. The first variation of
-the final attitude is
+with velocities averaged over a tick. So joint positions, velocities and accelerations stay within
+their limits, but loops of chords enclose slightly different areas from the curves, and the attitude
+of the solution differs slightly from the attitude integrated by the plant. Newton's method adds a
+few smooth waves to the path until the plant's own prediction ends at the goal. The first variation
+of the final attitude is
 
 ``eta = R_f' sum_k R_k K(q_k)(dq_k, q_k' dt)`` (K is the curvature of the connection),
 
 for a change ``dq`` that vanishes at both ends, with further terms if the robot drifts
 (:class:`DriftVariation`). If these waves need more speed or acceleration than the limits allow, a
-quadratic program finds the smallest change in the commands that stays within them. The unknowns are
+quadratic program finds the smallest change that keeps the commands within them. The unknowns are
 the changes in all shapes at the ticks. To first order, the end of the motion is linear in these
 changes, and a few successive programs reach the goal (sequential quadratic programming). If they do
 not reach the goal, the manoeuvre takes a few ticks longer.
 
 If the last shape is free, the program changes it as well, because loops of some robots do not
 rotate the base. A manoeuvre of only a few ticks is a polygon that no longer resembles the curve.
-With two or three ticks, it may have too few corners to end at the goal, and takes one more tick.
+With two or three ticks, it may have too few corners to end at the goal; one tick is then added.
 """
 
 from __future__ import annotations
@@ -97,7 +96,7 @@ class HeldCommands:
 
 @dataclass(frozen=True)
 class ManoeuvreModel:
-    """Converts all manoeuvres of one robot to held commands, with its model and its constraints.
+    """Converts manoeuvres of one robot to held commands, using its model and constraints.
 
     Attributes
     ----------
@@ -129,12 +128,12 @@ class ManoeuvreModel:
         fixed: bool = False,
         before: Array | float | None = None,
     ) -> HeldCommands | None:
-        """Return commands for a trajectory that end at the goal shape and attitude.
+        """Return commands that follow a trajectory and end at the goal shape and attitude.
 
         The commands take the trajectory's time, rounded up to whole ticks, or longer if required by
         the limits (``fixed``: not longer); None if no such commands are found. If the boundary
         conditions leave the last shape free, it is the trajectory's last shape, or close to it.
-        ``before`` are the velocities (n,) held until the start; None: as in the boundary
+        ``before`` are the velocities (n,) held before the start; None: as in the boundary
         conditions.
         """
         before = boundary.velocity if before is None else before
@@ -390,7 +389,7 @@ class DriftVariation:
     ``xi' = R (K(dq, q') + G dq + D^-1 (L_B x R' xi))``,
     ``G dq = d(D^-1 L_B)/dq dq + (D^-1 L_B) x A dq - D^-1 (L_B x A dq)``,
 
-    where K is the curvature as at zero momentum.
+    where K is the curvature at zero momentum.
     """
 
     def __init__(self, robot: SpaceRobot) -> None:

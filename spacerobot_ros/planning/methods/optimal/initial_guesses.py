@@ -1,8 +1,8 @@
 """Initial guesses for the manoeuvre search: loops on the direct path.
 
-A path that leads directly from one shape to the other is a saddle: to first order, no small path
-change alters the base rotation. So guesses are the direct path with random loops, sized such that
-their areas times the curvature are about the desired rotation.
+The direct path from one shape to the other is a saddle point: to first order, no small path change
+alters the base rotation. So guesses are the direct path with random loops, sized so that their
+areas times the curvature approximate the desired rotation.
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ class InitialGuesses:
         limits: MotionLimits,
         is_clear: Callable[[Trajectory], bool] | None = None,
     ) -> Iterator[Trajectory]:
-        """Yield guesses that end in the likely shape, or in each possible end shape in turn.
+        """Yield guesses that end in the most likely final shape, or in each possible one in turn.
 
-        ``is_clear``: whether a guess stays clear; if given, all do, unless no candidate does.
+        ``is_clear``: whether a guess is clear; if given, all guesses are, unless no candidate is.
         """
         rng = np.random.default_rng(1)
         half = limits.joint_ranges(boundary.start)[1]
@@ -125,8 +125,8 @@ class InitialGuesses:
         """Yield guesses in which reaction wheels rotate the base to its goal.
 
         The base rotates about a fixed axis, in either direction, and slows down from its current
-        rate to rest. The other joints move to their final shape; in later guesses, with loops on
-        the path. The wheel rates follow from the momentum.
+        rate to rest. The other joints move to their final positions; later guesses add loops to
+        their path. The wheel rates follow from the momentum.
         """
         direct = self._direct_path(boundary.start, boundary.likely_final_shape)
         loops = self.generate(boundary, limits)
@@ -288,7 +288,7 @@ class InitialGuesses:
         return np.asarray(X.reshape(*q.shape[:-2], N + 1, 4))
 
     def resample(self, solution: Trajectory) -> Trajectory:
-        """Return a solution on another grid."""
+        """Return a solution, resampled on the grid of the guesses."""
         intervals = len(self._instants) - 1
         coarse = np.linspace(0.0, 1.0, len(solution.shapes))
         shapes = solution.at_ticks(intervals)
@@ -300,7 +300,7 @@ class InitialGuesses:
         return Trajectory(step, shapes, velocities, attitudes)
 
     def from_ticks(self, positions: Array, velocity: Array, period: float) -> Trajectory:
-        """Return shapes (M + 1, n) at ticks that begin with a velocity (n,) and end at rest."""
+        """Return the trajectory through shapes (M + 1, n) at ticks, from velocity (n,) to rest."""
         ticks = np.linspace(0.0, 1.0, len(positions))
         step = period * (len(positions) - 1) / (len(self._instants) - 1)
         rates = np.gradient(positions, period, axis=0)
@@ -341,8 +341,8 @@ def attitudes_along(turn: ca.Function, q: Array, u: Array, u_next: Array) -> Arr
 
 
 def rates_between(quaternions: Array, step: float) -> Array:
-    """Return the angular velocity (N + 1, 3), base components, at attitudes (N + 1, 4) that are a
-    step, s, apart.
+    """Return the angular velocities (N + 1, 3), in base components, at attitudes (N + 1, 4) that
+    are ``step`` seconds apart.
     """
     turns = rotvecs_from_quaternions(
         quaternion_multiply(quaternion_inverse(quaternions[:-1]), quaternions[1:])

@@ -52,7 +52,7 @@ class LimitedEfforts(JointEfforts):
     def of(
         cls, robot: SpaceRobot, options: OptimalOptions, control_period: float
     ) -> LimitedEfforts | None:
-        """Return the efforts limited by the options; None: none."""
+        """Return the efforts that the options limit; None if there are none."""
         if options.effort_limits == 2:
             return None
         limit = robot.effort_limit.copy()

@@ -53,7 +53,7 @@ def instants_of(intervals: int) -> int:
 
 
 class DistanceLibrary:
-    """Clearance of one robot, with what planes between its pairs are computed from.
+    """Clearance of one robot, and the data from which planes between its pairs are computed.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class DistanceLibrary:
     def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
         """Return the pairs to keep apart between the two ends of a motion: none initially.
 
-        ``turn_is_known``: the base rotation at the end is given by the boundary conditions.
+        ``turn_is_known``: whether the boundary conditions give the base rotation at the end.
 
         Raises
         ------
@@ -142,7 +142,7 @@ class KeptDistances:
 
     def approaches(self, positions: Array, turns: Array, margin: float = 0.0) -> list[Approach]:
         """Return the pairs whose distance during held commands (N + 1, n) falls below the required
-        one plus a margin, m, nearest first.
+        distance plus a margin, m, nearest first.
 
         ``turns`` (N + 1, 4) are the base rotations since the start.
         """
@@ -154,8 +154,8 @@ class KeptDistances:
         return self._library.clearance.clause(approach, control_period)
 
     def beside(self, path: Trajectory, margin: float = 0.0) -> KeptDistances:
-        """Return the same motion ends, with the pairs that come closer along a path than required
-        plus a margin, m; pairs that are already kept apart keep their room.
+        """Return kept distances for the same ends, with the pairs that come closer along a path
+        than required plus a margin, m; pairs that are already kept apart keep their room.
         """
         kept = KeptDistances(self._library, self._boundary, self._required)
         near = (each.pair for each in self.approaches_of(path, margin))
@@ -189,7 +189,7 @@ class KeptDistances:
         return clearance.is_clear(path.shapes, self._required) and not self.approaches_of(path)
 
     def approaches_of(self, path: Trajectory, margin: float = 0.0) -> list[Approach]:
-        """Return the pairs that come too close along a path, as :meth:`approaches`."""
+        """Return the pairs that come too close along a path, as in :meth:`approaches`."""
         shapes, turns = self.along(path)
         shapes = np.vstack([path.shapes[:1], shapes])
         return self.approaches(shapes, np.vstack([path.quaternions[:1], turns]), margin)

@@ -1,4 +1,4 @@
-"""Time-optimal manoeuvres within real limits for any free-floating robot.
+"""Time-optimal manoeuvres within physical limits for any free-floating robot.
 
 The manoeuvre is the solution of an optimal control problem (:mod:`.multiple_shooting`) that starts
 from guesses with loops (:mod:`.initial_guesses`). It is converted to held commands that end at the

@@ -15,7 +15,7 @@ momentum ``h_i`` about it due to the joint at unit rate with the base at rest, t
 ``-H^-1 h_i``. The distances of the centres of mass from the joint bound ``|h_i|`` for all shapes,
 and the smallest principal moments of all bodies bound ``H`` from below. Energy yields another
 bound: the energy of the base motion is not available outboard of the joint,
-``omega . (H + I_base) omega <= M_ii``. The smaller bound counts.
+``omega . (H + I_base) omega <= M_ii``. The smaller bound applies.
 
 :class:`DurationBound` follows from both bounds, and from the largest joint travel in a given time.
 No shape is sampled.
@@ -180,7 +180,7 @@ class ConnectionBounds:
 
     @classmethod
     def of(cls, robot: SpaceRobot, axes: Array) -> ConnectionBounds:
-        """Return the bounds for a robot whose base rotates about ``axes`` (m, 3), in the base."""
+        """Return the bounds for a robot whose base rotates about base-frame ``axes`` (m, 3)."""
         tree = _Tree.of(robot, robot.lower, robot.upper)
         least, base = sum(tree.least_moments), tree.least_moments[0]
         if len(axes) == 1:
@@ -301,7 +301,7 @@ class _Tree:
         """Yield the largest distances, m, of centres of mass from a ``point`` (3,) of body ``at``,
         for this body and all bodies reached from it, except through ``came_from``.
 
-        The matrix ``measured`` (3, 3) multiplies vectors in this body before their norms are taken.
+        The matrix ``measured`` (3, 3) multiplies body-frame vectors before their norms are taken.
         """
 
         def way(joint: int, vector: Array, R: Array) -> float:
@@ -336,8 +336,8 @@ def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: s
 
 @dataclass(frozen=True)
 class Demand:
-    """A motion that takes time: ``weights`` times the joint travels, plus ``drift`` times the
-    duration, must be at least ``amount``.
+    """A motion that the joints must produce: ``weights`` times the joint travels, plus ``drift``
+    times the duration, must be at least ``amount``.
 
     Attributes
     ----------

@@ -77,7 +77,7 @@ _COST_OF_LACK = 300.0
 
 @dataclass(frozen=True)
 class StopRule:
-    """Conditions on which a solver stops before convergence.
+    """Conditions under which a solver stops before convergence.
 
     Attributes
     ----------
@@ -131,8 +131,7 @@ class Neighbourhood:
     def within(
         cls, limits: MotionLimits, share: float = 1.0, largest_lack: float = 0.0
     ) -> Neighbourhood:
-        """Return the neighbourhood with a fraction of the largest reach of joints with given
-        limits."""
+        """Return the neighbourhood with a fraction of the largest reach for given limits."""
         width = limits.upper - limits.lower
         return cls(share * np.minimum(_LARGEST_REACH, _LARGEST_REACH_SHARE * width), largest_lack)
 
@@ -189,7 +188,7 @@ class MultipleShooting:
         *,
         refining: bool = False,
     ) -> Trajectory | None:
-        """Return the fastest trajectory near ``guess``; None if none.
+        """Return the fastest trajectory near ``guess``; None if none is found.
 
         If links may be closer than required, it may be the last iterate, which is not
         :attr:`feasible`.
@@ -202,7 +201,7 @@ class MultipleShooting:
         boundary, limits, guess
             The problem, and the start of the solver.
         stop
-            Conditions on which the solver stops early.
+            Conditions under which the solver stops early.
         duration
             Bounds on the duration.
         near
@@ -351,7 +350,7 @@ class SolverMonitor(ca.Callback):
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)])
 
     def has_eval_buffer(self) -> bool:
-        """Return True, because the thousands of iterates are read from the solver's memory."""
+        """Return True, so that the thousands of iterates are read from the solver's memory."""
         return True
 
     def eval_buffer(

@@ -316,7 +316,7 @@ class MotionLimits:
     def within(self, margin: Array, *shapes: Array) -> MotionLimits:
         """Return limits narrowed by ``margin`` (n,) from the ends of the joint ranges.
 
-        The given shapes (n,) are always admitted.
+        The given ``shapes`` (n,) always stay within the limits.
         """
         # Where two margins overlap, the joint stays in the middle of its range.
         with np.errstate(invalid="ignore"):
@@ -339,8 +339,8 @@ class MotionLimits:
         return middle, np.minimum((upper - lower) / 2, _UNLIMITED_HALF_RANGE)
 
     def speeds(self, q: Array) -> Array:
-        """Return a finite speed (n,) of every joint: half of its range around ``q`` (n,) per second
-        if its velocity is unlimited."""
+        """Return a finite speed (n,) for every joint: half of its range around ``q`` (n,) per
+        second if its velocity is unlimited."""
         return np.where(np.isfinite(self.velocity), self.velocity, self.joint_ranges(q)[1])
 
     def excess(
@@ -456,7 +456,7 @@ class _SmoothBody:
 
 @dataclass(frozen=True)
 class PathConstraints:
-    """Path bounds; each is absent by default.
+    """Path constraints, each absent by default.
 
     Attributes
     ----------

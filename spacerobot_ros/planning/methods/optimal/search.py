@@ -16,8 +16,8 @@
 Each step consists of a few methods of :class:`ManoeuvreSearch`.
 
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
-checking", International Journal of Robotics Research 33, 2014, clear paths in steps, each of which
-is a quadratic program; here, each step is the full problem of the manoeuvre.
+checking", International Journal of Robotics Research 33, 2014, make paths collision-free in steps,
+each of which is a quadratic program; here, each step is the full problem of the manoeuvre.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ class SearchProblem:
 
     @property
     def motion(self) -> InitialMotion | None:
-        """Motion of the joints at the start; None: they rest."""
+        """Motion of the joints at the start; None: at rest."""
         return self.request.motion
 
     @property
@@ -286,7 +286,7 @@ class SearchProblem:
 
     @property
     def hastens(self) -> bool:
-        """Whether the fastest manoeuvre is searched for."""
+        """Whether the search is for the fastest manoeuvre."""
         return self.options.duration == 0 and not self.gentle
 
     def within_time(self, seconds: float) -> SearchProblem:
@@ -317,7 +317,7 @@ class _Grid(NamedTuple):
 
 
 class ManoeuvreSearch:
-    """Searches for a robot's manoeuvres, and keeps its solvers for the next ones.
+    """Searches for a robot's manoeuvres, and keeps its solvers for later searches.
 
     Parameters
     ----------
@@ -481,8 +481,8 @@ class _Search:
     # -- 2. coarse solutions ----------------------------------------------------------------------
 
     def search_from_guesses(self) -> Manoeuvre | None:
-        """Return a manoeuvre that need not keep clear, from guesses on a coarse grid first; None:
-        none was found.
+        """Return a manoeuvre that need not be clear, starting from guesses on a coarse grid; None
+        if none is found.
         """
         self._report("begun")
         problem, enough = self._problem, self._problem.options.answers
@@ -614,8 +614,8 @@ class _Search:
     # -- 5. clear ---------------------------------------------------------------------------------
 
     def keep_clear(self, kept: KeptDistances, found: Manoeuvre) -> Manoeuvre | None:
-        """Return a manoeuvre that keeps clear: the one that was found, if it does; else one close
-        to it, or close to other paths; None: none is found.
+        """Return a clear manoeuvre: the one that was found, if it is clear; otherwise, one near it
+        or near other paths; None if none is found.
         """
         if not kept.approaches(found.held.positions, found.held.quaternions):
             return found

@@ -4,7 +4,7 @@ Each knot k = 0..N contains an attitude X, a joint velocity v and a vertex s. Th
 interval k is its constant joint acceleration a. All intervals take the same time h, which is free.
 In each interval, the shape runs from ``q_k = s_k - h v_k / 2`` to ``q_{k+1}`` along a parabola
 whose tangents at both ends meet in the vertex ``s_k``. As the parabola lies in the triangle of
-these three points, simple bounds on s enforce the joint limits also between the knots. The dynamics
+these three points, simple bounds on s also enforce the joint limits between the knots. The dynamics
 are
 
 ``v+ = v + h a``, ``s+ = s + h v+``, ``X+ = X exp(Omega(s, h v, h v+))``.
@@ -66,7 +66,7 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ConstraintBlock:
-    """Program rows that depend on few variables z, with their derivatives.
+    """Program rows that depend on a few variables z, with their derivatives.
 
     ``values`` is ``(z, p) -> g``, ``jacobian`` ``(z, p) -> g, J`` and ``hessian``
     ``(z, p, lambda) -> H``, the upper triangle of the Hessian of ``lambda' g``.
@@ -218,7 +218,7 @@ class Stages:
         return cls(n, beginning_block(n), interval, ends, path, turn)
 
     def with_distances(self, rows: PlaneDistances, instants: int) -> Stages:
-        """Return the problem in which link pairs also keep distances, at a number of instants per
+        """Return the problem that also keeps link pairs apart, at a number of instants per
         interval.
         """
         return replace(self, distances=_distance_block(self.joints, rows, instants))
@@ -329,7 +329,7 @@ class AttitudeRows:
         rotation: ca.Function,
         defect: ca.SX | None = None,
     ) -> AttitudeRows:
-        """Derive the rows by the chain rule, because only terms with the robot's inertia are large.
+        """Derive the rows by the chain rule: only expressions with the robot's inertia are large.
 
         Parameters
         ----------

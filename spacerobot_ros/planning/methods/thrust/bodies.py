@@ -93,7 +93,7 @@ class _Surroundings:
         return self.geometry.distances(pair, self.poses(path))
 
     def is_near(self, pair: int, path: Samples) -> npt.NDArray[np.bool_]:
-        """Return where a pair on a path (K,) is closer than the size of its first solid."""
+        """Return at which instants (K,) a pair on a path is closer than its first solid's size."""
         first = self.geometry.solids[self.geometry.pairs[pair][0]]
         reach = self.required[pair] + first.enclosure.bounding_radius
         return np.asarray(self.distances(pair, path) < reach)
@@ -175,7 +175,7 @@ class _Corridor:
 
     def planes(self, _pair: int, path: Samples, at: npt.NDArray[np.int64]) -> Array:
         """Return cones (K, 7) at instants (K,) of a path or, where it is nearer to the outside of
-        the sphere, planes that touch the sphere."""
+        the sphere than to the cone, planes that touch the sphere."""
         p, apex, axis, inside, outside = self._places(path)
         within = inside >= outside
         # Also at the instant before: between the two, the sphere is entered within the cone.
@@ -190,12 +190,12 @@ class _Corridor:
         return np.maximum(inside, outside)
 
     def is_near(self, _pair: int, path: Samples) -> npt.NDArray[np.bool_]:
-        """Return where an end-effector on a path (K,) is near the sphere or in it."""
+        """Return at which instants (K,) of a path an end-effector is near or inside the sphere."""
         return np.asarray(self._places(path)[-1] < 0.1 * self._length)
 
     def approaches(self, path: Samples) -> list[Approach]:
-        """Return where the end-effector is farthest outside, if it is: also between the instants of
-        a path, as far as it moves there.
+        """Return where the end-effector is farthest outside, if it is outside; this includes its
+        motion between the instants of a path.
         """
         ticks = np.arange(len(path.times), dtype=float)
         while True:

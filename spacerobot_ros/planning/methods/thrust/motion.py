@@ -65,8 +65,8 @@ class MotionSample(NamedTuple):
 
 
 class MotionFunctions:
-    """Functions of one robot's motions, of states (:class:`.ThrustKnots`) and controls ``[qddot;
-    wrench]``: a Runge-Kutta ``step``, the steps of an ``interval``, and a ``sample``.
+    """Functions of states (:class:`.ThrustKnots`) and controls ``[qddot; wrench]`` of one robot: a
+    Runge-Kutta ``step``, the steps of an ``interval``, and a ``sample``.
 
     The sample contains the frames of the base and of an end-effector link as numbers (19,), and the
     joint efforts. Without a link, the base is the end-effector.
@@ -119,7 +119,7 @@ class Samples(NamedTuple):
     times: Array
 
     def at(self, ticks: Array) -> Samples:
-        """Return the path, linear between its instants, at places (M,) among them."""
+        """Return the path, interpolated linearly, at fractional indices (M,) of its instants."""
         k = np.minimum(ticks.astype(int), len(self.times) - 2)
         share = (ticks - k)[:, np.newaxis]
         shapes = (1 - share) * self.shapes[k] + share * self.shapes[k + 1]
@@ -128,7 +128,7 @@ class Samples(NamedTuple):
 
 
 class ThrustMotion:
-    """A planned motion as it results from its controls, integrated from the start.
+    """A planned motion, obtained by integrating its controls from the start.
 
     Parameters
     ----------

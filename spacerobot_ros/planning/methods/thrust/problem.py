@@ -110,7 +110,7 @@ class Propulsion:
 
     @classmethod
     def within(cls, force: float, torque: float, reserve: float) -> Propulsion:
-        """Return the propulsion for a largest force (N) and torque (N m), each in Euclidean norm.
+        """Return the propulsion for bounds on the Euclidean norms of force (N) and torque (N m).
 
         Raises
         ------
@@ -135,8 +135,8 @@ class Propulsion:
         return float(np.linalg.norm(one_way))
 
     def cost_of(self, levels: ca.MX | ca.DM, rounding: ca.MX | float = 0.0) -> ca.MX | ca.DM:
-        """Return the cost of levels (m, N) that each last for a second; norms are smoothed at a
-        level.
+        """Return the cost of levels (m, N), each held for a second; norms are smoothed below the
+        level ``rounding``.
         """
         if self.is_table:
             return ca.sum2(ca.DM(self.cost).T @ levels)
@@ -204,7 +204,8 @@ def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Ar
 
 
 def shape_for_hand(robot: SpaceRobot, link: str, base: Array, hand: Array, q: Array) -> Array:
-    """Return the shape (n,) close to ``q`` in which a link has a pose (7,), with the base at one.
+    """Return the shape (n,) close to ``q`` in which a link has the pose ``hand`` (7,), with the
+    base at the pose ``base`` (7,).
 
     Raises
     ------

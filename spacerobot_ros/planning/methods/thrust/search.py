@@ -154,7 +154,7 @@ class ThrustPlanner:
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Plan around other obstacles from the next plan on; None: around none."""
+        """Use other obstacles from the next plan on; None: no obstacles."""
         described = with_world(self.robot.description, world)
         self.clearance = Clearance.wanted(described, self.options.clearance, "plan.clearance")
 
@@ -288,7 +288,7 @@ class ThrustPlanner:
     def guess(
         self, boundary: ThrustBoundary, base: Array, end: Array, bow: Array | float = 0.0
     ) -> ThrustKnots:
-        """Return a guess at full thrust along a quintic: the base moves on a straight line and
+        """Return a guess at full thrust along a quintic: the base moves along a straight line and a
         geodesic to a pose (7,), and the joints move straight to a shape (n,). Half-way, the base is
         displaced from the line by ``bow`` (3,), m.
         """

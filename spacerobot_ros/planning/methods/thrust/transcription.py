@@ -163,8 +163,8 @@ class ThrustBoundary(NamedTuple):
 
 class Weights(NamedTuple):
     """Weights of the terms in the objective: of the duration (1/s), of the propulsion cost, of the
-    squares of joint accelerations over their limits, and of those of levels; and the level at which
-    the cost of a norm is smoothed.
+    squares of joint accelerations relative to their limits, and of the squares of levels; and the
+    level below which the cost of a norm is smoothed.
     """
 
     duration: float
@@ -422,9 +422,9 @@ class ThrustSolver:
         center: ThrustKnots | None = None,
         begins: str = "",
     ) -> ThrustKnots | None:
-        """Return the best motion near ``guess``; None if none.
+        """Return the best motion near ``guess``; None if none is found.
 
-        If the guess is a solution, even one without the pairs, the solver continues from it.
+        If the guess is a solution, even without the pairs, the solver continues from it.
 
         Parameters
         ----------
