@@ -60,22 +60,24 @@ class PlannedReference(ReferenceProfile):
     ) -> None:
         super().__init__(start, goal, carries=carries)
         self._legs = legs
-        times = np.cumsum([0.0, *(leg.duration for leg in legs)]).tolist()
-        *self._begins, self.duration = times
+        self._ends = np.cumsum([leg.duration for leg in legs]).tolist()
+        """Times since the start at which the legs end, s."""
+        self.duration = self._ends[-1]
 
     def _leg_at(self, time: float) -> tuple[ThrustMotion, float]:
         """Return the leg at a time since the start, s, and its beginning."""
         k = self.waypoints_passed(time)
-        return self._legs[k], self._begins[k]
+        return self._legs[k], self._ends[k] - self._legs[k].duration
 
     def waypoints_passed(self, time: float) -> int:
         """Return the number of waypoints reached ``time`` s after the start."""
-        return bisect_right(self._begins[1:], time)
+        return bisect_right(self._ends[:-1], time)
 
     def configurations(self) -> Samples:
         """Return samples of the plan."""
         paths = [leg.path() for leg in self._legs]
-        times = [begin + path.times for begin, path in zip(self._begins, paths, strict=True)]
+        begins = np.subtract(self._ends, [leg.duration for leg in self._legs])
+        times = [begin + path.times for begin, path in zip(begins, paths, strict=True)]
         base = zip(*(path.base for path in paths), strict=True)
         shapes = np.vstack([path.shapes for path in paths])
         return Samples(shapes, BasePoses(*map(np.vstack, base)), np.concatenate(times))
