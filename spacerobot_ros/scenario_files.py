@@ -330,10 +330,7 @@ def _parse_kill(line: object, where: str) -> Kill:
         raise refusal(f"its node is one of {', '.join(('plant', *COMMANDERS))}")
     if words[:1] != ["at"]:
         raise refusal("it must be NODE at SECONDS [until SECONDS]")
-    at, until = parse_times(words, node, 0.0, refusal)
-    if at < 0.0:
-        raise refusal(f"it is at {at:g} s, before the start of the flight")
-    return Kill(node, at, until)
+    return Kill(node, *parse_times(words, node, 0.0, refusal))
 
 
 def parse_published(rows: Any, path: Path) -> tuple[Published, ...]:

@@ -226,6 +226,11 @@ class RecorderNode(FlightNode):
     # -- contents ------------------------------------------------------------------------------
 
     @property
+    def messages_recorded(self) -> int:
+        """Number of messages written."""
+        return self.recording.messages if self.recording is not None else 0
+
+    @property
     def exit_code(self) -> int:
         """1 if an error ended the recording."""
         return 0 if self.failure is None else 1

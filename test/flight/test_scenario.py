@@ -312,7 +312,7 @@ def written(folder: Path, text: str) -> Scenario:
                 "plant at x": "'x' is not a finite number",
                 "plant at inf": "'inf' is not a finite number",
                 "plant at nan": "'nan' is not a finite number",
-                "plant at -1": "it is at -1 s, before the start of the flight",
+                "plant at -1": "its time is -1 s but must be from 0 to 1e+09 s",
                 "plant at 2 until 2": "it ends at 2 s but begins at 2 s",
                 "plant at 2 until 1": "it ends at 1 s but begins at 2 s",
             }.items()
