@@ -33,10 +33,6 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 _INITIAL_MARGIN = 2e-3
 """Room beyond the clearance that is added for a pair, because held commands change the path, m."""
 
-_ADDITIONAL_ROOM = 1e-3
-"""Room given in addition to what a pair lacks, m: with the missing room alone, which was 0.1 mm
-several times in succession, a path for two arms took ten solutions instead of two."""
-
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 _MIN_INSTANTS = 80
@@ -169,11 +165,10 @@ class KeptDistances:
 
     def widen(self, near: Sequence[Approach]) -> None:
         """Add pairs that came too close; pairs that are already kept apart are given the missing
-        room, and a little more."""
+        room."""
         for each in near:
             if each.pair in self._room:
-                missing = self._required[each.pair] - each.distance
-                self._room[each.pair] += missing + _ADDITIONAL_ROOM
+                self._room[each.pair] += self._required[each.pair] - each.distance
         self.add(near)
 
     def along(self, path: Trajectory) -> tuple[Array, Array]:
