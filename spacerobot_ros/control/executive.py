@@ -110,6 +110,8 @@ class ControlExecutive:
         """Goals pursued together, by frame."""
         self._goal_id = ""
         """Id of the latest goal, included in status messages."""
+        self._holds_until_planned = False
+        """Whether the robot holds its pose until a motion to the restarted goal is planned."""
         self._watch = GoalWatch()
         self._was_measured = False
         self.servicing.end()
@@ -389,6 +391,7 @@ class ControlExecutive:
             elif reaction is _Next.BEGIN_ANEW and self.controller.planner is not None:
                 self._plan_anew(time)
                 self.controller.hold_here(time, measured)
+                self._holds_until_planned = True
             elif reaction is _Next.BEGIN_ANEW:
                 self.controller.restart_motion(time, measured)
                 self._watch.begin_anew()
@@ -443,7 +446,7 @@ class ControlExecutive:
             if lost:
                 self._abort_on_lost_control(lost)
                 return
-        if self.servicing.task is not None:
+        if self.servicing.task is not None or self._holds_until_planned:
             return
         decided = watch.decision(self.controller, time, config)
         if decided is not None:
@@ -531,7 +534,7 @@ class ControlExecutive:
         self._wait_for_tasks()
 
     def _begin_tracking(self, time: float) -> None:
-        self._goal_state = ControllerState.TRACKING
+        self._goal_state, self._holds_until_planned = ControllerState.TRACKING, False
         self._watch.begin(time)
         self._next_report = time
 
@@ -676,6 +679,10 @@ class ControlExecutive:
                 if self._latest_id() == self._goal_id:
                     later = "; planning another motion to it"
                 later *= self._planning.active
+                if self._holds_until_planned:
+                    return (
+                        f"Planning a motion to the goal again; holding, {away} from the reference."
+                    )
                 return f"Flying to the goal; {away} from the reference{later}."
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()

@@ -206,6 +206,20 @@ def test_states_are_answered_while_a_thread_plans() -> None:
     np.testing.assert_allclose(rig.reference().position, second.position, atol=1e-9)
 
 
+def test_a_goal_is_not_reached_while_its_motion_is_planned_again_after_a_reset() -> None:
+    rig = Follower(plan_in_background=True, settle_time=0.04)
+    goal = Goal.from_rotvec([1.3, 0.2, 0.1], [0.2, 0.1, 0.4])
+    rig.executive.submit("base", IdentifiedGoal(goal, "first"))
+    while rig.executive.state is not ControllerState.TRACKING:
+        rig.answer()
+    rig.fly(until=rig.time + 4.0)
+    left = float(np.linalg.norm(rig.reference().position - goal.position))
+    rig.executive.plant_reset()
+    assert rig.fly() is ControllerState.REACHED
+    np.testing.assert_allclose(rig.reference().position, goal.position, atol=1e-9)
+    assert left > 0.1, "the test is sharp: the robot was on its way"
+
+
 def test_motions_are_planned_anew_around_obstacles_that_come_in_flight() -> None:
     goal = Goal.from_rotvec([1.3, 0.2, 0.1], [0.0, 0.0, 0.0])
     middle = (PLACE + goal.position) / 2
