@@ -209,7 +209,10 @@
         ],
         series: [{ label: "time", value: (_, time) => (time === null ? "–" : `${text(time)} s`) }, ...series],
         cursor: { sync: { key: "flight" }, drag: { x: true, y: false, setScale: false }, y: false },
-        legend: { live: true },
+        legend: {
+          live: true,
+          markers: { dash: (self, k) => (self.series[k].dash?.length ? "dotted" : "solid") },
+        },
         hooks: {
           drawAxes: [draw(chart)],
           setSelect: [

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from matplotlib.axes import Axes
 
-from spacerobot_ros.errors import RobotDescriptionError, sentence_case, shortened
+from spacerobot_ros.errors import RobotDescriptionError, enumeration, sentence_case, shortened
 from spacerobot_ros.flight.captures import BUDGET_PARTS, momentum_budget_over_time
 from spacerobot_ros.flight.reading import impulse
 from spacerobot_ros.flight.series import Signal
@@ -477,6 +477,12 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     total = impulse(thrust, np.ones(thrust.width))
     groups.append(TraceGroup(total, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
     caption = "Fraction of each tick during which each thruster was on; lower panel: total impulse"
+    on = whole.values > 0
+    # A closed nozzle gives no thrust.
+    vain = (on & (thrust.values == 0)).sum(axis=0) > on.sum(axis=0) / 2 if len(thrust) else ()
+    failed = [name for name, each in zip(names, vain, strict=False) if each]
+    if failed:
+        caption = caption.replace(";", f", although {enumeration(failed)} mostly gave no thrust;")
     if propellant is not None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))

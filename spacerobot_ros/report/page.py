@@ -57,6 +57,11 @@ _EVENTS_CAPTION = (
 )
 """Caption of the strip below the first chart."""
 
+_FIRST_ALONE = (
+    '<p class="facts">The charts and the paths below show all runs; numbers, events, the 3D view '
+    "and other figures show the first one.</p>"
+)
+
 _FOLDED = ("velocities", "efforts", "twist")
 """Names of the collapsed figures."""
 
@@ -138,7 +143,7 @@ def _runs_html(flight: FlightReport, beside: Sequence[FlightReport]) -> list[str
     if not beside:
         return []
     flights = [flight, *beside]
-    parts = ["<h2>Runs side by side</h2>", table("runs", *runs_table(flights))]
+    parts = ["<h2>Runs side by side</h2>", table("runs", *runs_table(flights)), _FIRST_ALONE]
     files = labels_of(flights)
     if goals := different_goals(flights):
         parts += ["<h3>Goals that differ</h3>", table("goals", ("Goal", *files), goals)]

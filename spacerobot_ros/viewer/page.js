@@ -181,7 +181,7 @@
       notice.textContent =
         "The viewer does not respond. This page shows its last state and can no longer steer the robot.";
       notice.style.cssText =
-        "position:fixed;top:0;left:0;right:max(0px, min(22em, 100vw - 40em));z-index:10000;" +
+        "position:fixed;top:0;left:0;right:max(0px, min(26em, 100vw - 40em));z-index:10000;" +
         "padding:.6em 1em;text-align:center;" +
         "background:#222;color:#fff;font:600 15px sans-serif;border-bottom:2px solid #fff";
       document.body.append(notice);
