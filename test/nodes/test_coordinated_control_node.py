@@ -514,7 +514,7 @@ def test_a_file_that_holds_no_goal_is_refused(
     ("content", "settings", "mentions"),
     [
         (written("end_effector"), {"law": "computed_torque"}, ("computed_torque", "end-effector")),
-        (written(joint_positions=[0.0] * 3), {}, ("3 joints", "planar_manipulator", "2")),
+        (written(joint_positions=[0.0] * 3), {}, ("3 joint positions", "planar_manipulator", "2")),
     ],
 )
 def test_goals_of_another_robot_or_law_are_refused(
