@@ -486,9 +486,10 @@ class KillTimeline:
 
     def due(self, time: float) -> tuple[list[str], list[str]]:
         """Return the nodes to be killed and the nodes to be started by a simulated time, s."""
-        before, self._time = self._time, time
-        killed = [kill.node for kill in self._kills if before < kill.at <= time]
-        return killed, [kill.node for kill in self._kills if before < kill.until <= time]
+        # An estimated time may be corrected downwards.
+        before, self._time = self._time, max(time, self._time)
+        killed = [kill.node for kill in self._kills if before < kill.at <= self._time]
+        return killed, [kill.node for kill in self._kills if before < kill.until <= self._time]
 
     @property
     def away(self) -> set[str]:

@@ -319,7 +319,7 @@ def test_runs_stand_side_by_side(folder: Path, flown: Page, tmp_path: Path) -> N
     page = Page((tmp_path / "both.html").read_text(encoding="utf-8"))
     (_, *runs), *rows = page.tables["runs"]
     values = {name: each for name, *each in rows}
-    assert runs == ["flight (lie_bracket)", "other.mcap"]
+    assert runs == ["flight", "other"]
     assert values["Recorded"] == [f"{len(cyclic_shapes()) - 1} ticks", "2 ticks"]
     # The second bag does not give the method, which is not the default in the first.
     parameters = [["planner.position_tolerance (m)", "0.02", "0.03"]]

@@ -140,6 +140,8 @@ def test_kills_come_in_their_order() -> None:
     timeline = KillTimeline(kills)
     assert timeline.due(0.5) == ([], [])
     assert timeline.due(1.0) == (["planner"], [])
+    # A time that was estimated too late is corrected: nothing happens twice.
+    assert timeline.due(0.9) == timeline.due(1.1) == ([], [])
     assert timeline.away == {"planner"}
     assert timeline.due(4.5) == ([], ["planner"])
     assert timeline.away == set()
