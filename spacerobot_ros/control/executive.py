@@ -98,6 +98,8 @@ class ControlExecutive:
         self._planning.close()
         self._time: float | None = None
         """Time of the last state, s."""
+        self._gap = -math.inf, 0.0
+        """Time of the last state that came after a gap, and the gap, s."""
         self._next = _Next.GO_ON
         self.plant_blocked = False
         """Whether the plant ignores commands, as set by the owner. If so, each command holds the
@@ -375,6 +377,8 @@ class ControlExecutive:
             self.servicing.restart()
             self._watch.shift_time(jump)
             self._next_report += jump
+        if self._time is not None and time - self._time > 1.5 * self._config.control_period:
+            self._gap = time, time - self._time
         self._time = time
         wheels = self.controller.wheels
         if wheels is not None:
@@ -468,6 +472,9 @@ class ControlExecutive:
         return bool(self._guided or self.plant_blocked or self.controller.coming_to_rest)
 
     def _abort_on_lost_control(self, why: str) -> None:
+        at, gap = self._gap
+        if self._time is not None and self._time - at < _GAP_REPORT_TIME:
+            why += f" ({gap:.2g} s without a state before: is the machine busy?)"
         self._give_up(f"Aborted: control is lost, {why}; the robot is brought to rest.")
         self.controller.come_to_rest()
         self._report_abort()
@@ -703,6 +710,9 @@ class ControlExecutive:
             case ControllerState.REFUSED:
                 raise ValueError("a refusal has its own message")
 
+
+_GAP_REPORT_TIME = 1.0
+"""Time, s, for which a gap between states is a possible cause of a loss of control."""
 
 _UNREPORTED_SHARE = 0.1
 """Longest unreported time without a base measurement, as a fraction of ``estimation_time``."""

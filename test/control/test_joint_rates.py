@@ -291,6 +291,19 @@ def test_one_joint_that_is_too_fast_for_long_enough_ends_the_goal() -> None:
     assert [e.kind for e in loop.events].count(EventKind.GOAL_ABORTED) == 1, "it is lost once"
 
 
+def test_control_that_is_lost_after_a_gap_between_states_says_so() -> None:
+    loop = ExecutiveLoop(joint_rates=0.4)
+    loop.aim(base=goal_at(AIM, "g"))
+    loop.answer()
+    loop.tick += 4
+    loop.rates = np.array([0.3, -1.21])
+    loop.answer(3)
+    assert loop.status.message == (
+        "Aborted: control is lost, joint 'elbow' moves at -1.21 rad/s instead of 0.8 rad/s "
+        "(0.05 s without a state before: is the machine busy?); the robot is brought to rest."
+    )
+
+
 def test_a_robot_that_was_brought_to_rest_begins_its_next_goal_where_it_is() -> None:
     loop = ExecutiveLoop()
     loop.aim(base=goal_at(40 * AIM, "far"))
