@@ -35,6 +35,7 @@ from spacerobot_ros.cli.options import (
 from spacerobot_ros.cli.terminal import display, exit_if_terminated, fail, say
 from spacerobot_ros.errors import counted, numbers, quantity
 from spacerobot_ros.termination import termination
+from spacerobot_ros.topics import Request
 
 if TYPE_CHECKING:
     from spacerobot_ros.scenario import Scenario
@@ -439,7 +440,7 @@ def goal_command(
 @click.argument(
     "request",
     metavar="REQUEST",
-    type=click.Choice(["abort", "stop", "rearm", "pause", "resume", "reset", "play", "hold"]),
+    type=click.Choice([each.value for each in Request]),
 )
 @click.option("--namespace", default="", help="Namespace of the stack.")
 def request_command(request: str, namespace: str) -> None:
@@ -454,7 +455,6 @@ def request_command(request: str, namespace: str) -> None:
     hold, play     pause a replay, and continue
     """
     from spacerobot_ros.session.live import send_request
-    from spacerobot_ros.topics import Request
 
     if not send_request(Request(request), say, namespace=namespace):
         fail()
