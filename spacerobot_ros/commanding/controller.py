@@ -169,7 +169,14 @@ class ControllerCommander(Commander):
             pairing = self.states.take_overdue()
             assert pairing is not None
             self._answer_state(pairing)
-            self._watch_missed(missing)
+            # Continue without references missed for their timeout of simulated time.
+            now, timeout = self.stamps.now_ns, self.config.reference_timeout
+            for topic in missing:
+                wait = self._references[topic]
+                if wait.missed_since_ns is None:
+                    wait.missed_since_ns = now
+                if timeout and now - wait.missed_since_ns >= timeout * SECOND:
+                    self._do_without(topic)
         super().take_odom(stamp_ns, odom)
 
     def take_accepted_jump(self) -> str:
@@ -178,15 +185,6 @@ class ControllerCommander(Commander):
         if self.active:
             self._watch_waiting_state()
         return warning
-
-    def _watch_missed(self, missing: tuple[str, ...]) -> None:
-        """Continue without references missed by states for their timeout of simulated time."""
-        now, timeout = self.stamps.now_ns, self.config.reference_timeout
-        for topic in missing:
-            wait = self._references[topic]
-            wait.missed_since_ns = now if wait.missed_since_ns is None else wait.missed_since_ns
-            if timeout and now - wait.missed_since_ns >= timeout * SECOND:
-                self._do_without(topic)
 
     def _watch_waiting_state(self) -> None:
         """Continue without references that have stopped time for their timeout of wall time."""
@@ -347,9 +345,14 @@ class ControllerCommander(Commander):
                 pose, twist = map(np.array, decoder.decode_base(states.odom))
                 measured = ControlState(pose[:3], pose[3:], twist[:3], twist[3:], q, qdot)
             now = stamp / SECOND
-            self._read_target(decoder)
+            if self._target_odometry is not None:
+                (measured_ns, message), self._target_odometry = self._target_odometry, None
+                executive.servicing.target.measure(measured_ns / SECOND, *decoder.target(message))
             result = executive.command(now, measured, q, qdot, self._reference(decoder))
-            self._publish_plan(executive.controller.profile, stamp)
+            profile = executive.controller.profile
+            if profile is not self._published_plan and isinstance(profile, PlannedReference):
+                self.host.publish_plan(profile.path, stamp)
+            self._published_plan = profile
             self._forward_outputs()
         except (CommandError, NotFiniteError) as error:
             self._log_fault("state", f"The state is rejected: {error}")
@@ -359,18 +362,6 @@ class ControllerCommander(Commander):
             self.host.send_command(stamp)
         executive.evaluate(now, result)
         self._forward_outputs()
-
-    def _publish_plan(self, profile: ReferenceProfile | None, stamp_ns: int) -> None:
-        if profile is not self._published_plan:
-            self._published_plan = profile
-            if isinstance(profile, PlannedReference):
-                self.host.publish_path(profile.path, stamp_ns)
-
-    def _read_target(self, decoder: StateDecoder) -> None:
-        if self._target_odometry is not None:
-            assert self.executive is not None
-            (stamp_ns, message), self._target_odometry = self._target_odometry, None
-            self.executive.servicing.target.measure(stamp_ns / SECOND, *decoder.target(message))
 
     def _reference(self, decoder: StateDecoder) -> Reference | None:
         base, joints = self.states.latest(BASE_REFERENCE), self.states.latest(JOINT_REFERENCE)

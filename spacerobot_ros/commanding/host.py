@@ -10,8 +10,8 @@ from typing import Any, Protocol
 from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.events import Event
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.execution.status import LogLevel, ScheduleStart
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.planning.execution.status import LogLevel
 
 
 class CommanderActivity(Enum):
@@ -35,12 +35,11 @@ class CommanderHost(Protocol):
     def report_event(self, event: Event) -> None:
         """Publish an event."""
 
-    def publish_start(self, start: ScheduleStart) -> None:
-        """Publish the start of a schedule; only planners have schedules."""
-
-    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
-        """Publish the path of a planned reference when the reference starts; only controllers have
-        references."""
+    def publish_plan(
+        self, path: BasePath, stamp_ns: int, schedule: GaitSchedule | None = None
+    ) -> None:
+        """Publish the path of a plan that starts with this stamp, and its schedule; plans of
+        controllers have none."""
 
     def log(self, level: LogLevel, message: str) -> None:
         """Write a line to the log."""

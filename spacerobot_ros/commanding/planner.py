@@ -248,7 +248,7 @@ class PlannerCommander(Commander):
                 self._status = status
                 self._publish_decision(status)
             case ScheduleStart() as start:
-                host.publish_start(start)
+                host.publish_plan(start.schedule.path, start.stamp_ns, start.schedule)
                 if self.trajectories is not None:
                     self.trajectories.start(start)
                 self._warn_of_disturbances(self._disturbances)

@@ -46,9 +46,9 @@ from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text,
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.core.method import GaitMethod
-from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalIds
-from spacerobot_ros.planning.execution.status import PlannerStatus, ScheduleStart
+from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
 from spacerobot_ros.simulation.clearance import ClearanceMonitor
@@ -192,12 +192,12 @@ class _Host:
     def report_event(self, event: Event) -> None:
         self.flight.take_event(self.node, event)
 
-    def publish_start(self, start: ScheduleStart) -> None:
-        self.flight.log.schedules.append((start.stamp_ns, start.schedule))
-        self.publish_path(start.schedule.path, start.stamp_ns)
-
-    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
+    def publish_plan(
+        self, path: BasePath, stamp_ns: int, schedule: GaitSchedule | None = None
+    ) -> None:
         self.flight.log.paths.append((stamp_ns, path))
+        if schedule is not None:
+            self.flight.log.schedules.append((stamp_ns, schedule))
 
     def log(self, level: str, message: str) -> None:
         pass

@@ -41,9 +41,8 @@ from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, HeartbeatState, Role
 from spacerobot_ros.nodes.common.watchdog import TOPIC as HEARTBEAT
 from spacerobot_ros.planning.core.goal import Goal
-from spacerobot_ros.planning.core.schedule import BasePath
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
-from spacerobot_ros.planning.execution.status import ScheduleStart
 from spacerobot_ros.times import first_time_ns, stamp_bytes
 
 
@@ -173,10 +172,9 @@ class CoordinatedControlNode(CommanderNode):
         elif (awaited or status.state is ControllerState.REACHED) and not lasts:
             self.get_logger().info(status.message)
 
-    def publish_start(self, start: ScheduleStart) -> None:
-        """Ignore schedules, because a controller has none."""
-
-    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
+    def publish_plan(
+        self, path: BasePath, stamp_ns: int, schedule: GaitSchedule | None = None
+    ) -> None:
         """Publish the path of a planned reference."""
         self._path_topic.publish(path_message(path, stamp_ns, self.config.world_frame))
 

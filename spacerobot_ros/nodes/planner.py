@@ -184,25 +184,26 @@ class PlannerNode(CommanderNode):
         super().publish_status(status)
         self.log("warning" if status.state.level else "info", status.message)
 
-    def publish_start(self, start: ScheduleStart) -> None:
+    def publish_plan(
+        self, path: BasePath, stamp_ns: int, schedule: GaitSchedule | None = None
+    ) -> None:
         """Publish a schedule, its path and its goal, in a thread if planning runs in a thread."""
+        assert schedule is not None
         if not self.commander.config.plan_in_background:
-            self._publish_schedule(start)
+            self._publish_schedule(schedule, stamp_ns)
             return
         self._await_announcement()
         # Serialising a long schedule takes longer than a tick, and nothing waits for it.
-        self._announcement = Thread(target=self._publish_schedule, args=(start,), daemon=True)
+        self._announcement = Thread(
+            target=self._publish_schedule, args=(schedule, stamp_ns), daemon=True
+        )
         self._announcement.start()
 
-    def publish_path(self, path: BasePath, stamp_ns: int) -> None:
-        """Ignore reference paths, because a planner has none."""
-
-    def _publish_schedule(self, start: ScheduleStart) -> None:
-        schedule, stamp, frame = start.schedule, start.stamp_ns, self.config.world_frame
+    def _publish_schedule(self, schedule: GaitSchedule, stamp_ns: int) -> None:
         assert self.commander.robot is not None
-        robot = self.commander.robot.description
-        self._schedule_topic.publish(trajectory_message(schedule, stamp, robot.base_link))
-        self._path_topic.publish(path_message(schedule.path, stamp, frame))
+        robot, frame = self.commander.robot.description, self.config.world_frame
+        self._schedule_topic.publish(trajectory_message(schedule, stamp_ns, robot.base_link))
+        self._path_topic.publish(path_message(schedule.path, stamp_ns, frame))
         self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, robot, frame))
 
 

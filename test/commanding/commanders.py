@@ -44,11 +44,8 @@ class Host:
     def report_event(self, event: Event) -> None:
         self.events.append(event)
 
-    def publish_start(self, start: Any) -> None:
-        self.starts.append(start)
-
-    def publish_path(self, path: Any, stamp_ns: int) -> None:
-        self.starts.append(path)
+    def publish_plan(self, path: Any, stamp_ns: int, schedule: Any = None) -> None:
+        self.starts.append(path if schedule is None else schedule)
 
     def log(self, level: str, message: str) -> None:
         self.lines.append((level, message))

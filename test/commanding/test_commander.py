@@ -586,7 +586,7 @@ def test_plans_have_the_period_of_the_plant(rate: float, other: float) -> None:
         stamp = round(rig.time)
         rig.commander.receive_goal(BASE_GOAL_KEY, stamp, 0, lambda: GOAL)
         rig.states(2, each)
-        assert rig.host.starts[-1].schedule.control_period == pytest.approx(1 / each)
+        assert rig.host.starts[-1].control_period == pytest.approx(1 / each)
     assert rig.host.statuses[-1].state.value == "executing"
 
 
