@@ -7,7 +7,7 @@ import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -39,6 +39,10 @@ from spacerobot_ros.bag.reader import (
 )
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.times import SECOND
+
+if TYPE_CHECKING:
+    from spacerobot_ros.model.grasp import BodyMotion
+    from spacerobot_ros.simulation.plant import InitialState
 
 _STATE_TOPICS = ("odom", "joint_states", "momentum")
 _WITHOUT_STATES = ("inactive", "failed")
@@ -210,30 +214,22 @@ class LastState:
     ----------
     time_ns
         Stamp of the state.
-    position, quaternion
-        Base link pose in the world: (3,) m and (x, y, z, w).
-    joint_names, joints, rates
-        Joint names, positions and velocities (n,).
-    momenta
-        Stacked linear and angular momentum in the world (6,), of the robot together with a held
-        body.
+    joint_names
+        The joints, in the order of their positions and velocities.
+    initial
+        The state; its momenta include a held body.
     target
-        Pose (7,) of the target's root link in the world, and its twist (6,) in T; None if there is
-        no target.
+        Motion of the target's root link; None if there is no target.
     payload
         The body that the robot holds, as a string from ``plant/status``; empty if there is no such
         body.
     """
 
     time_ns: int
-    position: Array
-    quaternion: Array
     joint_names: list[str]
-    joints: Array
-    rates: Array
-    momenta: Array
-    target: Array | None = None
-    payload: str = ""
+    initial: InitialState
+    target: BodyMotion | None
+    payload: str
 
 
 def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
@@ -256,6 +252,8 @@ def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
 
 
 def _last_state(robot: RecordedRobot) -> LastState:
+    from spacerobot_ros.simulation.plant import InitialState  # Other functions need no model.
+
     odom, joints, momentum = (robot[name] for name in _STATE_TOPICS)
     # Momenta have no stamp. The plant publishes the momenta of a state first, so that odom k has
     # momenta k.
@@ -274,21 +272,16 @@ def _last_state(robot: RecordedRobot) -> LastState:
         raise RecordingError(
             f"The last state in the bag {robot.bag.path} has missing or non-finite values."
         )
-    return LastState(
-        time_ns=int(common[-1]),
-        position=pose[:3],
-        quaternion=pose[3:],
-        joint_names=names,
-        joints=positions,
-        rates=rates,
-        momenta=momenta,
-        target=_last_target(robot, int(common[-1])),
-        payload=_last_payload(robot, int(common[-1])),
-    )
+    initial = InitialState.of_motion(pose, positions, rates, momenta)
+    time_ns = int(common[-1])
+    target, payload = _last_target(robot, time_ns), _last_payload(robot, time_ns)
+    return LastState(time_ns, names, initial, target, payload)
 
 
-def _last_target(robot: RecordedRobot, time_ns: int) -> Array | None:
-    """Return pose over twist (13,) of the target in a state; None if it was not recorded."""
+def _last_target(robot: RecordedRobot, time_ns: int) -> BodyMotion | None:
+    """Return the motion of the target in a state; None if it was not recorded."""
+    from spacerobot_ros.model.grasp import BodyMotion
+
     for name in ("target/odom_true", "target/odom"):
         series = robot.get(name)
         if series is None:
@@ -297,7 +290,7 @@ def _last_target(robot: RecordedRobot, time_ns: int) -> Array | None:
         if len(found):
             columns_of_state = (*columns("odom", "pose.pose"), *columns("odom", "twist.twist"))
             state: Array = series.table(columns_of_state)[found[-1]]
-            return state if np.isfinite(state).all() else None
+            return BodyMotion.of(state[:7], state[7:]) if np.isfinite(state).all() else None
     return None
 
 

@@ -397,15 +397,9 @@ def _initial_state(
             f"joint_states or momentum."
         )
     pose, q, qdot, momentum = (found[name][0] for name in needed)
-    state = InitialState(
-        position=pose[:3],
-        quaternion=pose[3:],
-        joint_positions=np.clip(q, flight.robot.lower, flight.robot.upper),
-        joint_velocities=qdot if flight.config.actuation == "effort" else None,
-        linear_momentum=momentum[:3],
-        angular_momentum=momentum[3:6],
-    )
-    return state, qdot
+    q = np.clip(q, flight.robot.lower, flight.robot.upper)
+    rates = qdot if flight.config.actuation == "effort" else None
+    return InitialState.of_motion(pose, q, rates, momentum), qdot
 
 
 # -- re-simulation ----------------------------------------------------------------------------

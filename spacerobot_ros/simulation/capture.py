@@ -527,14 +527,9 @@ class CapturePlant(WrappedPlant):
         return report
 
     def _continue(self, robot: SpaceRobot, motion: RobotMotion, momenta: Array) -> None:
-        start = InitialState(
-            position=motion.pose[:3],
-            quaternion=motion.pose[3:],
-            joint_positions=np.clip(motion.q, robot.lower, robot.upper),
-            joint_velocities=motion.qdot if self._moving_start else None,
-            linear_momentum=momenta[:3],
-            angular_momentum=momenta[3:],
-        )
+        q = np.clip(motion.q, robot.lower, robot.upper)
+        rates = motion.qdot if self._moving_start else None
+        start = InitialState.of_motion(motion.pose, q, rates, momenta)
         self._use(self._build(robot, start))
         # Servos bring the joints from these rates to the commanded ones in the next tick.
         self.plant.qdot[:] = motion.qdot

@@ -249,6 +249,13 @@ class InitialState:
             center_of_mass=_array_or_none(config.initial_center_of_mass),
         )
 
+    @classmethod
+    def of_motion(cls, pose: Array, q: Array, qdot: Array | None, momenta: Array) -> InitialState:
+        """Return the state with a base pose (7,), joint positions and velocities (n,), and linear
+        and angular momentum in the first six ``momenta``; the arrays are copied."""
+        momenta, rates = momenta.copy(), None if qdot is None else qdot.copy()
+        return cls(pose[:3].copy(), pose[3:].copy(), q.copy(), momenta[:3], momenta[3:6], rates)
+
     def __post_init__(self) -> None:
         if self.center_of_mass is not None and np.any(self.position):
             raise ParameterError(

@@ -267,12 +267,14 @@ def say_state(say: Say, time: float, k: float, prefix: str = "") -> None:
 def assert_state(bag: Path, time: float, k: float, namespace: str = "") -> None:
     state = last_state(bag, namespace)
     assert state.time_ns == round(time * 1e9)
-    assert state.position.tolist() == [k, 10.0 + k, 20.0 + k]
-    assert state.quaternion.tolist() == [0.0, 0.6, 0.0, 0.8]
     assert state.joint_names == NAMES
-    assert state.joints.tolist() == [0.1 + k, 0.2 + k]
-    assert state.rates.tolist() == [0.3 + k, 0.4 + k]
-    assert state.momenta.tolist() == [100.0 * (i + 1) + k for i in range(6)]
+    initial = state.initial
+    assert initial.position.tolist() == [k, 10.0 + k, 20.0 + k]
+    assert initial.quaternion.tolist() == [0.0, 0.6, 0.0, 0.8]
+    assert initial.joint_positions == pytest.approx([0.1 + k, 0.2 + k], abs=0.0)
+    assert initial.joint_velocities == pytest.approx([0.3 + k, 0.4 + k], abs=0.0)
+    momenta = *initial.linear_momentum, *initial.angular_momentum
+    assert momenta == tuple(100.0 * (i + 1) + k for i in range(6))
 
 
 @pytest.mark.parametrize("parts", range(4))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -150,12 +151,12 @@ class PlantNode(FlightNode):
             CommandValidator(self._under_efforts, under_efforts)
         last = self._last_state(robot)
         self.tick = 0 if last is None else round(last.time_ns / self._period_ns)
-        self._use_plant(
-            build_plant(robot, decided)
-            if last is None
-            else self._resumed_plant(robot, decided, last),
-            decided,
-        )
+        if last is None:
+            plant = build_plant(robot, decided)
+        else:
+            payload = Payload.from_text(last.payload) if last.payload else None
+            plant = _resumed_plant(robot, decided, last.initial, last.target, payload)
+        self._use_plant(plant, decided)
         self._lockstep: Lockstep | None = None
         self._real_time: RealTime | None = None
         if config.time_mode == "lockstep":
@@ -257,24 +258,11 @@ class PlantNode(FlightNode):
         if capturing is None and not np.any(plant.momentum[:6]) and not self.config.resume_bag:
             assert prepared is not None
             return prepared  # It is still at its start.
-        from spacerobot_ros.bag.salvage import LastState  # Few plants drift before they move.
-
-        target = None
-        if capturing is not None:
-            target = np.concatenate([capturing.target_pose, capturing.target_twist])
-        payload = None if capturing is None else capturing.payload
-        state = LastState(
-            time_ns=self.time_ns,
-            position=plant.pose[:3].copy(),
-            quaternion=plant.pose[3:].copy(),
-            joint_names=list(robot.joint_names),
-            joints=plant.q.copy(),
-            rates=plant.qdot.copy(),
-            momenta=plant.momentum[:6].copy(),
-            target=target,
-            payload="" if payload is None else payload.to_text(),
-        )
-        return self._resumed_plant(robot, config, state)
+        initial = InitialState.of_motion(plant.pose, plant.q, plant.qdot, plant.momentum)
+        if capturing is None:
+            return _resumed_plant(robot, config, initial)
+        target = BodyMotion.of(capturing.target_pose, capturing.target_twist)
+        return _resumed_plant(robot, config, initial, target, capturing.payload)
 
     def activate(self) -> None:
         """Publish the robot and its current state, and start stepping."""
@@ -396,27 +384,6 @@ class PlantNode(FlightNode):
                 "'target.robot' as in that flight."
             )
         return state
-
-    def _resumed_plant(
-        self, robot: SpaceRobot, config: PlantConfig, state: LastState
-    ) -> PlantWithFaults:
-        # Servos hold their commanded rates; only motors leave joints moving.
-        moving = config.actuation == "effort"
-        initial = InitialState(
-            position=state.position,
-            quaternion=state.quaternion,
-            joint_positions=state.joints,
-            linear_momentum=state.momenta[:3],
-            angular_momentum=state.momenta[3:],
-            joint_velocities=state.rates if moving else None,
-        )
-        if state.target is None:
-            return build_plant(robot, config, initial)
-        plant = build_plant(robot, config)
-        assert plant.capturing is not None
-        payload = Payload.from_text(state.payload) if state.payload else None
-        plant.capturing.resume(initial, payload, BodyMotion.of(state.target[:7], state.target[7:]))
-        return plant
 
     # -- time ---------------------------------------------------------------------------------
 
@@ -636,6 +603,24 @@ class PlantNode(FlightNode):
         response.success = True
         response.message = self._when_active.value
         return response
+
+
+def _resumed_plant(
+    robot: SpaceRobot,
+    config: PlantConfig,
+    initial: InitialState,
+    target: BodyMotion | None = None,
+    payload: Payload | None = None,
+) -> PlantWithFaults:
+    if config.actuation == "velocity":
+        # Servos hold their commanded rates; only motors leave joints moving.
+        initial = replace(initial, joint_velocities=None)
+    if target is None:
+        return build_plant(robot, config, initial)
+    plant = build_plant(robot, config)
+    assert plant.capturing is not None
+    plant.capturing.resume(initial, payload, target)
+    return plant
 
 
 main = partial(run_node, PlantNode)
