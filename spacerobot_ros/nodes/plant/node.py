@@ -18,6 +18,7 @@ from rclpy.timer import Timer
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
+from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.errors import (
     CommandError,
@@ -26,6 +27,7 @@ from spacerobot_ros.errors import (
     SpaceRobotError,
     printable,
 )
+from spacerobot_ros.messages.builders import RobotMarkers
 from spacerobot_ros.messages.readers import CommandReader, actuation_of
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
@@ -38,7 +40,6 @@ from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.nodes.plant.publisher import (
     ClearancePublisher,
-    LinkMarkers,
     PlantReport,
     StatePublisher,
     TransformPublisher,
@@ -168,7 +169,8 @@ class PlantNode(FlightNode):
         )
         self._publisher = StatePublisher(self, robot, self.reported, config)
         self._transforms = TransformPublisher(self, robot, config)
-        self._markers = LinkMarkers(self, config.world_frame)
+        self._markers = RobotMarkers(robot.description, self.reported.target, config.world_frame)
+        self._marker_stream = self.create_publisher(MarkerArray, "markers", STREAM)
         self._report = PlantReport(self, self._real_time)
         self._pose_ticks = (
             self._ticks_for_viewers(config.base_pose_period, _LONGEST_MARKER_PERIOD) or 1
@@ -414,8 +416,13 @@ class PlantNode(FlightNode):
             self._look_at_contacts(self._clearance, now)
         if self._tf_ticks and self.tick % self._tf_ticks == 0:
             self._transforms.publish(now)
-        if self._marker_ticks and self.tick % self._marker_ticks == 0:
-            self._markers.publish(now)
+        draws = self._markers.draws_anything and self._marker_ticks
+        if draws and self.tick % self._marker_ticks == 0:
+            plant = self.plant
+            target = None if plant.capturing is None else plant.capturing.target_pose
+            self._marker_stream.publish(
+                self._markers.message(now, plant.pose, plant.link_R, plant.link_r, target)
+            )
         if self._report_ticks and self.tick % self._report_ticks == 0:
             self._publish_report()
 

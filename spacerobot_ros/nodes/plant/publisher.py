@@ -10,12 +10,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
-from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.messages.builders import (
     STATIC_TRANSFORMS,
     TRANSFORMS,
-    RobotMarkers,
     RobotTransforms,
     state_message,
 )
@@ -322,24 +320,3 @@ class ClearancePublisher:
             else:
                 node.get_logger().info(event.message)
         return self._monitor.contacts if events else None
-
-
-class LinkMarkers:
-    """Publishes all visuals of the robot, its target and the obstacles as one marker array."""
-
-    def __init__(self, node: PlantNode, world_frame: str) -> None:
-        self._node, plant = node, node.plant
-        target = None if plant.capturing is None else plant.capturing.target.description
-        self._stream = node.create_publisher(MarkerArray, "markers", STREAM)
-        self._markers = RobotMarkers(plant.robot.description, target, world_frame)
-        self.use_obstacles = self._markers.use_obstacles
-
-    def publish(self, time_ns: int) -> None:
-        """Publish the markers of all visuals at their current poses."""
-        if not self._markers.draws_anything:
-            return
-        plant = self._node.plant
-        target = None if plant.capturing is None else plant.capturing.target_pose
-        self._stream.publish(
-            self._markers.message(time_ns, plant.pose, plant.link_R, plant.link_r, target)
-        )
