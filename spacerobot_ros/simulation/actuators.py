@@ -290,14 +290,20 @@ class PlantWithFaults(WrappedPlant):
             self._apply_faults(faults)
         if disturbances is not self.disturbances and self.loads is not None:
             self.disturbances = disturbances
-            self._apply_disturbances(disturbances, self.loads)
+            loads = self.loads
+            loads.in_link[:] = loads.in_world[:] = 0.0
+            for each in disturbances:
+                wrenches = loads.in_link if each.in_link else loads.in_world
+                wrenches[self.robot.link_names.index(each.link)] += (*each.force, *each.torque)
         if self.injected != (*faults, *disturbances):
             self.injected = (*faults, *disturbances)
 
     def _apply_faults(self, active: tuple[Fault, ...]) -> None:
         self._bias[:], self._noise[:], self._factor[:] = 0.0, 0.0, 1.0
         self._wrench_factor[:], self._wrench_held[:] = 1.0, 0.0
-        wrench_faulty = False
+        wrench_faulty, thrusters = False, self.thrusters
+        if thrusters is not None:
+            thrusters.thruster_health[:], thrusters.stuck_on[:] = 1.0, False
         held = np.zeros(self.robot.n, dtype=np.bool_)
         variances = np.zeros_like(self._noise)
         for fault in active:
@@ -318,31 +324,18 @@ class PlantWithFaults(WrappedPlant):
             elif fault.kind == "thruster_weak":
                 self._wrench_factor[axes] *= fault.value
                 wrench_faulty = True
-        self._noise[:] = np.sqrt(variances)
-        self.plant.hold(held)
-        if self.thrusters is not None:
-            self.thrusters.wrench_fault = (
-                (self._wrench_factor, self._wrench_held) if wrench_faulty else None
-            )
-            self._apply_nozzle_faults(self.thrusters, active)
-        self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
-
-    def _apply_disturbances(self, active: tuple[Disturbance, ...], loads: PlantLoads) -> None:
-        loads.in_link[:] = loads.in_world[:] = 0.0
-        for each in active:
-            wrenches = loads.in_link if each.in_link else loads.in_world
-            wrenches[self.robot.link_names.index(each.link)] += (*each.force, *each.torque)
-
-    @staticmethod
-    def _apply_nozzle_faults(thrusters: ThrusterPlant, active: tuple[Fault, ...]) -> None:
-        thrusters.thruster_health[:], thrusters.stuck_on[:] = 1.0, False
-        for fault in active:
-            if fault.kind.startswith("nozzle_"):
+            elif fault.kind.startswith("nozzle_") and thrusters is not None:
                 nozzle = thrusters.table.names.index(fault.target)
                 if fault.kind == "nozzle_open":
                     thrusters.stuck_on[nozzle] = True
                 else:
                     thrusters.thruster_health[nozzle] *= fault.value
+        self._noise[:] = np.sqrt(variances)
+        self.plant.hold(held)
+        if thrusters is not None:
+            fault_of_wrench = self._wrench_factor, self._wrench_held
+            thrusters.wrench_fault = fault_of_wrench if wrench_faulty else None
+        self._actuators_sound = all(FAULT_KINDS[f.kind].sensor for f in active)
 
     def _faulty_commands(self, joints: Array, *wrench: Array) -> list[Array]:
         """Return the commands as the faulty actuators realise them (new arrays)."""

@@ -164,7 +164,7 @@ class MujocoPlant:
 
     def reset(self) -> None:
         """Return to the initial state, with zero efforts; the limit counters are kept."""
-        start, robot, data = self.initial, self.robot, self._data
+        start, robot = self.initial, self.robot
         rates = start.rates(robot)
         if self._velocity and rates.any():
             raise ParameterError(
@@ -172,21 +172,17 @@ class MujocoPlant:
                 "or command them."
             )
         quaternion, q, momenta = start.attitude(), start.shape(robot), start.momenta()
-        self._mujoco.mj_resetData(self._model, data)
-        R_WB = matrix_from_quaternion(quaternion)
-        data.qpos[:3] = start.system_position(robot) - R_WB @ robot.center_of_mass(q)
-        data.qpos[3:7] = np.roll(quaternion, 1)
-        data.qpos[self._q], data.qvel[self._qdot] = q, rates
-        v_WB_B, omega_WB_B = robot.base_twist(quaternion, q, rates, momenta[:3], momenta[3:])
-        data.qvel[:3], data.qvel[3:6] = R_WB @ v_WB_B, omega_WB_B
-        if self._target is not None:
-            self._place_target(self._target.initial)
-        self.holds_target = False
+        self._mujoco.mj_resetData(self._model, self._data)
         self._model.geom_conaffinity[self._target_shapes] = 1
+        self.holds_target = False
+        r_BC_W = matrix_from_quaternion(quaternion) @ robot.center_of_mass(q)
+        pose = np.concatenate([start.system_position(robot) - r_BC_W, quaternion])
+        twist = robot.base_twist(quaternion, q, rates, momenta[:3], momenta[3:])
+        motion = RobotMotion(pose, np.concatenate(twist), q, rates)
+        self.go_on(motion, None if self._target is None else self._target.initial)
         self.expected_momenta[:] = momenta
-        self.effort[:] = self.wrench[:] = self._aim[:] = 0.0
+        self.effort[:] = self.wrench[:] = 0.0
         self.hold(self._held)
-        self._update()
 
     def go_on(
         self, motion: RobotMotion, target: BodyMotion | None = None, *, welded: bool = False
