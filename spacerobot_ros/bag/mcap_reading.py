@@ -520,7 +520,14 @@ def blocks_in_time_order(
                 if section.chunk is None:
                     yield from _blocks_of_records(opened, wanted[n])
                 else:
-                    yield _messages_of_chunk(opened, section.chunk, wanted[n])
+                    place = section.chunk.chunk_start_offset
+                    chunk = read_record(opened, place, Chunk)
+                    if chunk.uncompressed_size != section.chunk.uncompressed_size:
+                        raise ValueError(
+                            f"the chunk at byte {place} and its index specify different sizes"
+                        )
+                    data = ChunkUnpacker(file_size(opened)).unpack(chunk, place)
+                    yield _messages_in(data, place, wanted[n])
 
     for cluster in _overlapping(sections):
         yield _in_time_order(blocks(cluster))
@@ -549,11 +556,3 @@ def _in_time_order(blocks: Iterable[MessageBlock]) -> MessageBlock:
     order = np.argsort(times, kind="stable")
     messages = [message for part in data for message in part]
     return np.concatenate(numbers)[order], times[order], [messages[k] for k in order.tolist()]
-
-
-def _messages_of_chunk(file: BinaryIO, index: ChunkIndex, wanted: _Wanted) -> MessageBlock:
-    place = index.chunk_start_offset
-    chunk = read_record(file, place, Chunk)
-    if chunk.uncompressed_size != index.uncompressed_size:
-        raise ValueError(f"the chunk at byte {place} and its index specify different sizes")
-    return _messages_in(ChunkUnpacker(file_size(file)).unpack(chunk, place), place, wanted)

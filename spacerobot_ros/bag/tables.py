@@ -176,7 +176,11 @@ def _table_fields(
 ) -> list[Field]:
     values = series.field(path)
     if series.element_type(path) == _KEY_VALUES:
-        return _key_value_fields(path, values)
+        rows = [key_values(pairs) for pairs in values]
+        return [
+            Field(f"{path}[{key}]", _object_array([row.get(key, "") for row in rows]), ("",))
+            for key in dict.fromkeys(key for row in rows for key in row)
+        ]
     if path in _TIME_COLUMNS:
         path = f"message.{path}"
     if not isinstance(values, np.ndarray) or values[:1].size > _MAX_ARRAY_COLUMNS:
@@ -225,7 +229,8 @@ def array_field(
 
 def number_field(path: str, values: NDArray[Any]) -> Field:
     """Return one number per message (N,) as a field, with the unit of its path."""
-    return Field(path, values, (_unit_of_path(path),))
+    units = (unit for ending, unit in _UNITS_BY_PATH_ENDING if ending.search(path))
+    return Field(path, values, (next(units, ""),))
 
 
 def with_euler_angles(table: TopicTable) -> TopicTable:
@@ -256,21 +261,10 @@ def _euler_angles(quaternions: NDArray[np.float64]) -> tuple[NDArray[np.float64]
     return roll, pitch, np.arctan2(across, along)
 
 
-def _key_value_fields(path: str, values: list[Any]) -> list[Field]:
-    """Return a string column for each key in lists of key-value pairs."""
-    rows = [key_values(pairs) for pairs in values]
-    keys = dict.fromkeys(key for row in rows for key in row)
-    return [Field(f"{path}[{k}]", _object_array([r.get(k, "") for r in rows]), ("",)) for k in keys]
-
-
 def _joint_unit(path: str, is_prismatic: bool | None) -> str:
     if path not in _JOINT_UNITS or is_prismatic is None:
         return ""
     return _JOINT_UNITS[path][0 if is_prismatic else 1]
-
-
-def _unit_of_path(path: str) -> str:
-    return next((unit for ending, unit in _UNITS_BY_PATH_ENDING if ending.search(path)), "")
 
 
 def _object_array(values: list[str]) -> NDArray[Any]:

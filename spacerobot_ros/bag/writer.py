@@ -323,23 +323,20 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         done = self._file
         done.finish()
         self._earlier_counts += done.message_counts
-        self._file = self._open_next_file()
+        while self._file is done:
+            self._file_number += 1
+            try:
+                self._file = self._open_numbered_file()
+            except BagExistsError:
+                # A file of another bag has this number: in flight, the next number is used.
+                if self._overwrite:
+                    raise
         self.splits += 1
         for topic in done.topics.values():
             self._file.add_topic(topic)
         self._file.add_rosbag2_metadata()
         for record in self._repeated:
             record(self._file)
-
-    def _open_next_file(self) -> McapFile:
-        while True:
-            self._file_number += 1
-            try:
-                return self._open_numbered_file()
-            except BagExistsError:
-                # A file of another bag has this number: in flight, the next number is used.
-                if self._overwrite:
-                    raise
 
     @contextmanager
     def _adding(self) -> Iterator[None]:

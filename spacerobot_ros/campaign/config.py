@@ -216,7 +216,13 @@ def parse_campaign(
     """
     for key in section:
         _require_known("key", key, _CAMPAIGN_KEYS)
-    scenario = scenario or _read_scenario(section, folder)
+    if scenario is None:
+        given = section.get("scenario")
+        if not isinstance(given, str):
+            raise ParameterError("'scenario' must be a scenario name or file.")
+        beside = folder / given
+        found = scenario_or_robot(str(beside) if beside.is_file() else given)
+        scenario = scenario_of_section(found, section)
     drawn = [*read_distributions(_read_mapping(section, "disperse"), scenario)]
     rows = None
     if section.get("table") is not None:
@@ -266,15 +272,6 @@ def _require_known(kind: str, name: Any, known: Sequence[str]) -> None:
             f"there is no {kind} '{name}'; available: {', '.join(known)}."
             f"{suggestion(str(name), known)}"
         )
-
-
-def _read_scenario(section: Mapping[str, Any], folder: Path) -> Scenario:
-    given = section.get("scenario")
-    if not isinstance(given, str):
-        raise ParameterError("'scenario' must be a scenario name or file.")
-    beside = folder / given
-    scenario = scenario_or_robot(str(beside) if beside.is_file() else given)
-    return scenario_of_section(scenario, section)
 
 
 def scenario_of_section(scenario: Scenario, section: Mapping[str, Any]) -> Scenario:

@@ -197,8 +197,13 @@ class Dataset:
             for left in (self.folder / _FLIGHTS_FOLDER).glob(".*"):
                 left.unlink()  # An earlier process was killed while it wrote this file.
             done = self.flown_numbers()
-            if done:
-                self._name_other_software()
+            about = self.folder / _ABOUT_FILE
+            flown_by = json.loads(about.read_text("utf-8")).get("versions", "") if done else ""
+            if done and flown_by != versions_json():
+                warn_once(
+                    f"The flights in {self.folder} were flown with different software "
+                    f"({flown_by}): the results of further flights may differ."
+                )
             self._write_description(
                 campaign, max([campaign.flights, *(number + 1 for number in done)])
             )
@@ -225,14 +230,6 @@ class Dataset:
             f"The folder {self.folder} contains another campaign: '{facts['name']}', with "
             f"{difference}. Use another folder, or remove this one."
         )
-
-    def _name_other_software(self) -> None:
-        flown_by = json.loads((self.folder / _ABOUT_FILE).read_text("utf-8")).get("versions", "")
-        if flown_by != versions_json():
-            warn_once(
-                f"The flights in {self.folder} were flown with different software ({flown_by}): "
-                "the results of further flights may differ."
-            )
 
     def _require_no_other_files(self) -> None:
         if not self.folder.exists():

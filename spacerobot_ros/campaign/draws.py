@@ -184,36 +184,27 @@ def drawn_flights(
                 # Other values are refused below.
                 dispersion.target.weigh(factors, np.where(np.isfinite(drawn), drawn, 1.0))
         parameters, differ = factors.applied_to(nominal), factors.differ.tolist()
-        suspicious = any(differ) and not _is_physical(parameters, bodies)
+        suspicious = False
+        if any(differ):
+            try:
+                parameters.require_physical(bodies)
+            except RobotDescriptionError:
+                suspicious = True
         for row, draw in enumerate(block):
             seed = draw.seed if has_own_seed else None
             flight = replace(common, inertial=parameters[row] if differ[row] else None, seed=seed)
             try:
-                flight = _with_values(campaign, draw, flight)
+                for dispersion in campaign.dispersions:
+                    value, target = draw.values[dispersion.name], dispersion.target
+                    if not target.is_text and not math.isfinite(value):
+                        raise ParameterError(f"The value drawn for '{dispersion.name}' is {value}.")
+                    flight = target.apply(flight, value)
                 if suspicious and flight.inertial is not None:
                     flight.inertial.require_physical(bodies)
             except Exception as error:
                 yield draw, error
             else:
                 yield draw, flight
-
-
-def _is_physical(parameters: InertialParameters, bodies: Sequence[str]) -> bool:
-    try:
-        parameters.require_physical(bodies)
-    except RobotDescriptionError:
-        return False
-    return True
-
-
-def _with_values(campaign: Campaign, draw: Draw, flight: DrawnFlight) -> DrawnFlight:
-    """Return a flight that already has a draw's masses, with the draw's other values applied."""
-    for dispersion in campaign.dispersions:
-        value, target = draw.values[dispersion.name], dispersion.target
-        if not target.is_text and not math.isfinite(value):
-            raise ParameterError(f"The value drawn for '{dispersion.name}' is {value}.")
-        flight = target.apply(flight, value)
-    return flight
 
 
 def require_module(module: str) -> Any:

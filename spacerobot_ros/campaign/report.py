@@ -475,35 +475,32 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
         f"{only_a} only {a}, {only_b} only {b} (McNemar's exact test: p = {p:.2g})."
     )
     notes = [*_notes_on_failures(first, second), *_notes_on_control(first, second)]
+    rows = [
+        list(row)
+        for row in different_parameters([first.campaign.scenario, second.campaign.scenario])
+    ]
     with drawing():
         body = [
             f"<header><h1>{escape(a)} and {escape(b)}</h1>",
             facts([f"{len(common)} common draws"]),
             f'<p class="outcome">{escape(sentence)}</p></header>',
             *(f'<p class="missing">{escape(note)}</p>' for note in notes),
-            *_parameters_part(first.campaign, second.campaign),
+            "<h2>Parameters that differ</h2>",
+            table("parameters", ["parameter", a, b], rows)
+            if rows
+            else '<p class="missing">None differ.</p>',
             "<h2>Paired differences</h2>",
             _difference_table(found, first, second),
             _difference_figure(first, second, flown_a, flown_b, compared[:6]),
         ]
     write_output(path, html_page(f"{a} and {b}", body, _FOOTER))
-    return [sentence, *(_difference_line(each, b, a) for each in found), *notes]
-
-
-def _parameters_part(first: Campaign, second: Campaign) -> list[str]:
-    rows = [list(row) for row in different_parameters([first.scenario, second.scenario])]
-    if not rows:
-        return ["<h2>Parameters that differ</h2>", '<p class="missing">None differ.</p>']
-    head = ["parameter", first.name, second.name]
-    return ["<h2>Parameters that differ</h2>", table("parameters", head, rows)]
-
-
-def _difference_line(each: PairedDifference, second: str, first: str) -> str:
-    return (
-        f"{metric_label(each.metric)}: {first} {each.first:.4g}, {second} {each.second:.4g}; "
-        f"{second} minus {first} is {each.difference:.4g} "
-        f"(95 % interval {each.interval_low:.4g} to {each.interval_high:.4g})"
-    )
+    lines = [
+        f"{metric_label(each.metric)}: {a} {each.first:.4g}, {b} {each.second:.4g}; {b} minus {a} "
+        f"is {each.difference:.4g} (95 % interval {each.interval_low:.4g} to "
+        f"{each.interval_high:.4g})"
+        for each in found
+    ]
+    return [sentence, *lines, *notes]
 
 
 def _notes_on_failures(first: Results, second: Results) -> list[str]:

@@ -435,12 +435,17 @@ class TaskDistributor:
         self._running[task] = _SubmittedTask(numbers, engine, alone)
 
     def _collect_rows(self, ended: _Task) -> list[Row]:
-        """Return the rows of a task; none if its worker died."""
+        """Return the rows of a task; if its worker died, that of a flight that was alone. The
+        flights of other tasks are then repeated one at a time."""
         task = self._running.pop(ended)
         try:
             made = self._workers.result(ended)
         except WorkerDeath:
-            return self._on_worker_death(task)
+            if not task.runs_alone:
+                self._retry_alone += task.numbers
+                return []
+            draw = self._draws[task.numbers[0]]
+            return [Row(draw, KILLED, "Its process died 2 times.", engine=self._engine)]
         rows = [each for each in made if isinstance(each, Row)]
         passed_on = {each.number: each for each in made if isinstance(each, Draw)}
         self._passed_on |= passed_on
@@ -452,11 +457,3 @@ class TaskDistributor:
                 least = engine_by_name(task.engine).efficient_flights
                 self._sizes[task.engine] = max(least, min(_MAX_TASK_FLIGHTS, size))
         return rows
-
-    def _on_worker_death(self, task: _SubmittedTask) -> list[Row]:
-        """Repeat the flights of a task one at a time; return the row of a flight that was alone."""
-        if not task.runs_alone:
-            self._retry_alone += task.numbers
-            return []
-        draw = self._draws[task.numbers[0]]
-        return [Row(draw, KILLED, "Its process died 2 times.", engine=self._engine)]

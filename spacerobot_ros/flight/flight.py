@@ -249,35 +249,25 @@ class Flight(FlightData):
         capture, detumbling = self.capture, self.detumbling
         if not capture:
             return CaptureMeasures()
-        time = capture.get("time_s", math.nan)
+        changes = (EventKind.CAPTURED, EventKind.RELEASED)
+        last = [event.kind for event in self.events if event.kind in changes][-1:]
+        time, distance = capture.get("time_s", math.nan), capture.get("nearest_m", math.nan)
+        times, distances = self._grapple_distances
+        if capture["captured"] and len(times):
+            distance = distances[int(np.searchsorted(times, time - 1e-9))]
         impulse = np.array(capture.get("impulse_Ns", [math.nan] * 6))
         joints = np.abs(capture.get("joint_impulses_Nms", ()))
         return CaptureMeasures(
             captured=float(capture["captured"]),
-            placed=float(self.succeeded and self._holds_target),
+            placed=float(self.succeeded and last == [EventKind.CAPTURED]),
             time=time,
-            distance=self._capture_distance(capture),
+            distance=float(distance),
             impulse=float(np.linalg.norm(impulse[:3])),
             angular_impulse=float(np.linalg.norm(impulse[3:])),
             joint_impulse=float(joints.max()) if joints.size else math.nan,
             detumbling_time=detumbling.get("took_s", math.nan),
             detumbling_bound=detumbling.get("shortest_s", math.nan),
         )
-
-    @property
-    def _holds_target(self) -> bool:
-        changes = (EventKind.CAPTURED, EventKind.RELEASED)
-        last = [event.kind for event in self.events if event.kind in changes][-1:]
-        return last == [EventKind.CAPTURED]
-
-    def _capture_distance(self, capture: dict[str, Any]) -> float:
-        """Return the distance at a capture, or the flight's smallest, m; NaN: unknown."""
-        if not capture["captured"]:
-            return float(capture.get("nearest_m", math.nan))
-        time, distances = self._grapple_distances
-        if not len(time):
-            return math.nan
-        return float(distances[int(np.searchsorted(time, capture["time_s"] - 1e-9))])
 
     # -- verdict ------------------------------------------------------------------------------
 
@@ -313,7 +303,9 @@ class Flight(FlightData):
         reached = self.outcome in (Outcome.REACHED, Outcome.REACHED_PARTLY)
         if not (reached or late):
             return Verdict(self.outcome.value.capitalize(), self.message)
-        left_out, missed = self.not_controlled, reached and self._automatic_capture_is_missing
+        automatic = self.scenario.plant.capture.mode == "automatic"
+        missed = reached and automatic and not self.capture.get("captured", True)
+        left_out = self.not_controlled
         word = "Reached" if reached else "Failed"
         if reached and left_out:
             word += f", except for the {' and '.join(left_out)}"
@@ -356,11 +348,6 @@ class Flight(FlightData):
             fact = self.message.partition(": ")[0]
         fact += ", but the target is not captured" * missed
         return Verdict(word, f"{fact}: {errors}.", succeeded, succeeded and not left_out)
-
-    @property
-    def _automatic_capture_is_missing(self) -> bool:
-        automatic = self.scenario.plant.capture.mode == "automatic"
-        return automatic and not self.capture.get("captured", True)
 
     @property
     def _last_error(self) -> PoseError | None:

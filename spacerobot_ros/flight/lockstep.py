@@ -355,16 +355,13 @@ class LockstepFlight:
         self.log.add_state(self._tick)
         if self._report_ticks and self._tick % self._report_ticks == 0:
             self.log.diagnostics.append((self._now_ns, tuple(self._diagnostics.records())))
-        if self._clearance is not None and self._tick % self._contact_ticks == 0:
-            self._report_contacts(self._clearance)
-
-    def _report_contacts(self, clearance: ClearanceMonitor) -> None:
-        plant = self._plant
-        _, events = clearance.measure(plant.link_R, plant.link_r, plant.pose, self.time)
-        if events:
-            self.log.events += [replace(event, node="plant") for event in events]
-            self._monitor.contacts = clearance.contacts
-            self._report_plant_status(PlantState.RUNNING)
+        clearance, plant = self._clearance, self._plant
+        if clearance is not None and self._tick % self._contact_ticks == 0:
+            _, events = clearance.measure(plant.link_R, plant.link_r, plant.pose, self.time)
+            if events:
+                self.log.events += [replace(event, node="plant") for event in events]
+                self._monitor.contacts = clearance.contacts
+                self._report_plant_status(PlantState.RUNNING)
 
     def _step(self) -> bool:
         """Step with the commands of the tick; return whether the plant could step."""

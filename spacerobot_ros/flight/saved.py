@@ -389,6 +389,8 @@ def table_of_flight(flight: FlightData, *, euler: bool = False) -> TopicTable:
     ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` for attitudes.
     """
     quantities, seen = topic_quantities(flight), set(flight.quantities)
+    joints = flight.robot.movable_joints if flight.robot is not None else ()
+    prismatic = {joint.name: joint.unit == "m" for joint in joints}
     truth: list[Field] = []
     others: list[Field] = []
     for topic in state_topics(flight.scenario.plant.end_effectors):
@@ -404,14 +406,15 @@ def table_of_flight(flight: FlightData, *, euler: bool = False) -> TopicTable:
                 pairs = zip(field.columns, values.T, strict=True)
                 made = [number_field(path, column) for path, column in pairs]
             else:
-                made = [
-                    array_field(
-                        topic.name, field.path, values, _names(flight, topic), _prismatic(flight)
-                    )
-                ]
+                names = _names(flight, topic)
+                made = [array_field(topic.name, field.path, values, names, prismatic)]
             found = others if prefix else truth
             found += [replace(each, path=prefix + each.path) for each in made]
-    others += _single_numbers(flight, seen)
+    others += [
+        Field(name, values[:, 0], (_UNITS.get(name, ""),))
+        for name, values in flight.quantities.items()
+        if name in seen and values.shape == (len(flight.time), 1)
+    ]
     table = TopicTable("", "", flight.time, (*truth, *others))
     return with_euler_angles(table) if euler else table
 
@@ -436,15 +439,3 @@ def _names(flight: FlightData, topic: Topic) -> Sequence[str]:
     # A thruster table in a separate file is not read, because a bag may name any file.
     source, robot = flight.scenario.plant.thrusters, flight.robot
     return find_thrusters(source, robot).names if robot is not None and source == IN_URDF else ()
-
-
-def _prismatic(flight: FlightData) -> dict[str, bool]:
-    joints = flight.robot.movable_joints if flight.robot is not None else ()
-    return {joint.name: joint.unit == "m" for joint in joints}
-
-
-def _single_numbers(flight: FlightData, names: set[str]) -> Iterator[Field]:
-    """Yield the scalar quantities that no topic contains."""
-    for name, values in flight.quantities.items():
-        if name in names and values.shape == (len(flight.time), 1):
-            yield Field(name, values[:, 0], (_UNITS.get(name, ""),))

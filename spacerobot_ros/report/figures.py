@@ -384,18 +384,17 @@ def set_range(
     axes: Axes,
     values: Array,
     extra: Sequence[float] = (),
-    least: float = 0.0,
     axis: Literal["x", "y"] = "y",
 ) -> None:
     """Set an axis to the value range with a margin, including nearby values of ``extra``.
 
-    The axis spans at least ``least``, or 0.1 if the values are constant, so that rounding errors
-    are not magnified.
+    The axis spans at least 0.1 if the values are constant, so that rounding errors are not
+    magnified.
     """
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
-    if high - low < max(1e-6, 1e-6 * max(abs(low), abs(high))):
-        least = max(least, 0.1)
+    constant = high - low < max(1e-6, 1e-6 * max(abs(low), abs(high)))
+    least = 0.1 if constant else 0.0
     span = max(high - low, least)
     near = [x for x in extra if low - 0.2 * span <= x <= high + 0.2 * span]
     low, high = min([low, *near]), max([high, *near])

@@ -38,7 +38,7 @@ from spacerobot_ros.model.shared_parameters import (
     robot_from_text,
 )
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.parameters import configured, declared
+from spacerobot_ros.parameters import configured, known_values
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import RobotState, Tolerance, missed_parts
@@ -193,8 +193,7 @@ def planner_config(parameters: Mapping[str, str]) -> PlannerConfig:
     SpaceRobotError
         A value is refused.
     """
-    known = {each.name for each in declared(PlannerConfig)}
-    values = {name: json.loads(text) for name, text in parameters.items() if name in known}
+    values = {name: json.loads(x) for name, x in known_values(PlannerConfig, parameters).items()}
     values = {name: value for name, value in values.items() if value is not None}
     # The robot is the viewer's, wherever the planner takes its own from.
     elsewhere = {"robot_description": "", "robot": "", "world": ""}
