@@ -163,23 +163,14 @@ class Progress:
     errors: GoalErrors
 
 
-@dataclass(frozen=True)
-class FlyToResult:
-    """Result of a goal: state and message of the final status, and the errors."""
-
-    outcome: str
-    message: str
-    errors: GoalErrors
-
-
 class FlyToClient(Protocol):
     """The client of one goal."""
 
     def feedback(self, progress: Progress) -> None:
         """Send feedback about the goal to the client."""
 
-    def end(self, result: FlyToResult) -> None:
-        """Send the result to the client; called once, at the end."""
+    def end(self, status: Status, errors: GoalErrors) -> None:
+        """Send the result to the client: final status and errors; called once, at the end."""
 
 
 @dataclass
@@ -318,4 +309,4 @@ class FlyToGoals:
         errors = GoalErrors()
         if served.request is not None:
             errors = self._errors(served.request.goal).reported_by(status)
-        served.client.end(FlyToResult(status.state.value, status.message, errors))
+        served.client.end(status, errors)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum, IntEnum
 from typing import Any, Protocol
 
@@ -100,10 +100,10 @@ class PlannerCommander(Commander):
             described = with_world(described, self._world)
         return PlanningWorker(robot, self.config, method, self._on_long_work, described)
 
-    def end_schedule(self, end: TrajectoryEnd) -> None:
+    def end_schedule(self, why: str, final: bool) -> None:
         """End the current schedule, because the controller that executes it has ended it."""
         if self.executive is not None:
-            self.executive.schedule_ended(end.message, final=end.final)
+            self.executive.schedule_ended(why, final=final)
 
     def _use_obstacles(self) -> None:
         executive, robot = self.executive, self.robot
@@ -288,22 +288,6 @@ class Outcome(Enum):
     CANCELED = "canceled"
 
 
-@dataclass(frozen=True)
-class TrajectoryEnd:
-    """The end of a schedule executed by the robot's own controller.
-
-    Attributes
-    ----------
-    message
-        Reason for an early end, as a clause; empty: the schedule was completed.
-    final
-        Whether a correction would end in the same way; if so, none is planned.
-    """
-
-    message: str = ""
-    final: bool = False
-
-
 class TrajectoryServer(Protocol):
     """The connection to the action server."""
 
@@ -330,11 +314,13 @@ class TrajectoryOutput:
     name
         Name of the action, for messages.
     on_end
-        Called once for each schedule that ends without being replaced or cancelled.
+        Called once for each schedule that ends without being replaced or cancelled, with the reason
+        for an early end, as a clause (empty: the schedule was completed), and whether a correction
+        would end in the same way; if so, none is planned.
     """
 
     def __init__(
-        self, server: TrajectoryServer, name: str, on_end: Callable[[TrajectoryEnd], None]
+        self, server: TrajectoryServer, name: str, on_end: Callable[[str, bool], None]
     ) -> None:
         self._server, self._name, self._on_end = server, name, on_end
         self._number = 0
@@ -356,7 +342,7 @@ class TrajectoryOutput:
         self._replaced, self._sent, self._accepted = self._sent, self._number, False
         self._watched_ns = None
         if not self._server.is_available():
-            self._end(TrajectoryEnd(f"the action '{self._name}' has no server", final=True))
+            self._end(f"the action '{self._name}' has no server")
             return
         self._server.send(self._number, start)
 
@@ -377,7 +363,7 @@ class TrajectoryOutput:
     def _give_up(self, why: str) -> None:
         assert self._sent is not None
         self._server.cancel(self._sent)
-        self._end(TrajectoryEnd(why, final=True))
+        self._end(why)
 
     def on_phase_change(self, phase: Phase) -> None:
         """Cancel the schedule if the planner has abandoned it."""
@@ -398,33 +384,30 @@ class TrajectoryOutput:
             return
         if self._replaced is not None:
             self._server.cancel(self._replaced)
-        self._end(
-            TrajectoryEnd(f"the action '{self._name}' has rejected the trajectory", final=True)
-        )
+        self._end(f"the action '{self._name}' has rejected the trajectory")
 
     def ended(self, number: int, outcome: Outcome, code: int, text: str) -> None:
         """End a schedule with the result of the server: ``error_code`` and ``error_string``."""
         if number == self._sent:
-            self._end(_motion_end(outcome, code, text))
+            self._end(*_motion_end(outcome, code, text))
 
-    def _end(self, end: TrajectoryEnd) -> None:
+    def _end(self, why: str, final: bool = True) -> None:
         self._sent = self._replaced = None
-        self._on_end(end)
+        self._on_end(why, final)
 
 
-def _motion_end(outcome: Outcome, code: int, text: str) -> TrajectoryEnd:
+def _motion_end(outcome: Outcome, code: int, text: str) -> tuple[str, bool]:
     if outcome is Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
-        return TrajectoryEnd()
+        return "", False
     text = printable(text).rstrip(".")
     told = f": {text}" if text else ""
     if outcome is Outcome.CANCELED:
-        return TrajectoryEnd(f"another client has replaced or cancelled the trajectory{told}", True)
+        return f"another client has replaced or cancelled the trajectory{told}", True
     if code == ErrorCode.SUCCESSFUL:
-        return TrajectoryEnd(f"the trajectory was aborted without an error code{told}", final=True)
+        return f"the trajectory was aborted without an error code{told}", True
     try:
         name = ErrorCode(code).name
     except ValueError:
         name = f"error code {code}"
-    clause = f"the trajectory ended early with {name}{told}"
     violated = code in (ErrorCode.PATH_TOLERANCE_VIOLATED, ErrorCode.GOAL_TOLERANCE_VIOLATED)
-    return TrajectoryEnd(clause, final=not violated)
+    return f"the trajectory ended early with {name}{told}", not violated

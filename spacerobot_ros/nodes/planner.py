@@ -25,7 +25,6 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import (
     Outcome,
     PlannerCommander,
-    TrajectoryEnd,
     TrajectoryOutput,
 )
 from spacerobot_ros.errors import ParameterError, PlanningError
@@ -230,7 +229,7 @@ class _TrajectoryClients:
         self._kind, self._node = kind, node
         self._clients: dict[str, ActionClient] = {}
 
-    def connect(self, name: str, on_end: Callable[[TrajectoryEnd], None]) -> TrajectoryOutput:
+    def connect(self, name: str, on_end: Callable[[str, bool], None]) -> TrajectoryOutput:
         """Return an output to an action server; the output calls `on_end` when a schedule ends."""
         if name not in self._clients:
             self._clients[name] = ActionClient(self._node, self._kind, name)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.commanding.commander import Commander
-from spacerobot_ros.commanding.fly_to import FlyToResult, Progress
+from spacerobot_ros.commanding.fly_to import GoalErrors, Progress
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.host import ArrayDecoder, StateArrays
 from spacerobot_ros.commanding.plant_state import Stamped
@@ -148,18 +148,18 @@ class Client:
 
     def __init__(self) -> None:
         self.told: list[Progress] = []
-        self.results: list[FlyToResult] = []
+        self.results: list[tuple[Status, GoalErrors]] = []
 
     def feedback(self, progress: Progress) -> None:
         self.told.append(progress)
 
-    def end(self, result: FlyToResult) -> None:
-        self.results.append(result)
+    def end(self, status: Status, errors: GoalErrors) -> None:
+        self.results.append((status, errors))
 
     @property
     def end_of(self) -> tuple[str, str]:
-        (result,) = self.results
-        return result.outcome, result.message
+        ((status, _),) = self.results
+        return status.state.value, status.message
 
 
 METHOD = {

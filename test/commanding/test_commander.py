@@ -324,8 +324,7 @@ def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     assert decided == [("aborted", "a")]
     ended = [each.goal_id for each in planner.host.events if each.kind is EventKind.GOAL_ABORTED]
     assert ended == ["a"]
-    (result,) = first.results
-    assert result.outcome == "aborted"
+    assert first.end_of[0] == "aborted"
     assert not second.results
 
 
@@ -344,9 +343,9 @@ def test_goals_that_are_pursued_together_are_aborted_together(arm: SpaceRobot) -
     decided = [(each.state.value, each.goal_id) for each in rig.host.statuses]
     assert ("aborted", "a") in decided
     assert ("aborted", "8.000000000") in decided
-    (result,) = client.results
-    assert result.outcome == "aborted"
-    assert "replaced" not in result.message
+    outcome, message = client.end_of
+    assert outcome == "aborted"
+    assert "replaced" not in message
 
 
 def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(

@@ -192,8 +192,8 @@ def test_the_status_that_decides_a_goal_is_its_result(state: str) -> None:
     rig.goals.update(status("executing", "b"))
     rig.goals.update(status(state, "b", "It is over.", position_error_m=0.02))
     assert second.end_of == (state, "It is over.")
-    assert second.results[0].errors.position == 0.02
-    assert second.results[0].errors.attitude == 0.5
+    assert second.results[0][1].position == 0.02
+    assert second.results[0][1].attitude == 0.5
     rig.goals.update(status(state, "b", "Once more."))
     assert len(second.results) == 1
     assert not first.results
@@ -209,7 +209,7 @@ def test_a_goal_that_is_refused_at_once_has_no_errors() -> None:
     rig.advance(5)
     rig.goals.update(status("refused", "a", "It is in frame 'moon'."))
     assert client.end_of == ("refused", "It is in frame 'moon'.")
-    assert math.isnan(client.results[0].errors.position)
+    assert math.isnan(client.results[0][1].position)
     assert client.told == []
 
 

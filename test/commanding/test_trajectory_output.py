@@ -7,11 +7,7 @@ from typing import Any
 import pytest
 from commanding.commanders import TrajectoryServer
 
-from spacerobot_ros.commanding.planner import (
-    Outcome,
-    TrajectoryEnd,
-    TrajectoryOutput,
-)
+from spacerobot_ros.commanding.planner import Outcome, TrajectoryOutput
 from spacerobot_ros.planning.execution.status import Phase
 from spacerobot_ros.times import SECOND
 
@@ -23,8 +19,10 @@ class Sent:
     """An output with its server and the ends that it has told."""
 
     def __init__(self) -> None:
-        self.server, self.ends = TrajectoryServer(), list[TrajectoryEnd]()
-        self.output = TrajectoryOutput(self.server, "/arm/follow", self.ends.append)
+        self.server, self.ends = TrajectoryServer(), list[tuple[str, bool]]()
+        self.output = TrajectoryOutput(
+            self.server, "/arm/follow", lambda why, final: self.ends.append((why, final))
+        )
 
     def start(self, schedule: Any = "schedule", *, accepted: bool = True) -> int:
         self.output.start(schedule)
@@ -40,7 +38,7 @@ def test_a_schedule_is_sent_and_ends_with_its_result() -> None:
     assert sent.server.sent == [(number, "first")]
     sent.output.on_phase_change(Phase.EXECUTING)
     sent.output.ended(number, Outcome.SUCCEEDED, 0, "")
-    assert sent.ends == [TrajectoryEnd()]
+    assert sent.ends == [("", False)]
     # Each schedule ends once, and nothing that has ended is cancelled.
     sent.output.ended(number, Outcome.ABORTED, -4, "")
     sent.output.rejected(number)
@@ -73,7 +71,7 @@ def test_results_are_corrected_or_final(
 ) -> None:
     sent = Sent()
     sent.output.ended(sent.start(), outcome, code, text)
-    assert sent.ends == [TrajectoryEnd(message, final)]
+    assert sent.ends == [(message, final)]
 
 
 def test_what_is_left_is_cancelled_and_its_result_does_not_count() -> None:
@@ -104,9 +102,7 @@ def test_a_schedule_replaces_another() -> None:
     sent.output.rejected(third)
     # The robot must not follow the second one on.
     assert sent.server.cancelled == [second]
-    assert sent.ends == [
-        TrajectoryEnd("the action '/arm/follow' has rejected the trajectory", True)
-    ]
+    assert sent.ends == [("the action '/arm/follow' has rejected the trajectory", True)]
 
 
 def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
@@ -115,14 +111,14 @@ def test_a_server_that_is_not_there_or_does_not_answer_ends_the_goal() -> None:
     lost: Any = "lost"
     sent.output.start(lost)
     assert sent.server.sent == []
-    assert sent.ends.pop() == TrajectoryEnd("the action '/arm/follow' has no server", True)
+    assert sent.ends.pop() == ("the action '/arm/follow' has no server", True)
     sent.server.present = True
     number = sent.start(accepted=False)
     for second in range(6):
         assert not sent.ends
         sent.output.check_server(FIRST + second * SECOND)
     sent.output.check_server(FIRST + 5 * SECOND + 1)
-    assert sent.ends == [TrajectoryEnd("the action '/arm/follow' has not responded", True)]
+    assert sent.ends == [("the action '/arm/follow' has not responded", True)]
     assert sent.server.cancelled == [number]
     # One that was accepted may take any time; a schedule that is left ends nothing.
     later = sent.start()
@@ -158,7 +154,7 @@ def test_a_server_that_goes_ends_the_goal_within_a_second() -> None:
     sent.output.check_server(FIRST + SECOND - 1)
     assert sent.ends == []
     sent.output.check_server(FIRST + SECOND)
-    wanted = TrajectoryEnd("the server of the action '/arm/follow' is gone", True)
+    wanted = ("the server of the action '/arm/follow' is gone", True)
     assert sent.ends == [wanted]
     # It may still drive the joints, and only this planner not see it.
     assert sent.server.cancelled == [number]
@@ -169,5 +165,5 @@ def test_a_server_that_goes_ends_the_goal_within_a_second() -> None:
 def test_texts_of_the_server_are_one_line_without_control_characters() -> None:
     sent = Sent()
     sent.output.ended(sent.start(), Outcome.ABORTED, -6, "stop\n\x1b[31mred")
-    (end,) = sent.ends
-    assert end.message == "the trajectory ended early with error code -6: stop \ufffd[31mred"
+    ((why, _),) = sent.ends
+    assert why == "the trajectory ended early with error code -6: stop \ufffd[31mred"

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from support.ros_harness import nanoseconds
 from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.commanding.fly_to import FlyToResult, GoalErrors, Progress
+from spacerobot_ros.commanding.fly_to import GoalErrors, Progress
 from spacerobot_ros.errors import PlanningError, SpaceRobotError
 from spacerobot_ros.messages.builders import (
     MARKER_ARRAY,
@@ -42,6 +42,7 @@ from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.nodes.common.fly_to import GoalClient, NavigateToPoseAction
 from spacerobot_ros.nodes.common.messages import goal_of, interface_class, message_class, shape_of
 from spacerobot_ros.planning import BasePath, Goal
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
@@ -464,10 +465,14 @@ def test_what_is_not_known_is_zero() -> None:
     assert message.current_pose is None
 
 
+def final(outcome: str, message: str) -> PlannerStatus:
+    return PlannerStatus(PlannerState(outcome), message)
+
+
 def test_the_result_of_a_goal_of_nav2() -> None:
-    reached = ACTION.result(FlyToResult("reached", "There.", GoalErrors()))
+    reached = ACTION.result(final("reached", "There."), GoalErrors())
     assert (reached.error_code, reached.error_msg) == (0, "")
-    failed = ACTION.result(FlyToResult("failed", "Not there.", GoalErrors()))
+    failed = ACTION.result(final("failed", "Not there."), GoalErrors())
     assert failed.error_code > 0
     assert failed.error_msg == "Not there."
 
@@ -501,7 +506,7 @@ def test_the_final_state_of_a_goal_follows_its_outcome(
     """`canceled` is for goals whose client asked for it, as ROS 2's design of actions has it."""
     handle: Any = Handle(canceling)
     server: Any = Handle(canceling)
-    GoalClient(server, handle, ACTION, "map").end(FlyToResult(outcome, "So.", GoalErrors()))
+    GoalClient(server, handle, ACTION, "map").end(final(outcome, "So."), GoalErrors())
     assert handle.done == [(state,)]
     ((_, told_handle, result),) = server.done
     assert told_handle is handle

@@ -17,7 +17,8 @@ from rclpy.action.server import ServerGoalHandle
 from rclpy.clock import Clock, ClockType
 from rclpy.serialization import deserialize_message
 
-from spacerobot_ros.commanding.fly_to import FlyTo, FlyToResult, GoalErrors, Progress
+from spacerobot_ros.commanding.fly_to import FlyTo, GoalErrors, Progress
+from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.messages.builders import goal_message
 from spacerobot_ros.nodes.common.messages import (
@@ -109,10 +110,10 @@ class FlyToAction:
         _set_errors(message.errors, progress.errors)
         return message
 
-    def result(self, result: FlyToResult) -> Any:
+    def result(self, status: Status, errors: GoalErrors) -> Any:
         """Return a result as a message."""
-        message = self.kind.Result(outcome=result.outcome, message=result.message)
-        _set_errors(message.errors, result.errors)
+        message = self.kind.Result(outcome=status.state.value, message=status.message)
+        _set_errors(message.errors, errors)
         return message
 
 
@@ -150,13 +151,13 @@ class NavigateToPoseAction:
         message.distance_remaining = 0.0 if math.isnan(distance) else distance
         return message
 
-    def result(self, result: FlyToResult) -> Any:
+    def result(self, status: Status, errors: GoalErrors) -> Any:
         """Return a result as a message; in ROS 2 Humble, the message is empty."""
-        message = self.kind.Result()
+        message, reached = self.kind.Result(), status.state.value == "reached"
         if hasattr(message, "error_code"):
-            message.error_code = 0 if result.outcome == "reached" else _NAV2_FAILURE
+            message.error_code = 0 if reached else _NAV2_FAILURE
         if hasattr(message, "error_msg"):
-            message.error_msg = "" if result.outcome == "reached" else result.message
+            message.error_msg = "" if reached else status.message
         return message
 
 
@@ -190,16 +191,16 @@ class GoalClient:
         """Publish the progress of the goal."""
         self._handle.publish_feedback(self._action.feedback(progress, self._world_frame))
 
-    def end(self, result: FlyToResult) -> None:
+    def end(self, status: Status, errors: GoalErrors) -> None:
         """Send the result with the matching ROS 2 goal state."""
         handle = self._handle
-        if result.outcome == "reached":
+        if status.state.value == "reached":
             handle.succeed()
         elif handle.is_cancel_requested:
             handle.canceled()
         else:
             handle.abort()
-        self._server.end(handle, self._action.result(result))
+        self._server.end(handle, self._action.result(status, errors))
 
 
 class GoalActions:
