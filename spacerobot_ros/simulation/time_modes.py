@@ -1,8 +1,7 @@
-"""Time modes of a plant: driven by its commanders (lockstep) or by the wall clock."""
+"""The wall clock as the time of a plant."""
 
 from __future__ import annotations
 
-from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.times import SECOND
 
 _MAX_LATE_TICKS = 10
@@ -10,32 +9,6 @@ _MAX_LATE_TICKS = 10
 
 _MAX_TICKS_AT_ONCE = 2
 """Largest number of ticks that a late plant takes before it reads commands again."""
-
-
-class Lockstep:
-    """Steps as soon as all commands for a tick have arrived.
-
-    Parameters
-    ----------
-    commands
-        The plant's command validator.
-    """
-
-    def __init__(self, commands: CommandValidator) -> None:
-        self._commands = commands
-        self._looked_at = -1
-        self.waits = False
-        """Whether the plant was waiting in the same tick at the last two checks."""
-
-    def must_step_at_check(self, tick: int, *, pose_lost: bool) -> bool:
-        """Return whether a plant must step; called at periodic checks.
-
-        A state without a pose may receive no command: the commander only learns from the next state
-        that the pose is missing. The plant therefore steps without a command if it was already
-        waiting in the same tick at the previous check.
-        """
-        self.waits, self._looked_at = self._looked_at == tick, tick
-        return (self.waits and pose_lost) or self._commands.complete
 
 
 class RealTime:

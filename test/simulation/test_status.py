@@ -16,7 +16,7 @@ from spacerobot_ros.simulation.actuators import PLANTS, build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
-from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
+from spacerobot_ros.simulation.time_modes import RealTime
 
 SECOND = 10**9
 SLIDERS = SpaceRobot.from_file(robot_file("sliding_masses"))
@@ -208,25 +208,10 @@ def test_a_status_is_ok_only_without_faults_timeouts_and_latches(
     assert PlantStatus.from_values(status.to_values()).level == status.level
 
 
-# -- who drives the time: looks of a plant in lockstep, and the bookkeeping of one in ------------
+# -- the bookkeeping of a plant in real time ----------------------------------------------------
 
 
 MS = 1_000_000
-
-
-def test_a_plant_without_a_pose_steps_at_its_second_look_in_a_tick() -> None:
-    config = PlantConfig(time_mode="lockstep")
-    plant = build_plant(SpaceRobot.from_file(robot_file("sliding_masses")), config)
-    commands = CommandValidator(plant, config)
-    for first in (0, 1, 2):
-        assert not Lockstep(commands).must_step_at_check(first, pose_lost=True), "its first look"
-    time = Lockstep(commands)
-    assert [time.must_step_at_check(3, pose_lost=True), time.waits] == [False, False]
-    assert [time.must_step_at_check(3, pose_lost=False), time.waits] == [False, True]
-    assert [time.must_step_at_check(3, pose_lost=True), time.waits] == [True, True]
-    assert [time.must_step_at_check(4, pose_lost=True), time.waits] == [False, False]
-    commands.sources[0].arrived = True
-    assert time.must_step_at_check(5, pose_lost=False)
 
 
 def test_ticks_are_due_by_the_clock_two_at_a_time_and_ten_at_most() -> None:

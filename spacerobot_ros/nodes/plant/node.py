@@ -51,7 +51,7 @@ from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus, latched_text
-from spacerobot_ros.simulation.time_modes import Lockstep, RealTime
+from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS
 
@@ -158,11 +158,9 @@ class PlantNode(FlightNode):
             payload = Payload.from_text(last.payload) if last.payload else None
             plant = _resumed_plant(robot, decided, last.initial, last.target, payload)
         self._use_plant(plant, decided)
-        self._lockstep: Lockstep | None = None
         self._real_time: RealTime | None = None
-        if config.time_mode == "lockstep":
-            self._lockstep = Lockstep(self.commands)
-        else:
+        """The wall clock; None in lockstep."""
+        if config.time_mode == "realtime":
             self._real_time = RealTime(self._period_ns, config.real_time_factor)
         self._monitor = PlantMonitor(
             self.commands, self.plant, config if self._undecided else decided
@@ -219,6 +217,8 @@ class PlantNode(FlightNode):
         }
         self._capturing = plant.capturing
         self._injected_seen = plant.injected
+        self._looked_at = -1
+        """Tick of the last check for subscribers."""
 
     def _decide_actuation(self, topic: str, raw: bytes) -> None:
         """Use the actuation of a command that moves anything as the plant's actuation."""
@@ -238,8 +238,6 @@ class PlantNode(FlightNode):
             self._use_plant(self._plant_now(robot, config), config)
             self.plant.succeed(before)
             self.commands.succeed(commands)
-            if self._lockstep is not None:
-                self._lockstep = Lockstep(self.commands)
             self._publisher.observe(self.reported)
             self._report.observe_plant()
             self._count_commanders()
@@ -402,7 +400,7 @@ class PlantNode(FlightNode):
             self._publish_changed_status()
         self.tick += 1
         self._publish()
-        if self._lockstep is not None and self.tick % _MAX_UNCONFIRMED_TICKS == 0:
+        if self._real_time is None and self.tick % _MAX_UNCONFIRMED_TICKS == 0:
             self._publisher.await_readers()
         if self.plant.injected is not self._injected_seen:
             self._publish_changed_status()
@@ -465,16 +463,20 @@ class PlantNode(FlightNode):
             self._step()
 
     def _on_subscriber_check(self) -> None:
-        """Publish the last state again to new subscribers, whose command a lockstep plant needs."""
+        """Publish the last state again to new subscribers, whose command a lockstep plant needs.
+
+        A state without a pose may receive no command: the commander only learns from the next state
+        that the pose is missing. The plant steps without one if it waits since the last check.
+        """
         if self._active is not PlantState.RUNNING:
             if self._report_ticks:
                 self._report_on_wall_clock()
             return  # A new subscriber receives the state after the pause.
         self._check_for_commanders()
-        assert self._lockstep is not None
-        if self._lockstep.must_step_at_check(self.tick, pose_lost=self.reported.sensors.dropout):
+        waits, self._looked_at = self._looked_at == self.tick, self.tick
+        if (waits and self.reported.sensors.dropout) or self.commands.complete:
             self._step()
-        elif self._lockstep.waits and self._publisher.has_new_readers():
+        elif waits and self._publisher.has_new_readers():
             self._publisher.publish(self.time_ns, all_topics=True)
 
     def _on_commander_check(self) -> None:
