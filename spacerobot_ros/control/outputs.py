@@ -31,6 +31,7 @@ from spacerobot_ros.control.state import (
 )
 from spacerobot_ros.errors import AT_JOINTS, ParameterError, quantity
 from spacerobot_ros.model.description import Array, RobotDescription, plane_normal
+from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.model.kinematics import link_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
@@ -307,6 +308,14 @@ class OutputVector:
             parts += _joint_parts(reference.joints)
         np.concatenate(parts, out=memory)
         require_finite("reference", memory)
+
+    def mobility(self, H: ca.SX) -> ca.SX:
+        """Return the accelerations (m, m) due to unit forces on each output; ``H`` is the inertia
+        matrix."""
+        # The translation of the centre of mass decouples (eq. 15).
+        linear = self.J_z[:, :3].T / self.model.total_mass
+        other = solve_positive_definite(H[3:, 3:], self.J_z[:, 3:].T)
+        return self.J_z @ ca.vertcat(linear, other)
 
     def without_force(self, Q: ca.SX) -> ca.SX:
         """Return generalised forces or velocities (N,); those of the centre of mass are zero if no

@@ -347,13 +347,7 @@ class ControlLaw(ABC):
         z1 = self.outputs
         if not self._weighs:
             return ca.SX(z1.m, 1)
-        H = z1.model("inertia_matrix", z1.q)
-        # The translation of the centre of mass decouples (eq. 15).
-        moved = ca.vertcat(
-            z1.J_z[:, :3].T / z1.model.total_mass,
-            solve_positive_definite(H[3:, 3:], z1.J_z[:, 3:].T),
-        )
-        mobility = z1.J_z @ moved
+        mobility = z1.mobility(z1.model("inertia_matrix", z1.q))
         mobility = mobility + _SINGULAR_DAMPING * ca.diag(ca.diag(mobility))
         self._fills_gains = True
         Kd = self._damping_rate

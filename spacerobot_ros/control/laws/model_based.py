@@ -101,18 +101,13 @@ class ModelBasedLaw(ControlLaw):
         z1 = self.outputs
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)
-        # The translation of the centre of mass decouples (eq. 15).
-        mobility = ca.vertcat(
-            z1.J_z[:, :3].T / z1.model.total_mass,
-            solve_positive_definite(H[3:, 3:], z1.J_z[:, 3:].T),
-        )
         stiffness, damping = ca.vertsplit(symbols["null_space"])
         pull = ca.vertcat(ca.SX(6, 1), stiffness * (symbols["posture"] - z1.q))
         xi = pull - damping * z1.z0dot + symbols["singular_damping"]
         a = z1.acceleration + symbols["kd"] * z1.error_rate + symbols["kp"] * z1.error
         a += symbols["integral"]
         acceleration = a - z1.bias_acceleration - z1.J_z @ xi
-        mobility = z1.J_z @ mobility
+        mobility = z1.mobility(H)
         J_actuators = z1.J_z @ z1.J_q_inverse
         other = z1.J_q_inverse.T @ z1.without_force(H @ xi + C)
         force = solve_positive_definite(mobility, acceleration)
