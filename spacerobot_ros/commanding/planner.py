@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from enum import Enum, IntEnum
+from enum import IntEnum
 from typing import Any, Protocol
 
 from spacerobot_ros.commanding.commander import Commander
@@ -280,12 +280,12 @@ class ErrorCode(IntEnum):
     GOAL_TOLERANCE_VIOLATED = -5
 
 
-class Outcome(Enum):
-    """Final state of an action goal."""
+class Outcome(IntEnum):
+    """Final state of an action goal: ``status`` in action_msgs/GoalStatus."""
 
-    SUCCEEDED = "succeeded"
-    ABORTED = "aborted"
-    CANCELED = "canceled"
+    SUCCEEDED = 4
+    CANCELED = 5
+    ABORTED = 6
 
 
 class TrajectoryServer(Protocol):
@@ -386,8 +386,9 @@ class TrajectoryOutput:
             self._server.cancel(self._replaced)
         self._end(f"the action '{self._name}' has rejected the trajectory")
 
-    def ended(self, number: int, outcome: Outcome, code: int, text: str) -> None:
-        """End a schedule with the result of the server: ``error_code`` and ``error_string``."""
+    def ended(self, number: int, outcome: int, code: int, text: str) -> None:
+        """End a schedule with the result of the server: its :class:`Outcome`, ``error_code`` and
+        ``error_string``."""
         if number == self._sent:
             self._end(*_motion_end(outcome, code, text))
 
@@ -396,12 +397,12 @@ class TrajectoryOutput:
         self._on_end(why, final)
 
 
-def _motion_end(outcome: Outcome, code: int, text: str) -> tuple[str, bool]:
-    if outcome is Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
+def _motion_end(outcome: int, code: int, text: str) -> tuple[str, bool]:
+    if outcome == Outcome.SUCCEEDED and code == ErrorCode.SUCCESSFUL:
         return "", False
     text = printable(text).rstrip(".")
     told = f": {text}" if text else ""
-    if outcome is Outcome.CANCELED:
+    if outcome == Outcome.CANCELED:
         return f"another client has replaced or cancelled the trajectory{told}", True
     if code == ErrorCode.SUCCESSFUL:
         return f"the trajectory was aborted without an error code{told}", True

@@ -11,7 +11,6 @@ from threading import Thread
 from typing import Any, ClassVar
 
 import numpy as np
-from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Path
 from rclpy.action import ActionClient
@@ -23,7 +22,6 @@ from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.planner import (
-    Outcome,
     PlannerCommander,
     TrajectoryOutput,
 )
@@ -206,13 +204,6 @@ class PlannerNode(CommanderNode):
         self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, robot, frame))
 
 
-_OUTCOMES = {
-    GoalStatus.STATUS_SUCCEEDED: Outcome.SUCCEEDED,
-    GoalStatus.STATUS_ABORTED: Outcome.ABORTED,
-    GoalStatus.STATUS_CANCELED: Outcome.CANCELED,
-}
-
-
 class _TrajectoryClients:
     """The FollowJointTrajectory clients of a planner node, which exist as long as the node: after a
     cleanup, an executor might still hold a response for one of them.
@@ -286,9 +277,8 @@ class _Connection:
 
     def _on_result(self, number: int, response: Any) -> None:
         self._handles.pop(number, None)
-        outcome = _OUTCOMES.get(response.status, Outcome.ABORTED)
         result = response.result
-        self.output.ended(number, outcome, result.error_code, result.error_string)
+        self.output.ended(number, response.status, result.error_code, result.error_string)
 
 
 def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
