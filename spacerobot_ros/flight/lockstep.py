@@ -510,9 +510,7 @@ class LockstepFlight:
         """Track the status like a mission client."""
         self.log.statuses.append((self._now_ns, status))
         name = "planner" if isinstance(status, PlannerStatus) else "coordinated_control"
-        self._statuses[name] = StatusRecord(
-            f"/{name}", status.state.level, status.message, status.to_values()
-        )
+        self._statuses[name] = StatusRecord.of(f"/{name}", status, status.state.level)
         if isinstance(status, PlannerStatus) is not self.has_planner:
             return
         if self._decided is not None:

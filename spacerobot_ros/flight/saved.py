@@ -215,9 +215,8 @@ def _clearance_streams(flight: FlightData) -> Iterator[_Stream]:
         return
     plant = flight.scenario.plant
     statuses = flight.clearance.statuses(max(1, plant.ticks_of(plant.clearance_period)))
-    yield _status_stream(
-        "clearance", [(round(each.time_s * SECOND), _record("/plant", each)) for each in statuses]
-    )
+    records = [(round(x.time_s * SECOND), StatusRecord.of("/plant", x)) for x in statuses]
+    yield _status_stream("clearance", records)
 
 
 def _frame_streams(flight: FlightData) -> Iterator[_Stream]:
@@ -347,12 +346,12 @@ def _plan_streams(flight: FlightData) -> Iterator[_Stream]:
 
 
 def _status_streams(flight: FlightData) -> Iterator[_Stream]:
-    of_plant = [(time, _record("/plant", each)) for time, each in flight.plant_statuses]
+    of_plant = [(time, StatusRecord.of("/plant", each)) for time, each in flight.plant_statuses]
     yield _status_stream("plant/status", of_plant)
     for node, (name, _) in STATUS_TOPICS.items():
         kind = PlannerStatus if node == "planner" else ControllerStatus
         sent = [each for each in flight.statuses if isinstance(each[1], kind)]
-        records = [(time, _record(f"/{node}", each, each.state.level)) for time, each in sent]
+        records = [(at, StatusRecord.of(f"/{node}", x, x.state.level)) for at, x in sent]
         yield _status_stream(name, records)
     events = []
     for each in flight.events:
@@ -366,11 +365,6 @@ def _status_streams(flight: FlightData) -> Iterator[_Stream]:
 
 def _status_stream(topic: str, records: Iterable[tuple[int, StatusRecord]]) -> _Stream:
     return _Stream.of(TOPICS[topic], ((time, each.encoded()) for time, each in records))
-
-
-def _record(node: str, status: Any, level: int | None = None) -> StatusRecord:
-    given = status.level if level is None else level
-    return StatusRecord(node, given, status.message, status.to_values())
 
 
 _MEASURED_STATE_TOPICS = ("odom", "joint_states")

@@ -36,6 +36,13 @@ class StatusRecord:
     values: Mapping[str, str] = field(default_factory=dict)
     hardware_id: str = ""
 
+    @classmethod
+    def of(cls, node: str, status: Any, level: int | None = None) -> StatusRecord:
+        """Return the content for the status of a node; the level is that of the status by
+        default."""
+        given = status.level if level is None else level
+        return cls(node, given, status.message, status.to_values())
+
     @property
     def fields(self) -> dict[str, Any]:
         """Message fields by name."""

@@ -196,8 +196,8 @@ class CommanderNode(FlightNode):
 
     def publish_status(self, status: Status) -> None:
         """Publish a goal status."""
-        name, level = self.get_fully_qualified_name(), status.state.level
-        self._last_status = StatusRecord(name, level, status.message, status.to_values())
+        name = self.get_fully_qualified_name()
+        self._last_status = StatusRecord.of(name, status, status.state.level)
         self._status_topic.publish(self._last_status.encoded())
 
     def log(self, level: LogLevel, message: str) -> None:

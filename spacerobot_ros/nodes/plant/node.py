@@ -361,8 +361,7 @@ class PlantNode(FlightNode):
 
     def _publish_status(self, status: PlantStatus) -> None:
         self.status = status
-        name = self.get_fully_qualified_name()
-        record = StatusRecord(name, status.level, status.message, status.to_values())
+        record = StatusRecord.of(self.get_fully_qualified_name(), status)
         self._status.publish(record.encoded())
 
     def _last_state(self, robot: SpaceRobot) -> LastState | None:

@@ -310,8 +310,7 @@ class ClearancePublisher:
             plant.link_R, plant.link_r, plant.pose, time_ns / SECOND
         )
         if publishes:
-            name = node.get_fully_qualified_name()
-            record = StatusRecord(name, status.level, status.message, status.to_values())
+            record = StatusRecord.of(node.get_fully_qualified_name(), status)
             self._stream.publish(record.encoded())
         for event in events:
             node.report_event(event)
