@@ -207,7 +207,7 @@ class ControllerCommander(Commander):
         self.states.require(topic, required=False)
         self._references[topic] = _ReferenceWait(silent=True)
         if followed:
-            self.executive.reference_ended(Reference())
+            self.executive.references_ended()
         self.host.log("warning", f"'{topic}' is silent: the controller continues without it.")
 
     def _publish_status(self, status: Status) -> None:

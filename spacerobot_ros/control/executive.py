@@ -296,10 +296,10 @@ class ControlExecutive:
         }
         self._pending = {**self._goals, **self._pending}
 
-    def reference_ended(self, remaining: Reference) -> None:
-        """Continue with the remaining references: restart the goal or, without a goal, hold the
+    def references_ended(self) -> None:
+        """Continue without external references: restart the goal or, without a goal, hold the
         measured pose."""
-        self.controller.follow(remaining)
+        self.controller.follow(Reference())
         self._begin_anew_or_hold()
 
     def plant_reset(self) -> None:

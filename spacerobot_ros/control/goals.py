@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -420,22 +420,16 @@ def decided_message(
 # -- planned references ----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class PlannedGoals:
-    """Pending goals, their poses and joints, and the job that plans their reference."""
-
-    pending: Mapping[str, IdentifiedGoal]
-    aims: Aims
-    job: PlanningJob[PlannedReference]
-
-
 class GoalPlanning:
     """Plans references for pending goals, one at a time."""
 
     def __init__(self) -> None:
         self.time = 0.0
         """Total wall time spent planning references, s."""
-        self._plan: PlannedGoals | None = None
+        self._pending: Mapping[str, IdentifiedGoal] | None = None
+        """Goals whose reference is being planned; None: there are none."""
+        self._aims = Aims()
+        """Poses and joints of these goals."""
         self._job: PlanningJob[PlannedReference] | None = None
         """The last job, which may still be running although cancelled."""
         self._lead = PLANNING_TIME
@@ -443,13 +437,14 @@ class GoalPlanning:
     @property
     def active(self) -> bool:
         """Whether a reference is being planned."""
-        return self._plan is not None
+        return self._pending is not None
 
     def is_for(self, pending: Mapping[str, IdentifiedGoal]) -> bool:
         """Whether a reference for these goals is being planned."""
-        if self._plan is None or self._plan.pending.keys() != pending.keys():
+        present = self._pending
+        if present is None or present.keys() != pending.keys():
             return False
-        return all(goal is pending[part] for part, goal in self._plan.pending.items())
+        return all(goal is pending[part] for part, goal in present.items())
 
     def planned(
         self,
@@ -470,12 +465,12 @@ class GoalPlanning:
         assert planner is not None
         if not self.is_for(pending):
             self.cancel()
-            if self._plan is None:
+            if self._pending is None:
                 self._lead = PLANNING_TIME
             self._begin(time, state, controller, pending, aims_of(controller, pending, state))
-        plan = self._plan
-        assert plan is not None
-        job, waits = plan.job, planner.in_background and plan.job.begins > time
+        job = self._job
+        assert job is not None
+        waits = planner.in_background and job.begins > time
         if not job.done:
             return None
         try:
@@ -486,13 +481,13 @@ class GoalPlanning:
         finally:
             if not waits:
                 self.time += job.wall_time
-                self._plan = None
+                self._pending = None
         if waits:
             return None
         if planner.in_background and -math.inf < job.begins < time:
             # The reference has moved on: plan from its state after twice the time.
             self._lead *= 2
-            self._begin(time, state, controller, pending, plan.aims)
+            self._begin(time, state, controller, pending, self._aims)
             return None
         return job
 
@@ -516,22 +511,22 @@ class GoalPlanning:
 
         last, self._job = self._job, PlanningJob(work, begins)
         # Set before the work begins, so that it can be cancelled.
-        self._plan = PlannedGoals(dict(pending), aims, self._job)
+        self._pending, self._aims = dict(pending), aims
         self._job.start(in_background=planner.in_background, after=last)
 
     def cancel(self) -> None:
         """Cancel the job; any thread may call this."""
-        plan = self._plan
-        if plan is not None:
-            plan.job.cancel()
+        job = self._job
+        if self._pending is not None and job is not None:
+            job.cancel()
 
     def drop(self) -> None:
         """Cancel the job and discard its result."""
         self.cancel()
-        self._plan = None
+        self._pending = None
 
     def close(self) -> None:
         """Cancel the job and wait for its thread to end."""
-        self._plan = None
+        self._pending = None
         if self._job is not None:
             self._job.close()

@@ -255,7 +255,9 @@ class CommandValidator:
                 # A stamp of zero means the current state, at the start the first state.
                 stamp_ns, unset = now_ns, True
             elif stamp_ns % self._period:
-                stamp_ns = self._round_to_tick(stamp_ns)
+                # The stamp of the nearest tick, if the difference is rounding only.
+                tick = (stamp_ns + self._period // 2) // self._period * self._period
+                stamp_ns = tick if abs(stamp_ns - tick) <= _STAMP_ROUNDING else stamp_ns
             refusal = self._refusal_of_stamp(source, stamp_ns, now_ns) or self._refusal_of_values(
                 source, values
             )
@@ -370,11 +372,6 @@ class CommandValidator:
             limits = f"{values.tolist()} exceeds the limits {source.limits.tolist()}"
             return Refusal(Reason.BEYOND_LIMITS, limits)
         return None
-
-    def _round_to_tick(self, stamp_ns: int) -> int:
-        """Return the stamp of the nearest tick, if the difference is rounding only."""
-        tick = (stamp_ns + self._period // 2) // self._period * self._period
-        return tick if abs(stamp_ns - tick) <= _STAMP_ROUNDING else stamp_ns
 
     def _refusal_of_stamp(
         self, source: CommandSource, stamp_ns: int, now_ns: int
