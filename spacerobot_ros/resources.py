@@ -69,8 +69,8 @@ def robot_file(name: str) -> Path:
             return path
         known = resource_names("urdf", ".urdf")
         raise ParameterError(
-            f"There is no robot '{name}': there is no URDF file or robot with that name (known: "
-            f"{', '.join(known)}).{suggestion(name, known)}"
+            f"There is no robot '{name}'.{suggestion(name, known)} "
+            f"There are: {', '.join(known)}, or any URDF file."
         )
     if Path(name).is_file():
         return Path(name)

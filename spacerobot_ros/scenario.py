@@ -280,8 +280,8 @@ class Scenario:
         if method not in (*LAWS, *METHODS):
             known = [*METHODS, *LAWS]
             raise ParameterError(
-                f"There is no gait method or control law '{method}'; there are: "
-                f"{', '.join(known)}.{suggestion(method, known)}"
+                f"There is no gait method or control law '{method}'.{suggestion(method, known)} "
+                f"There are: {', '.join(known)}."
             )
         kind, node, parameter = "gait method", "planner", "method"
         if method in LAWS:
@@ -498,8 +498,8 @@ def load_scenario(name: str) -> Scenario:
     if not path.is_file():
         known, robots = scenario_names(), resource_names("urdf", ".urdf")
         raise ParameterError(
-            f"There is no scenario '{name}'; there are: {', '.join(known)}, or any YAML file."
-            f"{suggestion(name, [*known, *robots])}"
+            f"There is no scenario '{name}'.{suggestion(name, [*known, *robots])} "
+            f"There are: {', '.join(known)}, or any YAML file."
         )
     in_file, values = read_scenario(path)
     commanders = tuple(name for name in COMMANDERS if name in in_file) or COMMANDERS[:1]

@@ -242,7 +242,7 @@ def test_two_plugins_of_one_name_are_refused_with_their_files(tmp_path: Path) ->
 
 @pytest.mark.usefixtures("plugins")
 def test_a_name_that_is_none_is_answered_with_those_there_are() -> None:
-    with pytest.raises(ParameterError, match=r"no gait method or control law 'pd'; .*computed_tor"):
+    with pytest.raises(ParameterError, match=r"no gait method or control law 'pd'. .*computed_tor"):
         fly("coordinated_control", method="pd")
 
 

@@ -144,9 +144,9 @@ def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(ParameterError) as refused:
         resources.robot_file("servicr")
     assert str(refused.value).startswith(
-        "There is no robot 'servicr': there is no URDF file or robot with that name (known: "
+        "There is no robot 'servicr'. Did you mean 'servicer'? There are: dual_arm, "
     )
-    assert str(refused.value).endswith("Did you mean 'servicer'?")
+    assert str(refused.value).endswith("or any URDF file.")
 
 
 def test_data_files_are_in_the_checkout_or_installed(

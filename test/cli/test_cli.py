@@ -64,7 +64,8 @@ def test_run_reaches_its_goal(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["nowhere"], "There is no scenario 'nowhere'"),
+        (["nowhere"], "There is no scenario 'nowhere'."),
+        (["servicng"], "no scenario 'servicng'. Did you mean 'servicing'? There are: "),
         (["sliding_masses", "--goal", "nan", *"000001"], "is not finite"),
         (["sliding_masses", "--goal", *"0000000"], "zero quaternion"),
         (
