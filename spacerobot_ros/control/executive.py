@@ -309,6 +309,9 @@ class ControlExecutive:
         if self._pursues and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
         self._begin_anew_or_hold()
+        if self._pursues:
+            message = "The plant was reset: the goal is pursued from the initial state."
+            self._publish(ControllerState.TRACKING, message, self._goal_id)
 
     def _begin_anew_or_hold(self) -> None:
         self._plan_next(_Next.BEGIN_ANEW if self._pursues else _Next.HOLD)

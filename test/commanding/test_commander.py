@@ -404,8 +404,8 @@ def test_a_planner_plans_again_for_the_robot_with_the_body_that_it_holds(
     assert planner.host.states[-1] == "executing"
     planner.commander.receive_plant_status(replace(CAPTURED, payload=held.to_text()))
     assert planner.commander.robot.total_mass == pytest.approx(robot.total_mass + 4.0)
-    warnings = [line for level, line in planner.host.lines if level == "warning"]
-    assert warnings == ["The robot has a different mass now: the motion is replanned."]
+    told = planner.host.statuses[-1].message
+    assert told == "The robot has a different mass now: the motion is replanned."
     plans = planner.commander.statistics.plans
     for tick in range(5, 9):
         planner.state(tick)

@@ -418,7 +418,9 @@ def test_a_goal_is_begun_anew_from_where_a_reset_puts_the_robot() -> None:
     loop.answer(round(middle / LOOP_PERIOD))
     loop.place = -AIM
     loop.executive.plant_reset()
+    message = "The plant was reset: the goal is pursued from the initial state."
     wrench, _ = loop.answer()
+    assert (message, "g") in [(each.message, each.goal_id) for each in loop.statuses]
     np.testing.assert_allclose(wrench, 0.0, atol=1e-9)
     assert (loop.state, loop.status.goal_id) == ("tracking", "g")
     assert [event.kind for event in loop.events] == [EventKind.GOAL_ACCEPTED]

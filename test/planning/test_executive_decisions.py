@@ -281,6 +281,9 @@ def test_a_reset_is_planned_for_from_where_the_robot_is_then() -> None:
     loop = executing(ticks=40, max_corrections=0)
     loop.tick(20)
     reset_plant(loop)
+    said = loop.statuses[-1]
+    message = "The plant was reset: the motion is replanned from the initial state."
+    assert (said.state, said.goal_id, said.message) == (PlannerState.PLANNING, "goal-1", message)
     status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
     assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
     assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.REPLAN]

@@ -253,7 +253,7 @@ class Executive:
 
     def plant_reset(self) -> None:
         """Replan for the current goal, if any, because the robot state has changed."""
-        self._plan_again("The plant was reset: the motion is replanned.")
+        self._plan_again("The plant was reset: the motion is replanned from the initial state.")
 
     def use_robot(
         self, robot: SpaceRobot, worker: PlanningWorker, config: PlannerConfig | None = None
@@ -322,13 +322,17 @@ class Executive:
         # The held shape and the schedule belong to the time before the reset.
         self._tracker.stop()
         self._tracker.forget_wheels()
-        if self._active_goal is not None:
-            self._active_goal.next_plan = PlanReason.REPLAN
-        if self.phase in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
-            return
-        self._drop_plan()
-        self._change_phase(Event.PLANT_RESET, self._phase_at_rest())
-        self._add_notice("warning", message)
+        active = self._active_goal
+        if active is not None:
+            active.next_plan = PlanReason.REPLAN
+        if self.phase not in (Phase.IDLE, Phase.MEASURING, Phase.EVALUATING):
+            self._drop_plan()
+            self._change_phase(Event.PLANT_RESET, self._phase_at_rest())
+        about = PlannerState.PLANNING, message
+        if self._new_goal is not None:
+            self.outputs.append(PlannerStatus.of_goal(*about, self._new_goal))
+        elif active is not None:
+            self.outputs.append(active.status(*about))
 
     def cancel_plan(self) -> None:
         """Cancel the plan that the worker is computing; any thread may call this."""
