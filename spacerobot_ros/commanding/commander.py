@@ -222,7 +222,9 @@ class Commander(ABC):
     def deactivate(self, failure: str = "") -> None:
         """Discard the goals and stop commanding, but keep the goal file; ``failure`` is
         reported."""
-        why = f"Aborted: {failure or 'this node was deactivated.'}"
+        missing = self._reported_missing[0]
+        waited = f" while it waited for {missing}" if missing else ""
+        why = f"Aborted: {failure or f'this node was deactivated{waited}.'}"
         if self.config.resume_file:
             why += " A goal from a topic is resumed when the node is activated again."
         if self.activity is not CommanderActivity.INACTIVE:
@@ -488,7 +490,7 @@ class Commander(ABC):
             return  # The other messages are on their way.
         self._reported_missing = missing, goal_id
         if missing:
-            goes_on = " The goal is pursued when they arrive." if goal_id else ""
+            goes_on = " The goal is then pursued." if goal_id else ""
             message = f"Waiting for {missing}.{goes_on}"
             self._publish_status(self._make_status("waiting", message, goal_id))
         else:

@@ -483,6 +483,8 @@ class InputWatch:
             unheard = [t for t in absent if not (self.just_begun or self._has_publisher(t))]
             nobody = f", and no node publishes {_quoted(unheard)}" if unheard else ""
             return f"states on {_quoted(absent)}{refused}{nobody}"
+        if self._plant.status.reason == "ended":
+            return "the plant, which has ended: start it again"
         silence = self._clock() - self._heard
         if silence <= max(_LONGEST_SILENCE, _SILENT_PERIODS * control_period):
             return ""

@@ -59,7 +59,7 @@ class PlantStatus:
     reason
         Reason as a word. Latched, or paused and latched: the refusal reason, ``abort``
         or ``watchdog``; resting: ``no_command`` or ``timeout``; failed: ``model`` or ``exception``;
-        empty otherwise.
+        inactive: ``ended`` once the robot no longer exists; empty otherwise.
     latched_fault
         The fault latched until ``~/rearm``, in any plant state; empty if there is none.
     time_s

@@ -91,6 +91,20 @@ def test_an_abort_of_the_plant_ends_the_goal_until_there_is_another(
     flies_again(flight, "idle", "executing", "aborted", "refused")
 
 
+def test_a_plant_that_ends_in_flight_is_named(harness: Harness) -> None:
+    flight = Flight(harness, {**SLOW, **BACKGROUND}, REAL_TIME)
+    flight.start()
+    flight.send(NEAR)
+    flight.wait("executing")
+    flight.ticks(10)
+    flight.plant.trigger_shutdown()
+    status = flight.wait("waiting")
+    assert_one_sentence(status.message.removesuffix(" The goal is then pursued."), "has ended")
+    flight.planner.trigger_deactivate()
+    status = flight.wait("aborted")
+    assert_one_sentence(status.message, "deactivated", "the plant, which has ended")
+
+
 def test_only_the_last_of_the_states_that_wait_is_answered(
     harness: Harness, monkeypatch: pytest.MonkeyPatch
 ) -> None:

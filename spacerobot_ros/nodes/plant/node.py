@@ -346,9 +346,9 @@ class PlantNode(FlightNode):
         self._wall_timers = []
 
     def cleanup(self) -> None:
-        """Release the plant and publish that the node is not configured."""
+        """Release the plant and publish that the simulation has ended."""
         self._active, self._monitor = PlantState.INACTIVE, None
-        self._publish_status(PlantStatus(PlantState.INACTIVE, "The plant is not configured."))
+        self._publish_status(PlantStatus(PlantState.INACTIVE, "The simulation has ended.", "ended"))
 
     def _publish_changed_status(self) -> None:
         assert self._monitor is not None
