@@ -405,7 +405,7 @@ class FlightData:
 
     @property
     def propellant(self) -> float | None:
-        """Propellant used, kg; None without thrusters."""
+        """Propellant used since the start or the last reset, kg; None without thrusters."""
         used = self.signal("propellant")
         return float(used.values[-1, 0]) if len(used) else None
 
@@ -417,6 +417,12 @@ class FlightData:
         found = [event.about[key] for event in self.events if key in event.about]
         return float(found[-1]) if found else None
 
+    @property
+    def resets(self) -> list[float]:
+        """Times at which the plant was reset, s."""
+        resets = [event for event in self.events if event.kind is EventKind.RESET]
+        return [event.time_s for event in resets if event.time_s is not None]
+
     @cached_property
     def unexplained_momentum(self) -> Signal:
         """Momenta and energy (N, 7) without the change in momenta due to thrusters, at the times
@@ -427,7 +433,10 @@ class FlightData:
         # A recording may begin or end between the two, and logs them at slightly different times.
         gaps = np.diff(balance.time)
         near = _SAME_TICK_SHARE * float(np.median(gaps)) if len(gaps) else 0.0
-        of = np.searchsorted(expected.time, balance.time - near).clip(max=len(expected) - 1)
+        of = np.searchsorted(expected.time, balance.time - near)
+        # The states before and after a reset have the same stamp.
+        of += np.arange(len(balance)) - np.searchsorted(balance.time, balance.time)
+        of = of.clip(max=len(expected) - 1)
         at = np.flatnonzero(np.abs(expected.time[of] - balance.time) <= near)
         values = balance.values[at]
         values[:, :6] -= expected.values[of[at]]

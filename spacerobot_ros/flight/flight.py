@@ -21,6 +21,7 @@ from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import counted, quantity, sentence_case
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.data import FlightData
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import CaptureMeasures, Measures, Outcome, peak, peak_wrench
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
@@ -237,11 +238,14 @@ class Flight(FlightData):
 
     @property
     def thrust_impulse(self) -> float:
-        """Impulse of the thrusters, N s: the sum over all, or of the commanded force; 0: none."""
-        thrust = self.signal("thruster_force").values.sum(axis=1)
-        if not thrust.size and "base_wrench" in self.commands:
-            thrust = np.linalg.norm(self.commands["base_wrench"].values[:, :3], axis=1)
-        return float(thrust[1:].sum() * self.control_period)
+        """Impulse of the thrusters since the start or the last reset, N s: the sum over all, or of
+        the commanded force; 0: none."""
+        thrust, commands = self.signal("thruster_force"), self.commands.get("base_wrench")
+        if not len(thrust) and commands is not None:
+            time = commands.tick * np.float64(self.control_period)
+            thrust = Signal(time, commands.values).norms([0, 1, 2])
+        first = max([1, *thrust.rows_after(self.resets)])
+        return float(thrust.values[first:].sum() * self.control_period)
 
     @cached_property
     def capture_measures(self) -> CaptureMeasures:

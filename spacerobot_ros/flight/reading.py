@@ -446,7 +446,8 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
     if list(table.names) != list(names):
         return flight
 
-    used = impulse(flight.signal("thruster_force"), table.mass_flow / table.force)
+    thrust = flight.signal("thruster_force")
+    used = impulse(thrust, table.mass_flow / table.force, flight.resets)
     return replace(flight, series={**series, "propellant": used})
 
 
@@ -461,6 +462,10 @@ def since(flight: Flight, start: float) -> Flight:
         series={
             name: Signal(each.time - start, each.values) for name, each in flight.series.items()
         },
+        commands={
+            name: replace(each, tick=each.tick - round(start / flight.control_period))
+            for name, each in flight.commands.items()
+        },
         statuses=tuple((ns - round(start * SECOND), status) for ns, status in flight.statuses),
         events=tuple(
             each if each.time_s is None else replace(each, time_s=each.time_s - start)
@@ -471,10 +476,13 @@ def since(flight: Flight, start: float) -> Flight:
     )
 
 
-def impulse(thrust: Signal, weights: Array) -> Signal:
-    """Return the time integral (N, 1) of thrusts (N, m), N, with weights (m,)."""
+def impulse(thrust: Signal, weights: Array, resets: Sequence[float] = ()) -> Signal:
+    """Return the time integral (N, 1) of thrusts (N, m), N, with weights (m,), since the start or
+    the last reset (s)."""
     ticks = np.diff(thrust.time, prepend=thrust.time[:1])
     total = np.cumsum(ticks * (thrust.values @ weights))
+    for row in thrust.rows_after(resets):
+        total[row:] -= total[row - 1]
     return Signal(thrust.time, total[:, np.newaxis])
 
 

@@ -63,6 +63,20 @@ class Signal:
         columns = (np.interp(time, self.time, x, np.nan, np.nan) for x in self.values.T)
         return np.stack([*columns], axis=1) if self.width else np.empty((len(time), 0))
 
+    def rows_after(self, resets: Sequence[float]) -> npt.NDArray[np.int64]:
+        """Return the row of the first sample after each reset (s) that samples surround."""
+        before = np.searchsorted(self.time, np.subtract(resets, 1e-9))
+        rows = np.searchsorted(self.time, np.add(resets, 1e-9))
+        # The states before and after a reset have the same stamp.
+        rows = rows - (rows - before > 1)
+        return rows[(rows > 0) & (rows < len(self))]
+
+    def broken_at(self, resets: Sequence[float]) -> Signal:
+        """Return the signal with a NaN sample at each reset (s), where its traces break."""
+        rows = self.rows_after(resets)
+        time = np.insert(self.time, rows, self.time[rows])
+        return Signal(time, np.insert(self.values, rows, np.nan, axis=0))
+
     def norms(self, columns: Sequence[int]) -> Signal:
         """Return the norms (N, 1) of selected columns."""
         return Signal(self.time, np.linalg.norm(self.values[:, columns], axis=1, keepdims=True))

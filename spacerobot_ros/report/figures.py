@@ -544,8 +544,9 @@ class TraceGroup:
 
     @property
     def values(self) -> Array:
-        """All values from all flights."""
-        return np.concatenate([np.empty(0), *(each.values.ravel() for each in self.signals)])
+        """All values from all flights, without gaps."""
+        found = np.concatenate([np.empty(0), *(each.values.ravel() for each in self.signals)])
+        return found[~np.isnan(found)]
 
     def in_unit_of_angles(self) -> TraceGroup:
         """Return the traces in the selected angle unit: degrees instead of radians if requested."""

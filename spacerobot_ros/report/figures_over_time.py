@@ -149,6 +149,8 @@ def time_figure(
     """
     if all(len(signal) < 2 for group in groups for signal in group.signals):
         return ONE_STATE_TEXT
+    if not flights:
+        groups = [replace(each, signal=each.signal.broken_at(flight.resets)) for each in groups]
     groups = [group.in_unit_of_angles() for group in groups]
     left = max([0.72, *(room_for(group.names) + 0.1 for group in groups if group.rows)])
     figure, panels = sheet(
@@ -474,7 +476,7 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     label, unit = "thrusters", "fraction of each tick during which they are on"
     groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, tints, rows=True)]
     thrust, propellant = flight.signal("thruster_force"), flight.series.get("propellant")
-    total = impulse(thrust, np.ones(thrust.width))
+    total = impulse(thrust, np.ones(thrust.width), flight.resets)
     groups.append(TraceGroup(total, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
     caption = "Fraction of each tick during which each thruster was on; lower panel: total impulse"
     on = whole.values > 0
@@ -487,6 +489,8 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
         grams = Signal(propellant.time, 1e3 * propellant.values)
         groups.append(TraceGroup(grams, ["propellant"], "propellant", "g", [PALETTE[1]]))
         caption += " and the propellant consumed, according to the specific impulse"
+    if flight.resets:
+        caption += "; totals begin anew at a reset"
     if len(used) < len(names):
         caption += f". {len(names) - len(used)} of {len(names)} thrusters were never on"
     return time_figure(flight, "thrusters", "Thruster firings", caption, groups)

@@ -185,7 +185,7 @@ def draw_goal_and_path(axes: Axes, flight: FlightReport, view: View) -> list[Lin
     path = flight.pose[:, :3]
     limits = axes.axis()
     if float(np.ptp(path, axis=0).max()) > 0.0:
-        flat = view(path)
+        flat = view(Signal(flight.time, path).broken_at(flight.resets).values)
         dense = len(path) > 2 * TRACE_TIME_SLICES
         axes.plot(flat[:, 0], flat[:, 1], color=BASE_COLOUR, lw=0.8, zorder=5, rasterized=dense)
         keys.append(legend_entry(BASE_COLOUR, "path of the base"))
@@ -225,21 +225,25 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
     flown = [flight, *(other for other in beside if len(other.time))]
     tints = [_FLIGHT_COLOURS[k % len(_FLIGHT_COLOURS)] for k in range(len(flown))]
-    paths = [(each.pose[:, :3], tint) for each, tint in zip(flown, tints, strict=True)]
+    paths = [
+        (Signal(each.time, each.pose[:, :3]).broken_at(each.resets).values, tint)
+        for each, tint in zip(flown, tints, strict=True)
+    ]
     names = labels_of(flown) if beside else ["base"]
     keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
     if shows_tool:
-        paths.append((flight.tool.values[:, :3], HAND_COLOUR))
+        paths.append((flight.tool.broken_at(flight.resets).values[:, :3], HAND_COLOUR))
         keys.append(legend_entry(HAND_COLOUR, "end-effector"))
     for number, (link, poses) in enumerate(flight.link_poses.items()):
         tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
-        paths.append((poses.values[:, :3], tint))
+        paths.append((poses.broken_at(flight.resets).values[:, :3], tint))
         keys.append(legend_entry(tint, shortened(link)))
     if flight.planned:
         keys.append(legend_entry(PLANNED_COLOUR, "planned", DASHES))
     everything = np.concatenate(
         [path for path, _ in paths] + flight.planned + [goal[np.newaxis] for goal in goals]
     )
+    everything = everything[~np.isnan(everything).any(axis=1)]
     middle = (everything.max(axis=0) + everything.min(axis=0)) / 2
     half = 0.56 * max(float(np.ptp(everything, axis=0).max()), 1e-6)
     views = {"from above": (0, 1), "from the front": (0, 2), "from the side": (1, 2)}
@@ -330,6 +334,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
     part = Signal(flight.signal("q").time, flight.q[:, columns] * scale)
     if cycles is not None:
         part = part.between(*cycles.last(_SHOWN_CYCLES))
+    part = part.broken_at(flight.resets)
     one = len(pairs) == 1
     across, high = (2, 3.4) if one else (_LOOP_JOINTS, 2.35)
     figure, places = _square_panels(len(pairs), across, 2.0, high)

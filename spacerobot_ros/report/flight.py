@@ -73,10 +73,13 @@ class FlightReport(Flight):
         The bag that the flight was read from.
     meshes
         Triangles of the meshes in the bag, by URI.
+    draws_events
+        Whether figures over time show the events.
     """
 
     bag: FlightBag
     meshes: dict[str, TriangleMesh] = field(default_factory=dict)
+    draws_events: bool = True
 
     # -- signals ------------------------------------------------------------------------------
 
@@ -168,7 +171,7 @@ class FlightReport(Flight):
     @property
     def timed_events(self) -> list[tuple[float, Event]]:
         """The events that are drawn, with their times, s."""
-        return shown_events(self.events)
+        return shown_events(self.events) if self.draws_events else []
 
     # -- reports and goals ------------------------------------------------------------------------
 

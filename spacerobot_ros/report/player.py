@@ -392,15 +392,19 @@ def _grid_lines(center: Array, radius: float, spacing: float, flat: bool) -> Arr
 
 
 def _path_commands(flight: FlightReport) -> list[Command]:
-    lines = [("path of the base", flight.pose[:, :3], BASE_COLOUR)]
+    def flown(name: str, poses: Signal, tint: str) -> list[tuple[str, Array, str]]:
+        parts = np.split(poses.values[:, :3], poses.rows_after(flight.resets))
+        return [(f"{name} {k}" if k else name, part, tint) for k, part in enumerate(parts)]
+
+    lines = flown("path of the base", Signal(flight.time, flight.pose), BASE_COLOUR)
     lines += [(f"plan {k}", path, PLANNED_COLOUR) for k, path in enumerate(flight.planned)]
     if len(flight.tool):
-        lines.append(("path of the end-effector", flight.tool.values[:, :3], HAND_COLOUR))
+        lines += flown("path of the end-effector", flight.tool, HAND_COLOUR)
     assert flight.robot is not None
     tool = flight.robot.end_effector(flight.parameter("plant", "end_effector_frame") or "")
     for link, poses in flight.link_poses.items():
         if link != tool or not len(flight.tool):
-            lines.append((f"path of {link}", poses.values[:, :3], HAND_COLOUR))
+            lines += flown(f"path of {link}", poses, HAND_COLOUR)
     commands = []
     for name, points, tint in lines:
         step = max(1, len(points) // _MAX_LINE_POINTS)

@@ -52,7 +52,9 @@ def thinned(signal: Signal, slices: int) -> Signal:
     """
     if len(signal) <= 4 * slices:
         return signal
-    edges = np.unique(np.linspace(0, len(signal), slices + 1).astype(int))
+    gaps = np.flatnonzero(np.isnan(signal.values).any(axis=1))
+    edges = np.linspace(0, len(signal), slices + 1).astype(int)
+    edges = np.unique(np.concatenate([edges, gaps, gaps + 1]))
     kept = [edges[:-1], edges[1:] - 1]
     for a, b in itertools.pairwise(edges.tolist()):
         part = signal.values[a:b]

@@ -71,8 +71,9 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         rows.append((label, quantity(linear, "kg m/s"), f"angular {quantity(angular, 'kg m²/s')}"))
     if (propellant := flight.propellant) is not None:
         planned = flight.planned_propellant
-        beside = "" if planned is None else f"planned: {1e3 * planned:.3g} g"
-        rows.append(("Propellant", f"{1e3 * propellant:.3g} g", beside))
+        notes = [] if planned is None else [f"planned: {1e3 * planned:.3g} g"]
+        notes += ["since the reset"] * bool(flight.resets)
+        rows.append(("Propellant", f"{1e3 * propellant:.3g} g", "; ".join(notes)))
     if capture := flight.capture:
         about = flight.capture_measures
         done = f"at {about.time:.4g} s" if capture["captured"] else "no"

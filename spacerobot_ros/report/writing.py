@@ -171,7 +171,7 @@ def write_figures(
         )
     flight, *others = (read_report(each, namespace) for each in (bag, *beside))
     if others or not events:
-        flight = replace(flight, events=())
+        flight = replace(flight, draws_events=False)
     made: dict[str, Path | str] = {}
     with drawing(width / 25.4, "paper", style, degrees=degrees):
         for name in only or [name for name in FIGURES if name not in ("position", "attitude")]:

@@ -341,3 +341,16 @@ def test_propellant_is_the_impulse_over_the_exhaust_speed() -> None:
     used = impulse(thrust, np.array([0.5, 0.25]))
     assert used.time.tolist() == [1.0, 1.5, 2.5]
     assert used.values.tolist() == [[0.0], [0.5], [2.0]]
+
+
+def test_totals_begin_anew_at_a_reset() -> None:
+    """The states before and after it have the same stamp, or a reset is between two states."""
+    time, force = np.array([1.0, 2.0, 2.0, 3.0]), np.array([[5.0], [1.0], [0.0], [4.0]])
+    total = impulse(Signal(time, force), np.ones(1), [2.0])
+    assert total.values.tolist() == [[0.0], [1.0], [0.0], [4.0]]
+    broken = total.broken_at([2.0])
+    assert broken.time.tolist() == [1.0, 2.0, 2.0, 2.0, 3.0]
+    assert np.flatnonzero(np.isnan(broken.values)).tolist() == [2]
+    total = impulse(Signal(np.array([1.0, 2.0, 3.0]), np.full((3, 1), 5.0)), np.ones(1), [2.5])
+    assert total.values.tolist() == [[0.0], [5.0], [5.0]]
+    assert len(total.broken_at([0.5, 9.0])) == 3, "nothing was recorded before or after"

@@ -22,6 +22,7 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose, sta
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.series import Commands, Signal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure
@@ -155,6 +156,27 @@ def test_cards_of_tolerances_thrusters_and_propellant(tmp_path: Path) -> None:
     assert cards["Momentum not explained by thrusters"] == drift
     assert "Momentum drift" not in cards
     assert cards["Propellant"] == ("12.3 g", "")
+
+
+def test_traces_break_and_totals_begin_anew_at_a_reset(tmp_path: Path) -> None:
+    def more(say: Any, time: float, k: int) -> None:
+        if k == 2:
+            event = Event(EventKind.RESET, "It is back.", time_s=time)
+            pairs = [KeyValue(key=k, value=v) for k, v in event.to_values(None).items()]
+            say("/events", DiagnosticStatus(message=event.message, values=pairs), time)
+
+    found = flight(tmp_path, more=more)
+    assert found.resets == [1.0]
+    period = found.control_period
+    ticks = np.round(np.array([0.0, 0.5, 1.5]) / period).astype(int)
+    commands = {"base_wrench": Commands(ticks, np.outer([1.0, 1.0, 2.0], [0, 1, 0, 0, 0, 0]))}
+    assert replace(found, commands=commands).thrust_impulse == pytest.approx(2.0 * period)
+    figure = position_figure(found)
+    assert isinstance(figure, ReportFigure)
+    (group,) = figure.groups
+    at = np.flatnonzero(np.isnan(group.signal.values).all(axis=1))
+    assert group.signal.time[at].tolist() == [1.5]
+    assert np.isfinite(group.values).all()
 
 
 def test_a_goal_that_is_reached_but_for_a_part_is_not_called_reached(tmp_path: Path) -> None:
