@@ -125,7 +125,7 @@ def run_command(
         fail(result.message)
     verdict, *lines = _summary_lines(result.summary)
     published = _published_lines(chosen, result.summary)
-    for line in (verdict, *_fault_lines(chosen), *lines, *published):
+    for line in (verdict, *_fault_lines(chosen, result.summary), *lines, *published):
         say(line)
     if taken and path != usual:
         say(f"            {usual} contains an earlier flight and is kept")
@@ -201,12 +201,15 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
     ]
 
 
-def _fault_lines(scenario: Scenario) -> list[str]:
-    """Return the faults and disturbances that the scenario injects."""
+def _fault_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
+    """Return the faults and disturbances that the scenario injects, and what detected a fault."""
     from spacerobot_ros.simulation.faults import with_seconds
 
     plant = scenario.plant
     lines = [f"fault       {with_seconds(each)}" for each in plant.faults]
+    if found := summary.get("detection"):
+        line = f"detected    by {found['node']} at {found['time_s']:.6g} s: {found['message']}"
+        lines.append(line)
     return [*lines, *(f"disturbance {with_seconds(each)}" for each in plant.disturbances)]
 
 

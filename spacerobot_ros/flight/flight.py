@@ -9,6 +9,7 @@ bag (:mod:`~spacerobot_ros.flight.reading`).
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ import numpy as np
 
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import counted, quantity, sentence_case
-from spacerobot_ros.events import EventKind
+from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.data import FlightData
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import CaptureMeasures, Measures, Outcome, peak, peak_wrench
@@ -34,6 +35,7 @@ from spacerobot_ros.planning.core.goal import (
     reached_message,
 )
 from spacerobot_ros.planning.execution.status import describe_remaining_error
+from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.simulation.faults import active_fault
 
 if TYPE_CHECKING:
@@ -159,6 +161,9 @@ class Flight(FlightData):
             summary["propellant_kg"] = self.propellant
         if self.planned_propellant is not None:
             summary["planned_propellant_kg"] = self.planned_propellant
+        if (found := self.detection) is not None:
+            about = {"node": found.node, "time_s": found.time_s, "message": found.message}
+            summary["detection"] = about
         if self.clearance is not None:
             summary["clearance_m"] = measures.clearance
             summary["clearance_links"] = list(self.clearance.nearest.links)
@@ -286,6 +291,16 @@ class Flight(FlightData):
             return verdict
         clauses = sentence_case("; ".join(map(active_fault, faults)))
         return replace(verdict, sentence=f"{verdict.sentence} {clauses}.")
+
+    @property
+    def detection(self) -> Event | None:
+        """The first warning of a commander after a fault had begun, other than the outcome of a
+        goal; None: there is none."""
+        events = itertools.dropwhile(lambda e: e.kind is not EventKind.FAULT_INJECTED, self.events)
+        return next(
+            (e for e in events if e.level and e.node in COMMANDERS and "goal" not in e.kind.value),
+            None,
+        )
 
     @property
     def _faults_at_decision(self) -> list[str]:

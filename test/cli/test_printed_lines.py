@@ -118,11 +118,14 @@ def test_the_lines_of_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_injected_faults_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     faults = "['joint_stuck slider_1 at 1', 'joint_slow slider_2 0.5 until 9']"
     words = ("--set", f"plant.faults={faults}")
-    verdict, *lines = run(monkeypatch, SUMMARY, *GOAL, *words).stdout.splitlines()
-    assert [verdict, *lines[2:]] == (LINES + NEXT).splitlines()
-    assert lines[:2] == [
+    found = {"node": "planner", "time_s": 2.5, "message": "Stuck: slider_1."}
+    summary = SUMMARY | {"detection": found}
+    verdict, *lines = run(monkeypatch, summary, *GOAL, *words).stdout.splitlines()
+    assert [verdict, *lines[3:]] == (LINES + NEXT).splitlines()
+    assert lines[:3] == [
         "fault       joint_stuck slider_1 at 1 s",
         "fault       joint_slow slider_2 0.5 until 9 s",
+        "detected    by planner at 2.5 s: Stuck: slider_1.",
     ]
 
 

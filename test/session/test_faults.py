@@ -82,6 +82,15 @@ def test_a_scenario_ends_as_documented_and_can_be_flown_again(name: str, tmp_pat
     assert verification.difference is None, str(verification.difference)
 
 
+def test_the_summary_names_what_detects_a_fault(tmp_path: Path) -> None:
+    scenario = load_scenario("faults/stuck_elbow")
+    found = run_scenario(scenario, tmp_path / "run.mcap").summary["detection"]
+    assert found["node"] == "planner"
+    assert found["message"].startswith("Stuck: elbow_pitch.")
+    # It sticks at 5 s, and 50 ticks of 0.05 s later it is known to.
+    assert found["time_s"] == pytest.approx(7.5, abs=0.1)
+
+
 @pytest.mark.slow
 def test_killed_nodes_go_on_to_the_goal(tmp_path: Path) -> None:
     scenario = load_scenario(f"faults/{KILLED}").in_real_time(4.0)
