@@ -104,7 +104,8 @@ class ControlExecutive:
         self.plant_blocked = False
         """Whether the plant ignores commands, as set by the owner. If so, each command holds the
         current pose, so that the robot does not move when the plant accepts commands again."""
-        self._abort_message = ""
+        self._end_message = ""
+        """Message about the end of the goal, which later errors do not change."""
         self._pending: dict[str, IdentifiedGoal] = {}
         """Accepted goals that wait for the next measured state."""
         self._goal_state = self._reported_state = ControllerState.HOLDING
@@ -346,12 +347,12 @@ class ControlExecutive:
             self.controller.follow(Reference())
         self._pending.clear()
         self._planning.drop()
-        self._abort_message = message
+        self._end_message = message
 
     def _report_abort(self) -> None:
         self._goal_state = self._reported_state = ControllerState.ABORTED
-        self._end_goals(ControllerState.ABORTED, self._abort_message)
-        self._publish_decision(ControllerState.ABORTED, self._abort_message, self._goal_id)
+        self._end_goals(ControllerState.ABORTED, self._end_message)
+        self._publish_decision(ControllerState.ABORTED, self._end_message, self._goal_id)
 
     # -- states -------------------------------------------------------------------------------
 
@@ -457,9 +458,10 @@ class ControlExecutive:
             return
         decided = watch.decision(self.controller, time, config)
         if decided is not None:
-            self._goal_state, message = decided, self._message(decided)
-            self._end_goals(decided, message)
-            self._report_decision(decided, message, self._goal_id)
+            self._end_message = watch.message(decided, self.controller, config)
+            self._goal_state = decided
+            self._end_goals(decided, self._end_message)
+            self._report_decision(decided, self._end_message, self._goal_id)
         elif not self._is_moved_otherwise:
             watch.stall.observe(time, self.controller, result, config)
 
@@ -514,9 +516,10 @@ class ControlExecutive:
                 self._begin_goals(time, state, carried=True)
             case TaskState.DONE:
                 touched = bool(self._watch.touched)
-                self._goal_state = ControllerState.FAILED if touched else ControllerState.REACHED
-                message = self._message(self._goal_state)
-                self._report_decision(self._goal_state, message, self._goal_id)
+                ended = ControllerState.FAILED if touched else ControllerState.REACHED
+                self._goal_state = ended
+                self._end_message = self._watch.message(ended, self.controller, self._goal_config)
+                self._report_decision(ended, self._end_message, self._goal_id)
             case TaskState.REFUSED | TaskState.FAILED:
                 self._end_tasks(time, state, progress)
 
@@ -697,10 +700,13 @@ class ControlExecutive:
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()
                 return f"Stalled {away} from the reference: {self._watch.stall.cause}."
-            case ControllerState.REACHED | ControllerState.REACHED_PARTLY | ControllerState.FAILED:
-                return self._watch.message(state, self.controller, self._goal_config)
-            case ControllerState.ABORTED:
-                return self._abort_message
+            case (
+                ControllerState.REACHED
+                | ControllerState.REACHED_PARTLY
+                | ControllerState.FAILED
+                | ControllerState.ABORTED
+            ):
+                return self._end_message
             case ControllerState.ESTIMATING:
                 elapsed = self.controller.time_since_measurement
                 return (

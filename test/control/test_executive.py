@@ -228,9 +228,11 @@ def test_a_goal_is_reached_when_it_is_held_for_the_settling_time() -> None:
     assert loop.state == "reached"
     assert_one_sentence(loop.status.message, "reached")
     assert (loop.status.goal_id, loop.status.state.level) == ("7", 0)
+    said, message = len(loop.statuses), loop.status.message
     loop.place = np.zeros(3)
     loop.answer(5)
     assert loop.state == "reached", "it was reached, wherever the robot is pushed to later"
+    assert {each.message for each in loop.statuses[said:]} == {message}
 
 
 @pytest.mark.parametrize(("link", "state"), [("", "reached"), ("end_effector", "reached_partly")])
