@@ -357,6 +357,30 @@ def test_a_viewer_survives_what_is_wrong(clock: Clock, harness: Harness) -> None
     assert stack.viewer.is_active
 
 
+def test_a_foreign_robot_goes_with_its_plant(clock: Clock, harness: Harness) -> None:
+    stack = Stack(harness)
+    stack.describe()
+    stack.until(lambda: stack.robot is not None, "the robot")
+    own = stack.robot
+    stranger = harness.probe({}, name="stranger")
+    described = stranger.create_publisher(String, "/robot_description", LATCHED)
+    status = stranger.create_publisher(DiagnosticStatus, "/plant/status", LATCHED)
+    harness.matched(described)
+    harness.matched(status)
+    described.publish(String(data=ARM.urdf))
+    stack.until(lambda: stack.robot not in (own, None), "the foreign robot")
+    ended = PlantStatus(PlantState.INACTIVE, "It has ended.")
+    values = [KeyValue(key=k, value=v) for k, v in ended.to_values().items()]
+    status.publish(DiagnosticStatus(name="/stranger", values=values, message=ended.message))
+    stack.until(lambda: "It has ended." in stack.said(), "its status")
+    foreign = stack.robot
+    harness.remove(stranger)
+    stack.until(lambda: stack.robot not in (foreign, None), "the own robot again")
+    stack.until(lambda: "A command is active." in stack.said(), "its plant's status")
+    sliders = names_of(load_robot(robot_file("sliding_masses")))
+    stack.until(lambda: stack.move(0.1, sliders) or stack.placed, "its state")
+
+
 def test_a_replay_has_a_time_line(harness: Harness) -> None:
     stack = Stack(harness)
     status = stack.probe.create_publisher(DiagnosticStatus, "/replay/status", LATCHED)

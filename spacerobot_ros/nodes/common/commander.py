@@ -35,6 +35,7 @@ from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of
 from spacerobot_ros.nodes.common.fly_to import GoalActions
 from spacerobot_ros.nodes.common.messages import (
     KnownFrames,
+    LatchedSubscription,
     end_effector_goal,
     goal_description,
     goal_of,
@@ -83,6 +84,7 @@ class CommanderNode(FlightNode):
     _statuses: Subscription | None = None
     _decoder: MessageDecoder | None = None
     _goal_actions: GoalActions | None = None
+    _descriptions: LatchedSubscription | None = None
 
     # -- life cycle ---------------------------------------------------------------------------
 
@@ -123,10 +125,12 @@ class CommanderNode(FlightNode):
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         self.offer("~/abort", self._abort)
-        self._description, self._decoder = "", None
+        self._description, self._decoder, self._descriptions = "", None, None
         robot = robot_of(config)
         if robot is None:
-            self.create_subscription(String, "robot_description", self._on_description, LATCHED)
+            self._descriptions = LatchedSubscription(
+                self, String, "robot_description", self._on_description
+            )
         else:
             self.use(robot)
 
@@ -409,6 +413,8 @@ class CommanderNode(FlightNode):
                 self._on_plant_status(taken[0])
         if self._doubted and not self._has_foreign_statuses():
             self._subscribe_plant_status()
+        if self._descriptions is not None:
+            self._descriptions.renew()
         if self._unheard:
             self._resubscribe_best_effort()
         ignored = commander.take_accepted_jump()

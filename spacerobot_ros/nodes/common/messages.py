@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_for_type_support
@@ -25,6 +26,7 @@ from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_multiply,
 )
+from spacerobot_ros.nodes.common.node import LATCHED
 from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
@@ -250,6 +252,32 @@ def transform_class() -> Any | None:
         return message_class(TRANSFORM_TYPE)
     except SpaceRobotError:
         return None
+
+
+class LatchedSubscription:
+    """A subscription to a latched topic, renewed if one of several publishers leaves: those that
+    remain then send their last messages again.
+    """
+
+    def __init__(self, node: Any, kind: type[Any], topic: str, take: Callable[[Any], None]) -> None:
+        self._node, self._arguments, self._outdated = node, (kind, topic, take), False
+        self._subscribe()
+
+    def _subscribe(self) -> None:
+        events = SubscriptionEventCallbacks(matched=self._on_match)
+        self._subscription = self._node.create_subscription(
+            *self._arguments, LATCHED, event_callbacks=events
+        )
+
+    def _on_match(self, matches: Any) -> None:
+        self._outdated |= matches.current_count_change < 0 < matches.current_count
+
+    def renew(self) -> None:
+        """Subscribe again if a publisher has left; to be called by a timer of the node."""
+        if self._outdated:
+            self._outdated = False
+            self._node.destroy_subscription(self._subscription)
+            self._subscribe()
 
 
 class KnownFrames:

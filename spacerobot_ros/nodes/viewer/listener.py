@@ -32,7 +32,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.nodes.common.messages import goal_of, pose_array
+from spacerobot_ros.nodes.common.messages import LatchedSubscription, goal_of, pose_array
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.common.watchdog import HeartbeatState, Role
 from spacerobot_ros.planning import Goal
@@ -152,15 +152,15 @@ class Listener:
         self._pursued: dict[str, Any] = {}
         """The last status of the pursued goal, by kind of status."""
         self.forget_state()
+        self._status_topics = []
         for topic, key, read in (
             ("plant/status", "plant", PlantStatus.from_values),
             ("planner/status", "planner", PlannerStatus.from_values),
             ("controller/status", "controller", ControllerStatus.from_values),
             ("replay/status", "replay", lambda values, _: ReplayStatus.from_values(values)),
         ):
-            node.create_subscription(
-                DiagnosticStatus, topic, self._status_callback(key, read), LATCHED
-            )
+            take = self._status_callback(key, read)
+            self._status_topics.append(LatchedSubscription(node, DiagnosticStatus, topic, take))
         node.create_subscription(Path, "planned_path", self._on_path, LATCHED)
         node.create_subscription(JointTrajectory, "gait_schedule", self._on_schedule, LATCHED)
         node.create_subscription(DiagnosticStatus, "heartbeat", self._on_heartbeat, STREAM)
@@ -195,6 +195,8 @@ class Listener:
 
     def state(self) -> StackState:
         """Process the received messages and return the stack state."""
+        for each in self._status_topics:
+            each.renew()
         now = time.monotonic()
         self._take_streams(now)
         self._hide_long_silent_nodes(now)

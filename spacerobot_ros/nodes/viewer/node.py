@@ -30,7 +30,7 @@ from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import obstacles_from_topic, parse_robot
-from spacerobot_ros.nodes.common.messages import shape_message
+from spacerobot_ros.nodes.common.messages import LatchedSubscription, shape_message
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
@@ -142,7 +142,9 @@ class ViewerNode(FlightNode):
         self._listener = Listener(
             self._streams, self, config.world_frame, self._on_status, config.watchdog_timeout
         )
-        self.create_subscription(String, "robot_description", self._on_description, LATCHED)
+        self._descriptions = LatchedSubscription(
+            self, String, "robot_description", self._on_description
+        )
         for topic in ("target/robot_description", "obstacles"):
             self.create_subscription(String, topic, partial(self._on_urdf, topic), LATCHED)
         self.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
@@ -202,6 +204,7 @@ class ViewerNode(FlightNode):
     # -- drawing --------------------------------------------------------------------------------
 
     def _draw(self) -> None:
+        self._descriptions.renew()
         now, state = time.monotonic(), self._listener.state()
         self._take_parameters()
         for action in self._page.update(state, now):
