@@ -222,8 +222,7 @@ class Commander(ABC):
     def deactivate(self, failure: str = "") -> None:
         """Discard the goals and stop commanding, but keep the goal file; ``failure`` is
         reported."""
-        missing = self._reported_missing[0]
-        waited = f" while it waited for {missing}" if missing else ""
+        waited = f" while it waited for {missing}" if (missing := self.missing) else ""
         why = f"Aborted: {failure or f'this node was deactivated{waited}.'}"
         if self.config.resume_file:
             why += " A goal from a topic is resumed when the node is activated again."
