@@ -57,11 +57,15 @@ class Signal:
         return Signal(self.time[first:last], self.values[first:last])
 
     def at(self, time: Array) -> Array:
-        """Return the values (M, k) at times (M,), interpolated linearly; NaN outside the span."""
-        if not len(self):
-            return np.full((len(time), self.width), np.nan)
-        columns = (np.interp(time, self.time, x, np.nan, np.nan) for x in self.values.T)
-        return np.stack([*columns], axis=1) if self.width else np.empty((len(time), 0))
+        """Return the values (M, k) at times (M,), interpolated linearly; NaN outside the span and
+        at breaks."""
+        found = np.full((len(time), self.width), np.nan)
+        if len(self):
+            for column, values in zip(found.T, self.values.T, strict=True):
+                column[:] = np.interp(time, self.time, values, np.nan, np.nan)
+            breaks = self.time[np.isnan(self.values).any(axis=1)]
+            found[np.isin(time, breaks)] = np.nan
+        return found
 
     def rows_after(self, resets: Sequence[float]) -> npt.NDArray[np.int64]:
         """Return the row of the first sample after each reset (s) that samples surround."""

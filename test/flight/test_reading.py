@@ -351,6 +351,7 @@ def test_totals_begin_anew_at_a_reset() -> None:
     broken = total.broken_at([2.0])
     assert broken.time.tolist() == [1.0, 2.0, 2.0, 2.0, 3.0]
     assert np.flatnonzero(np.isnan(broken.values)).tolist() == [2]
+    np.testing.assert_array_equal(broken.at(time[[0, 1, 3]]), [[0.0], [np.nan], [4.0]])
     total = impulse(Signal(np.array([1.0, 2.0, 3.0]), np.full((3, 1), 5.0)), np.ones(1), [2.5])
     assert total.values.tolist() == [[0.0], [5.0], [5.0]]
     assert len(total.broken_at([0.5, 9.0])) == 3, "nothing was recorded before or after"
