@@ -81,7 +81,6 @@ class CommanderNode(FlightNode):
     goal_shape: Array | None = None
     """Joint positions (n,) required at the end of goals; None: any."""
 
-    _statuses: Subscription | None = None
     _decoder: MessageDecoder | None = None
     _goal_actions: GoalActions | None = None
     _descriptions: LatchedSubscription | None = None
@@ -112,8 +111,9 @@ class CommanderNode(FlightNode):
         self._diagnostics_period_ns = (config.diagnostics_period or math.inf) * SECOND
         self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
-        self._statuses = None
-        self._subscribe_plant_status()
+        self._statuses = LatchedSubscription(
+            self, DiagnosticStatus, "plant/status", self._on_plant_status, _STATUS_QOS
+        )
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
         """Name of a state topic with a QoS-incompatible publisher."""
@@ -302,29 +302,10 @@ class CommanderNode(FlightNode):
             raise CommandError("There is no goal to abort.")
         return answer
 
-    def _subscribe_plant_status(self) -> None:
-        """Subscribe again to plant/status, whose current publishers first send their last
-        status."""
-        if self._statuses is not None:
-            self.destroy_subscription(self._statuses)
-        self._doubted = False
-        """Whether a status may be from a node other than the plant."""
-        self._statuses = self.create_subscription(
-            DiagnosticStatus,
-            "plant/status",
-            self._on_plant_status,
-            _STATUS_QOS,
-            event_callbacks=SubscriptionEventCallbacks(matched=self._on_status_publisher),
-        )
-
-    def _on_status_publisher(self, matches: Any) -> None:
-        """Doubt earlier statuses if a publisher of plant/status has left while others remain."""
-        self._doubted |= matches.total_count > matches.current_count > 0
-
     def _on_plant_status(self, message: DiagnosticStatus) -> None:
         """React to a status of the plant, unless another node also publishes statuses."""
         if self._has_foreign_statuses():
-            self._doubted = True
+            self._statuses.outdated = True
             self.get_logger().warning(
                 "plant/status has more publishers than odom has. The topic is ignored until only "
                 "the plant publishes it.",
@@ -405,14 +386,13 @@ class CommanderNode(FlightNode):
 
     def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a deferred state once its time is accepted."""
-        assert self._statuses is not None
-        commander, handle = self.commander, self._statuses.handle
+        commander, handle = self.commander, self._statuses.subscription.handle
         # A busy executor may lose a callback.
         with handle:
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
                 self._on_plant_status(taken[0])
-        if self._doubted and not self._has_foreign_statuses():
-            self._subscribe_plant_status()
+        if self._statuses.outdated and not self._has_foreign_statuses():
+            self._statuses.renew()
         if self._descriptions is not None:
             self._descriptions.renew()
         if self._unheard:

@@ -255,28 +255,34 @@ def transform_class() -> Any | None:
 
 
 class LatchedSubscription:
-    """A subscription to a latched topic, renewed if one of several publishers leaves: those that
-    remain then send their last messages again.
+    """A subscription to a latched topic, renewed if a publisher has left while others remain: they
+    then send their last messages again.
     """
 
-    def __init__(self, node: Any, kind: type[Any], topic: str, take: Callable[[Any], None]) -> None:
-        self._node, self._arguments, self._outdated = node, (kind, topic, take), False
+    def __init__(
+        self,
+        node: Any,
+        kind: type[Any],
+        topic: str,
+        take: Callable[[Any], None],
+        qos: QoSProfile = LATCHED,
+    ) -> None:
+        self._node, self._arguments = node, (kind, topic, take, qos)
         self._subscribe()
 
     def _subscribe(self) -> None:
+        self.outdated = False
+        """Whether the last message may be from a node other than the present publishers."""
         events = SubscriptionEventCallbacks(matched=self._on_match)
-        self._subscription = self._node.create_subscription(
-            *self._arguments, LATCHED, event_callbacks=events
-        )
+        self.subscription = self._node.create_subscription(*self._arguments, event_callbacks=events)
 
     def _on_match(self, matches: Any) -> None:
-        self._outdated |= matches.current_count_change < 0 < matches.current_count
+        self.outdated |= matches.total_count > matches.current_count > 0
 
     def renew(self) -> None:
-        """Subscribe again if a publisher has left; to be called by a timer of the node."""
-        if self._outdated:
-            self._outdated = False
-            self._node.destroy_subscription(self._subscription)
+        """Subscribe again if outdated; to be called by a timer of the node."""
+        if self.outdated:
+            self._node.destroy_subscription(self.subscription)
             self._subscribe()
 
 
