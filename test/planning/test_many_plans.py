@@ -232,13 +232,18 @@ def test_plans_to_random_goals_keep_clear(
 
 
 @pytest.mark.slow
-def test_two_arms_keep_clear_where_all_solutions_without_clearance_collide(tmp_path: Path) -> None:
-    """Clear paths near any of the sixteen solutions in collision are not found either."""
-    robot = SpaceRobot.from_file(robot_file("dual_arm"))
-    start = np.zeros(robot.n)
+@pytest.mark.parametrize(("name", "number"), [("dual_arm", 22), ("quadruped", 45)])
+def test_plans_keep_clear_where_all_solutions_without_clearance_collide(
+    name: str, number: int, tmp_path: Path
+) -> None:
+    """Clear paths near any of the solutions in collision are not found either: two arms start from
+    a clear guess, and legs, which all starts bring to the same place, return by a loop.
+    """
+    robot = SpaceRobot.from_file(robot_file(name))
+    start = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
     clearance = Clearance(robot.description, CLEARANCE)
-    (goal,) = list(random_goals(robot, start, 23))[22:]
-    options = method_options("optimal", {"cache": 0, "base_position": 1})
+    *_, goal = random_goals(robot, start, number + 1)
+    options = method_options("optimal", {"cache": 0, "base_position": int(number % 3 == 1)})
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), start)
     request = PlanRequest(state, goal, Tolerance(1e-6, 1e-6, 1e-6))
     schedule = OptimalGait(robot, 0.05, 0.01, options, clearance).plan(request)

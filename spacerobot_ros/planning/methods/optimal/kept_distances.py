@@ -30,7 +30,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
 )
 
-_INITIAL_MARGIN = 2e-3
+INITIAL_ROOM = 2e-3
 """Room beyond the clearance that is added for a pair, because held commands change the path, m."""
 
 _NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
@@ -155,13 +155,13 @@ class KeptDistances:
         """
         kept = KeptDistances(self._library, self._boundary, self._required)
         near = (each.pair for each in self.approaches_of(path, margin))
-        kept._room = {pair: self._room.get(pair, _INITIAL_MARGIN) for pair in near}
+        kept._room = {pair: self._room.get(pair, INITIAL_ROOM) for pair in near}
         return kept
 
     def add(self, near: Sequence[Approach]) -> None:
         """Add pairs that came too close."""
         for each in near:
-            self._room.setdefault(each.pair, _INITIAL_MARGIN)
+            self._room.setdefault(each.pair, INITIAL_ROOM)
 
     def widen(self, near: Sequence[Approach]) -> None:
         """Add pairs that came too close; pairs that are already kept apart are given the missing

@@ -408,17 +408,19 @@ class OptimalGait(GaitMethod):
             found = self._plan_from_rest(task, final_is_given=shape is not None or same_shape)
             plan, is_final = self._found(task, found), self._is_within_efforts(task, found)
         except NotFoundError as refusal:
-            plan, is_final = self._plan_by_halves(task, refusal), True
+            plan, is_final = self._plan_in_parts(task, refusal), True
         # A result of a busy machine is not cached, as an idle machine finds a better one.
         if cache is not None and is_final and "cut_short" not in plan.notes:
             cache.store(name, key, json.dumps([plan.positions.tolist(), plan.notes]).encode())
         return plan
 
-    def _plan_by_halves(self, task: SearchProblem, refusal: NotFoundError) -> _Plan:
-        """Plan a rotation in two halves, with the joints at rest between them.
+    def _plan_in_parts(self, task: SearchProblem, refusal: NotFoundError) -> _Plan:
+        """Plan a rotation in two halves, with the joints at rest between them, or a small one by
+        loops that end at the current shape.
 
-        A rotation by many loops is beyond the guesses of a single search. The ``refusal`` is raised
-        if the rotation is not large, if its duration is limited, or if a half is not found either.
+        A rotation by many loops is beyond the guesses of a single search. From all guesses for a
+        small one, a search may arrive at the same direct path, which ends where links are too
+        close. The ``refusal`` is raised if the duration is limited, or if this fails, too.
         """
         request, options = task.request, task.options
         state, goal = request.state, request.goal
@@ -429,7 +431,15 @@ class OptimalGait(GaitMethod):
         limited = options.duration > 0 or options.longest < OptimalOptions().longest
         timed = request.correction or task.boundary.drifts or limited
         free = goal.end_effectors or "attitude" not in self._specification.controls & goal.base
-        if timed or free or angle < _MIN_HALVED_ANGLE:
+        if timed or free:
+            raise refusal
+        if angle < _MIN_HALVED_ANGLE:
+            if self.clearance is None or task.boundary.final is not None:
+                raise refusal
+            back = replace(request, goal=replace(goal, joint_positions=state.q))
+            with suppress(PlanningError):
+                return self._plan_about_center(back, task.cancellation, task.clock)
+            task.cancellation.raise_if_requested()
             raise refusal
         position = (state.position + goal.position) / 2
         halfway = replace(goal, position=position, quaternion=between, joint_positions=None)

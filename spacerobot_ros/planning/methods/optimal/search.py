@@ -48,7 +48,11 @@ from spacerobot_ros.planning.methods.optimal.held_commands import (
     ManoeuvreModel,
 )
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
-from spacerobot_ros.planning.methods.optimal.kept_distances import KeptDistances, instants_of
+from spacerobot_ros.planning.methods.optimal.kept_distances import (
+    INITIAL_ROOM,
+    KeptDistances,
+    instants_of,
+)
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     TOLERANCE,
     DurationBounds,
@@ -709,7 +713,7 @@ class _Search:
         """
         self._begin(SearchPhase.CLEARING)
         around = Neighbourhood.within(self._problem.limits, reach, _LARGEST_LACK)
-        least, stalled = math.inf, 0
+        least, stalled, no_lack = math.inf, 0, _NO_LACK
         for _ in range(_MAX_CLEARING_ROUNDS):
             path = self._solve_apart(kept, grid, path, duration, around)
             lack = self._lack
@@ -720,9 +724,12 @@ class _Search:
             near, made = self._approaches(kept, grid, path)
             if not near:
                 return path, made
-            stalled = stalled + 1 if lack > max(_STALLED_SHARE * least, _NO_LACK) else 0
+            stalled = stalled + 1 if lack > max(_STALLED_SHARE * least, no_lack) else 0
+            if stalled >= _MAX_STALLED_ROUNDS and lack < INITIAL_ROOM:
+                # The planes keep the clearance; links that turn between instants need more room.
+                stalled, no_lack = 0, INITIAL_ROOM
             least, before = min(least, lack), kept.pairs
-            (kept.widen if lack < _NO_LACK else kept.add)(near)
+            (kept.widen if lack < no_lack else kept.add)(near)
             if kept.pairs != before:
                 least, stalled = math.inf, 0
             is_over = grid != self._full and self._is_over(found=False)
