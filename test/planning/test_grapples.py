@@ -142,6 +142,19 @@ def test_a_fixture_that_faces_away_is_met_when_it_has_turned() -> None:
     assert careless.duration < 16 < clear.duration < 40
 
 
+@pytest.mark.slow
+def test_a_fixture_that_turns_too_slowly_is_met_round_the_target() -> None:
+    target = load_robot(SATELLITE)
+    free = satellite([-0.04, -0.62, 0.59, 0.51], [2.94, 0.14, 0.42], [0.0, 0.5, 0.8])
+    motion = TorqueFreeMotion(TargetBody.of(target, "grapple"), free)
+    options = ThrustOptions(intervals=20, thrusters="urdf", duration=60.0)
+    planner = ThrustPlanner(servicer().robot, options, "end_effector")
+    # The motion of least propellant ends at the horizon, inside the target.
+    clear = planner.plan(FOLDED_REST, Grapple(motion, target, 0.02, horizon=60.0))
+    assert distance_from_target(planner.robot.description, target, clear, free) > 0.0199
+    assert clear.duration <= 60.0
+
+
 def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
     planner, target = servicer(), load_robot(SATELLITE)
     body = TargetBody.of(target, "grapple")

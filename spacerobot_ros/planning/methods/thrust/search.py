@@ -93,9 +93,10 @@ _LARGEST_LACK, _SHALLOW = 1e-4, 0.1
 """Missing clearance between pairs up to which a solution counts as clear before the exact check,
 and contact depth on a path to a target up to which planes along this path are tried first, m."""
 
-_MAX_ROUNDS, _LARGEST_STRETCH = 6, 4.0
+_MAX_ROUNDS, _MOST_OPTIMA, _LARGEST_STRETCH = 6, 4, 4.0
 """Number of times that new planes are computed to clear a path or that a motion with excessive
-efforts is slowed down, and largest factor applied to its duration."""
+efforts is slowed down; after how many motions of least cost that were not clear the nearest one to
+a clear path is taken; and largest factor applied to a duration."""
 
 _SHARES_LEFT = (0.0, 0.25, 0.5)
 """Fractions of the angular momentum that may be left after a grasp."""
@@ -346,14 +347,18 @@ class _Search:
     """Time at which a target is met, s."""
 
     def _ways(self, base: Array, shape: Array, sides: Array, time: float) -> Iterator[ThrustKnots]:
-        """Yield guesses to a base pose (7,) and a shape (n,) that are clear of obstacles, in a time
-        if it suffices, the straightest first: each bows out to the side (3,) with the most room.
+        """Yield guesses to a base pose (7,) and a shape (n,) that are clear of obstacles, in a
+        time, or to a pose at rest in the time that they need, the straightest first: each bows out
+        to the side (3,) with the most room.
         """
+        longest = math.inf if self.grapple is None else time + 1e-6
         bow = max(float(np.linalg.norm(base[:3] - self.boundary.start[7:10])) / 2, 0.5)
         for height in _BOW_SHARES:
             best, room = None, 0.0
             for side in sides if height else sides[:1]:
                 guess = self.planner.guess(self.boundary, base, shape, height * bow * side)
+                if guess.duration > longest:
+                    continue
                 guess = guess.stretched(max(time / guess.duration, 1.0))
                 if (found := self.bodies.room(guess)) > room:
                     best, room = guess, found
@@ -366,11 +371,14 @@ class _Search:
         """Yield guesses to the end of a path, then the path."""
         X, _, r, _, q, _ = state_parts(path.states[-1:])
         base = np.hstack(base_poses(self.planner.robot, X, r, q))[0]
+        yield from self._ways(base, q[0], self._sides(base), path.duration)
+        yield path
+
+    def _sides(self, base: Array) -> Array:
+        """Return directions (M, 3) across the way to a base pose (7,)."""
         frame = np.linalg.svd((base[:3] - self.boundary.start[7:10])[np.newaxis])[2]
         angles = 2 * math.pi * np.arange(_BOW_DIRECTIONS) / _BOW_DIRECTIONS
-        sides = np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
-        yield from self._ways(base, q[0], sides, path.duration)
-        yield path
+        return np.outer(np.cos(angles), frame[1]) + np.outer(np.sin(angles), frame[2])
 
     def _meeting(self, time: float) -> tuple[Array, Array, Array]:
         """Return the base pose (7,) to meet a target at a time in the shape (n,) of the start, this
@@ -393,18 +401,30 @@ class _Search:
                 break
         return guess.stretched(time / guess.duration)
 
-    def _meetings(self, time: float) -> Iterator[ThrustKnots]:
+    def _meetings(self, latest: float) -> Iterator[ThrustKnots]:
         """Yield clear guesses at a target from a time on, each one much later than the one before,
-        which was in vain.
+        which was in vain; then those of earlier times.
         """
         assert self.grapple is not None
+        time = latest
         while time < self.grapple.horizon:
-            guess = next(self._ways(*self._meeting(time), time), None)
-            if guess is None or guess.duration > time + 1e-6:
+            guess = self._guess_at(time)
+            if guess is None:
                 time += _MEETING_PERIOD
                 continue
             yield guess
             time += max(_MEETING_PERIOD, _LATER * time)
+        while (latest := latest / (1 + _LATER)) >= self.earliest:
+            if (guess := self._guess_at(latest)) is not None:
+                yield guess
+
+    def _guess_at(self, time: float) -> ThrustKnots | None:
+        """Return a clear guess that meets a target at a time: on the side of its fixture or, if
+        the target is in the way, past it.
+        """
+        base, shape, fixture = self._meeting(time)
+        ways = (self._ways(base, shape, sides, time) for sides in (fixture, self._sides(base)))
+        return next(itertools.chain.from_iterable(ways), None)
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
         options = self.planner.options
@@ -476,8 +496,8 @@ class _Search:
     def _settled(self, path: ThrustKnots) -> ThrustMotion:
         """Return the exact motion near a clear path, which is clear, too."""
         self._begin(SearchPhase.REFINING)
-        for _ in range(_MAX_ROUNDS):
-            motion = self._exact(path)
+        for number in range(_MAX_ROUNDS):
+            motion = self._exact(path, nearest=self.is_timed and number >= _MOST_OPTIMA)
             near = self.bodies.approaches(motion)
             if not near:
                 return motion
@@ -519,8 +539,10 @@ class _Search:
         spent = guess.step * float(self.planner.propulsion.cost_of(ca.DM(guess.levels.T)))
         return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, _REGULARISATION, rounding)
 
-    def _exact(self, guess: ThrustKnots) -> ThrustMotion:
-        """Return the exactly integrated motion of least propellant or time near a path."""
+    def _exact(self, guess: ThrustKnots, *, nearest: bool = False) -> ThrustMotion:
+        """Return the exactly integrated motion of least propellant or time near a path, or the
+        nearest one.
+        """
         planner, knots, planes = self.planner, guess, self.bodies.planes(guess)
         is_rounded = not planner.propulsion.is_table and self.is_timed and not len(planes)
         roundings = _ROUNDINGS[1:] if is_rounded else _ROUNDINGS[1:2]
@@ -528,6 +550,8 @@ class _Search:
         for each in others:
             knots = self._solve(knots, each, planes) or knots
         center, best, error = None, None, math.inf
+        if nearest:
+            weights, center = _NEAREST, guess
         for number in range(_MAX_CORRECTIONS):
             begins = "corrected" * (number > 0)
             solved = self._solve(knots, weights, planes, center, begins)
