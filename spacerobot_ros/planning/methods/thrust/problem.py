@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import NotFoundError, ParameterError
+from spacerobot_ros.errors import NotFoundError, ParameterError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.inverse_kinematics import REACHED_DISTANCE, FixedBaseArm, is_reached
@@ -180,6 +180,25 @@ class Grapple:
     corridor_angle: float = 0.0
     corridor_length: float = 0.0
 
+    def require_in_time(self, center: Array, mass: float, force: float, arm: float) -> None:
+        """Reject a target that a robot cannot meet within the horizon, given the position and the
+        velocity (6,) of its centre of mass in W, its mass, its largest force and its reach, SI.
+        """
+        away = self.motion.center_of_mass(0.0) - center[:3]
+        distance = float(np.linalg.norm(away))
+        leaving = float((self.motion.velocity - center[3:]) @ away) / max(distance, 1e-9)
+        near = max(distance - arm - self.motion.arm_length, 0.0)
+        # From rest to the velocity of a body at this distance.
+        a = force / mass
+        least = max(leaving + 2 * math.sqrt(leaving**2 / 2 + a * near), abs(leaving)) / a
+        if least > self.horizon:
+            raise UnreachableError(
+                f"The target is {distance:.3g} m away and recedes at {leaving:.3g} m/s: with a "
+                f"force of {force:.3g} N, the robot meets it after {least:.4g} s at the earliest, "
+                f"and 'target.horizon' is {self.horizon:g} s.",
+                Proof.LIMITS,
+            )
+
 
 @dataclass(frozen=True)
 class ThrustGoal:
@@ -198,7 +217,7 @@ class ThrustGoal:
 
 def base_for_hand(robot: SpaceRobot, link: str, shape: Array, hand: Array) -> Array:
     """Return the base pose (7,) for which a link has a given pose (7,) in a shape (n,)."""
-    still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    still = np.eye(7)[6]
     there = np.concatenate(end_effector_pose(robot, link, still[:3], still[3:], shape))
     return compose_poses(hand, relative_pose(there, still))
 

@@ -151,7 +151,7 @@ class ThrustPlanner:
         self._wheels[ReactionWheels.of(robot.description).index] = True
         self.effort_limit = (1.0 - options.reserve) * robot.effort_limit
         """(n,) efforts that a plan may use."""
-        self._stages = cache(partial(thrust_stages, robot, len(self.propulsion.cost)))
+        self.stages = cache(partial(thrust_stages, robot, len(self.propulsion.cost)))
         self._solvers: dict[tuple[EndKind, KeptPlaces], ThrustSolver] = {}
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
@@ -192,7 +192,9 @@ class ThrustPlanner:
         a motion for.
         """
         boundary = self._start(start, np.zeros(0))
-        self._require_catch(boundary.start, grapple)
+        force, limits = self.propulsion.largest_force(), self.limits
+        arm = reach_of_end_effector(self.robot, limits.lower, limits.upper, self.link)
+        grapple.require_in_time(boundary.start[7:13], self.robot.total_mass, force, arm)
         s, reach = state_parts(boundary.bounds)[4], np.where(self._wheels, np.inf, _GRASP_REACH)
         s[:] = np.clip(s, start.q - reach, start.q + reach)
         kind = EndKind(self.link, target=True)
@@ -212,7 +214,7 @@ class ThrustPlanner:
         kept = bodies.kept
         if (kind, kept) not in self._solvers:
             self._solvers[kind, kept] = ThrustSolver(
-                self._stages(kind),
+                self.stages(kind),
                 self.propulsion,
                 self.options.intervals,
                 self.limits.acceleration,
@@ -240,25 +242,6 @@ class ThrustPlanner:
         bounds[:, 0, :13], v[:, 0] = state[:13], start.qdot
         v[:, -1, self._wheels] = start.qdot[self._wheels]
         return ThrustBoundary(state, goals, bounds)
-
-    def _require_catch(self, state: Array, grapple: Grapple) -> None:
-        robot, target, options = self.robot, grapple.motion, self.limits
-        away = target.center_of_mass(0.0) - state[7:10]
-        distance = float(np.linalg.norm(away))
-        leaving = float((target.velocity - state[10:13]) @ away) / max(distance, 1e-9)
-        force = self.propulsion.largest_force()
-        reach = reach_of_end_effector(robot, options.lower, options.upper, self.link)
-        near = max(distance - reach - target.arm_length, 0.0)
-        # From rest to the velocity of a body at this distance.
-        a = force / robot.total_mass
-        least = max(leaving + 2 * math.sqrt(leaving**2 / 2 + a * near), abs(leaving)) / a
-        if least > grapple.horizon:
-            raise UnreachableError(
-                f"The target is {distance:.3g} m away and recedes at {leaving:.3g} m/s: with a "
-                f"force of {force:.3g} N, the robot meets it after {least:.4g} s at the earliest, "
-                f"and 'target.horizon' is {grapple.horizon:g} s.",
-                Proof.LIMITS,
-            )
 
     def _boundary(self, start: RobotMotion, goal: ThrustGoal) -> tuple[ThrustBoundary, Array]:
         """Return both ends of a motion, and the shape (n,) at its end."""
@@ -347,9 +330,8 @@ class _Search:
     """Time at which a target is met, s."""
 
     def _ways(self, base: Array, shape: Array, sides: Array, time: float) -> Iterator[ThrustKnots]:
-        """Yield guesses to a base pose (7,) and a shape (n,) that are clear of obstacles, in a
-        time, or to a pose at rest in the time that they need, the straightest first: each bows out
-        to the side (3,) with the most room.
+        """Yield clear guesses to a base pose (7,) and a shape (n,) in a time, or longer without a
+        target, the straightest first: each bows out to the side (3,) with the most room.
         """
         longest = math.inf if self.grapple is None else time + 1e-6
         bow = max(float(np.linalg.norm(base[:3] - self.boundary.start[7:10])) / 2, 0.5)
@@ -408,12 +390,11 @@ class _Search:
         assert self.grapple is not None
         time = latest
         while time < self.grapple.horizon:
-            guess = self._guess_at(time)
-            if guess is None:
-                time += _MEETING_PERIOD
-                continue
-            yield guess
-            time += max(_MEETING_PERIOD, _LATER * time)
+            wait = _MEETING_PERIOD
+            if (guess := self._guess_at(time)) is not None:
+                yield guess
+                wait = max(wait, _LATER * time)
+            time += wait
         while (latest := latest / (1 + _LATER)) >= self.earliest:
             if (guess := self._guess_at(latest)) is not None:
                 yield guess
@@ -524,13 +505,8 @@ class _Search:
             duration = DurationBounds(self.earliest, self.latest)
         boundary = self.boundary._replace(goals=self._goals(guess.duration))
         planes = self.bodies.planes(guess) if planes is None else planes
-        return self._solver.solve(
-            boundary, guess, weights, self.stop, duration, planes, center, begins
-        )
-
-    @property
-    def _solver(self) -> ThrustSolver:
-        return self.planner.solver(self.kind, self.bodies)
+        solver = self.planner.solver(self.kind, self.bodies)
+        return solver.solve(boundary, guess, weights, self.stop, duration, planes, center, begins)
 
     def _weights(self, guess: ThrustKnots, rounding: float = 1.0) -> Weights:
         """Return the weights of least propellant, or of least time, in units of the guess."""
@@ -586,7 +562,7 @@ class _Search:
     def _end_error(self, motion: ThrustMotion) -> float:
         """Return the largest error at the end, m, rad, m/s, except that of angular momenta."""
         last = np.append(motion.step, with_joints_moved(motion.final_state, motion.step / 2))
-        rows = self._solver.end.values(last, self._goals(motion.duration))
+        rows = self.planner.stages(self.kind)[2].values(last, self._goals(motion.duration))
         of_poses = 9 if self.kind.target else rows.numel()
         return float(np.abs(rows.full()[:of_poses]).max(initial=0.0))
 

@@ -74,7 +74,6 @@ KeptPlaces = tuple[tuple[int, tuple[int, ...]], ...]
 K - 1.
 """
 
-
 _COST_OF_LACK = 1e3
 """Weight of missing clearance between pairs, per metre."""
 
@@ -354,8 +353,6 @@ class ThrustSolver:
         acceleration: Array,
         pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]],
     ) -> None:
-        self.end = stages[2]
-        """Rows of the last knot."""
         self._propulsion, self._acceleration = propulsion, acceleration
         n, m = len(acceleration), len(propulsion.cost)
         self._layout = Layout((13 + 2 * n,), (n, m), intervals, bool(pairs))
