@@ -384,28 +384,29 @@ class _Search:
         return guess.stretched(time / guess.duration)
 
     def _meetings(self, latest: float) -> Iterator[ThrustKnots]:
-        """Yield clear guesses at a target from a time on, each one much later than the one before,
-        which was in vain; then those of earlier times.
+        """Yield clear guesses at a target, first on the side of its fixture, then past it: from a
+        time on, each one much later than the one before, which was in vain, then earlier ones.
         """
         assert self.grapple is not None
-        time = latest
-        while time < self.grapple.horizon:
-            wait = _MEETING_PERIOD
-            if (guess := self._guess_at(time)) is not None:
-                yield guess
-                wait = max(wait, _LATER * time)
-            time += wait
-        while (latest := latest / (1 + _LATER)) >= self.earliest:
-            if (guess := self._guess_at(latest)) is not None:
-                yield guess
+        for past in (False, True):
+            time = latest
+            while time < self.grapple.horizon:
+                wait = _MEETING_PERIOD
+                if (guess := self._guess_at(time, past=past)) is not None:
+                    yield guess
+                    wait = max(wait, _LATER * time)
+                time += wait
+            time = latest
+            while (time := time / (1 + _LATER)) >= self.earliest:
+                if (guess := self._guess_at(time, past=past)) is not None:
+                    yield guess
 
-    def _guess_at(self, time: float) -> ThrustKnots | None:
-        """Return a clear guess that meets a target at a time: on the side of its fixture or, if
-        the target is in the way, past it.
+    def _guess_at(self, time: float, *, past: bool) -> ThrustKnots | None:
+        """Return a clear guess that meets a target at a time, on the side of its fixture or past
+        it; None if there is none.
         """
         base, shape, fixture = self._meeting(time)
-        ways = (self._ways(base, shape, sides, time) for sides in (fixture, self._sides(base)))
-        return next(itertools.chain.from_iterable(ways), None)
+        return next(self._ways(base, shape, self._sides(base) if past else fixture, time), None)
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
         options = self.planner.options
