@@ -226,6 +226,11 @@ def nonnegative(default: Value, description: str, unit: str = "", **attributes: 
     return parameter(default, description, unit, minimum=0.0, **attributes)
 
 
+def for_each_joint(description: str, unit: str, maximum: float = 1e9) -> Any:
+    """Return a :func:`nonnegative` array with one entry per joint, also accepted by joint name."""
+    return nonnegative((), description, unit, maximum=maximum, of_joints=True, by_name=True)
+
+
 def group(default: Any) -> Any:
     """Return a field that contains a configuration: its parameters are ``<field>.<parameter>``.
 

@@ -14,7 +14,7 @@ from spacerobot_ros.model import SpaceRobot, symbolic_rotations
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
 from spacerobot_ros.model.wheels import ReactionWheels
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import for_each_joint, nonnegative, parameter
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.schedule import held_velocities
 from spacerobot_ros.resources import suggestion
@@ -24,28 +24,16 @@ from spacerobot_ros.resources import suggestion
 class MotionOptions:
     """Options for methods that keep joint velocities and accelerations within limits."""
 
-    max_velocity: tuple[float, ...] = parameter(
-        (),
-        "speed limit of every joint, if below the URDF limit; []: the URDF limit",
-        unit="m/s or rad/s",
-        minimum=0.0,
-        maximum=1e9,
-        of_joints=True,
-        by_name=True,
+    max_velocity: tuple[float, ...] = for_each_joint(
+        "speed limit of every joint, if below the URDF limit; []: the URDF limit", "m/s or rad/s"
     )
-    max_acceleration: tuple[float, ...] = parameter(
-        (),
-        "acceleration limit of every joint; []: determined by ramp_time",
-        unit="m/s^2 or rad/s^2",
-        minimum=0.0,
-        maximum=1e9,
-        of_joints=True,
-        by_name=True,
+    max_acceleration: tuple[float, ...] = for_each_joint(
+        "acceleration limit of every joint; []: determined by ramp_time", "m/s^2 or rad/s^2"
     )
     ramp_time: float = parameter(
         0.5,
         "time from rest to full speed, if max_acceleration is not given",
-        unit="s",
+        "s",
         minimum=1e-6,
         maximum=1e9,
     )
@@ -55,61 +43,37 @@ class MotionOptions:
 class OptimalOptions(MotionOptions):
     """The options of ``optimal``."""
 
-    duration: float = parameter(
-        0.0,
-        "duration of a least-effort manoeuvre; 0: as fast as possible",
-        unit="s",
-        minimum=0.0,
-        maximum=1e9,
+    duration: float = nonnegative(
+        0.0, "duration of a least-effort manoeuvre; 0: as fast as possible", "s", maximum=1e9
     )
-    effort_limits: int = parameter(
+    effort_limits: int = nonnegative(
         0,
         "joint effort limits: 0: enforced if a manoeuvre within them is found, with "
         "effort_reserve if a controller tracks the manoeuvre, 1: enforced, with effort_reserve, "
         "2: ignored",
-        minimum=0,
         maximum=2,
     )
-    max_effort: tuple[float, ...] = parameter(
-        (),
+    max_effort: tuple[float, ...] = for_each_joint(
         "effort limit of every joint, if below the URDF limit; []: the URDF limit",
-        unit="N or N m",
-        minimum=0.0,
+        "N or N m",
         maximum=1e12,
-        of_joints=True,
-        by_name=True,
     )
-    effort_reserve: float = parameter(
-        0.15,
-        "fraction of the effort limits reserved for the controller's feedback",
-        minimum=0.0,
-        maximum=0.95,
+    effort_reserve: float = nonnegative(
+        0.15, "fraction of the effort limits reserved for the controller's feedback", maximum=0.95
     )
-    joint_margin: tuple[float, ...] = parameter(
-        (),
-        "margin of every joint to its limits, except in corrections; []: none",
-        unit="m or rad",
-        minimum=0.0,
-        maximum=1e9,
-        of_joints=True,
-        by_name=True,
+    joint_margin: tuple[float, ...] = for_each_joint(
+        "margin of every joint to its limits, except in corrections; []: none", "m or rad"
     )
-    base_position: int = parameter(
-        0,
-        "goal position: 0: reached if sliders allow it, 1: reached, 2: ignored",
-        minimum=0,
-        maximum=2,
+    base_position: int = nonnegative(
+        0, "goal position: 0: reached if sliders allow it, 1: reached, 2: ignored", maximum=2
     )
-    base_attitude: int = parameter(1, "1: reached, 0: ignored", minimum=0, maximum=1)
-    final_shape: int = parameter(
+    base_attitude: int = nonnegative(1, "1: reached, 0: ignored", maximum=1)
+    final_shape: int = nonnegative(
         0,
         "final joint positions if the goal has none: 0: any, 1: the current positions",
-        minimum=0,
         maximum=1,
     )
-    max_base_rate: float = parameter(
-        0.0, "largest base rate; 0: no limit", unit="rad/s", minimum=0.0, maximum=1e9
-    )
+    max_base_rate: float = nonnegative(0.0, "largest base rate; 0: no limit", "rad/s", maximum=1e9)
     keep_axis: tuple[float, ...] = parameter(
         (),
         "base axis that stays away from keep_direction; []: none",
@@ -119,17 +83,13 @@ class OptimalOptions(MotionOptions):
     keep_direction: tuple[float, ...] = parameter(
         (), "world direction from which keep_axis stays away", minimum=-1e9, maximum=1e9
     )
-    keep_angle: float = parameter(
-        0.0,
-        "smallest angle between keep_axis and keep_direction",
-        unit="rad",
-        minimum=0.0,
-        maximum=math.pi,
+    keep_angle: float = nonnegative(
+        0.0, "smallest angle between keep_axis and keep_direction", "rad", maximum=math.pi
     )
     keep_out: tuple[float, ...] = parameter(
         (),
         "boxes of joint positions to avoid: lower, then upper corner",
-        unit="m or rad",
+        "m or rad",
         minimum=-1e9,
         maximum=1e9,
     )
@@ -144,27 +104,23 @@ class OptimalOptions(MotionOptions):
         minimum=1,
         maximum=10000,
     )
-    agreeing: int = parameter(
+    agreeing: int = nonnegative(
         3,
         "number of starts that must find the best solution to end the search; 0: not used",
-        minimum=0,
         maximum=10000,
     )
     iterations: int = parameter(
         300, "largest number of solver steps for a guess", minimum=1, maximum=100000
     )
-    time_budget: float = parameter(
+    time_budget: float = nonnegative(
         0.0,
         "wall time for the search, five times as long if nothing is found; 0: no limit. If the "
         "budget ends the search, the plan depends on the machine load",
-        unit="s",
-        minimum=0.0,
+        "s",
         maximum=1e9,
     )
-    longest: float = parameter(
-        3600.0, "longest permitted manoeuvre", unit="s", minimum=1.0, maximum=1e9
-    )
-    cache: int = parameter(1, "1: cache manoeuvres on disk", minimum=0, maximum=1)
+    longest: float = parameter(3600.0, "longest permitted manoeuvre", "s", minimum=1.0, maximum=1e9)
+    cache: int = nonnegative(1, "1: cache manoeuvres on disk", maximum=1)
 
 
 _UNLIMITED_HALF_RANGE = np.pi
