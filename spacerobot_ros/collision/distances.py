@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.collision.rounded_box import RoundedBox, separating_planes, separation
+from spacerobot_ros.collision.rounded_box import RoundedBox, support, widest_gaps
 from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array, Shape
@@ -188,14 +188,19 @@ class EnclosureDistances:
     ) -> Array:
         """Return the bounds."""
         one, other = self._enclosures[first], self._enclosures[second]
-        return separation(one, R_1, r_1, other, R_2, r_2)
+        return widest_gaps(one, R_1, r_1, other, R_2, r_2)[0]
 
     def planes(
         self, first: int, R_1: Array, r_1: Array, second: int, R_2: Array, r_2: Array
     ) -> tuple[Array, Array]:
         """Return the distances between the enclosures, with planes and points."""
         one, other = self._enclosures[first], self._enclosures[second]
-        return separating_planes(one, R_1, r_1, other, R_2, r_2)
+        bounds, directions = widest_gaps(one, R_1, r_1, other, R_2, r_2)
+        on_first = support(one, R_1, directions)
+        on_second = support(other, R_2, -directions)
+        normals = np.einsum("nba,nb->na", R_1, directions)
+        offsets = np.einsum("na,na->n", normals, np.einsum("nba,nb->na", R_1, on_first))
+        return bounds, np.column_stack([normals, offsets, np.einsum("nba,nb->na", R_2, on_second)])
 
 
 DistanceFunction = ExactDistances | EnclosureDistances

@@ -101,11 +101,19 @@ def _around_points(points: Array, R: Array) -> RoundedBox:
     return min(found, key=lambda each: each.volume)
 
 
-def separation(
+def support(box: RoundedBox, R: Array, directions: Array) -> Array:
+    """Return the points (N, 3) of a box, rotated by R, that lie farthest in directions (N, 3)."""
+    axes = R @ box.pose.R
+    corner = box.half * np.sign(np.round(np.einsum("nba,nb->na", axes, directions), 9))
+    of_core = np.einsum("nab,nb->na", axes, corner)
+    return np.asarray(R @ box.pose.r + of_core + box.radius * directions)
+
+
+def widest_gaps(
     first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
-) -> Array:
-    """Return lower bounds (N,) on the distances between two rounded boxes, m; negative: penetration
-    depths.
+) -> tuple[Array, Array]:
+    """Return lower bounds (N,) on the distances between two rounded boxes, m (negative: penetration
+    depths), and the directions (N, 3) that attain them, from first to second.
 
     Parameters
     ----------
@@ -114,39 +122,6 @@ def separation(
     R_1, r_1, R_2, r_2
         Poses of these link frames in a common frame: attitudes (N, 3, 3), and positions (N, 3), m.
     """
-    return _widest_gaps(first, R_1, r_1, second, R_2, r_2)[0]
-
-
-def separating_planes(
-    first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
-) -> tuple[Array, Array]:
-    """Return the bounds from :func:`separation`, with the planes and points (N, 7) for which they
-    are attained.
-
-    A plane touches the first box. The plane is given by its unit normal toward the second box and
-    its distance from the origin, m, in the first link frame. The point, in the second link frame,
-    m, is where the second box is nearest to the plane. Parameters are as in :func:`separation`.
-    """
-    bounds, directions = _widest_gaps(first, R_1, r_1, second, R_2, r_2)
-    on_first = _support(first, R_1, directions)
-    on_second = _support(second, R_2, -directions)
-    normals = np.einsum("nba,nb->na", R_1, directions)
-    offsets = np.einsum("na,na->n", normals, np.einsum("nba,nb->na", R_1, on_first))
-    return bounds, np.column_stack([normals, offsets, np.einsum("nba,nb->na", R_2, on_second)])
-
-
-def _support(box: RoundedBox, R: Array, directions: Array) -> Array:
-    """Return the points (N, 3) of a box, rotated by R, that lie farthest in directions (N, 3)."""
-    axes = R @ box.pose.R
-    corner = box.half * np.sign(np.round(np.einsum("nba,nb->na", axes, directions), 9))
-    of_core = np.einsum("nab,nb->na", axes, corner)
-    return np.asarray(R @ box.pose.r + of_core + box.radius * directions)
-
-
-def _widest_gaps(
-    first: RoundedBox, R_1: Array, r_1: Array, second: RoundedBox, R_2: Array, r_2: Array
-) -> tuple[Array, Array]:
-    """Return the bounds (N,), and the directions (N, 3) that attain them, from first to second."""
     c_1, c_2 = r_1 + R_1 @ first.pose.r, r_2 + R_2 @ second.pose.r
     A, B = R_1 @ first.pose.R, R_2 @ second.pose.R
     radii = first.radius + second.radius
@@ -186,7 +161,7 @@ def nearest_points(
 ) -> Array:
     """Return the points (N, 3) on the second core that are approximately nearest to the first box.
 
-    Parameters are as in :func:`separation`.
+    Parameters are as in :func:`widest_gaps`.
     """
     c_1, c_2 = r_1 + R_1 @ first.pose.r, r_2 + R_2 @ second.pose.r
     cores = R_1 @ first.pose.R, R_2 @ second.pose.R

@@ -16,7 +16,7 @@ from spacerobot_ros.collision import (
     nearest_approach,
     nearest_approaches,
 )
-from spacerobot_ros.collision.rounded_box import RoundedBox, separation
+from spacerobot_ros.collision.rounded_box import RoundedBox, widest_gaps
 from spacerobot_ros.model import RobotDescription, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_rpy
@@ -249,7 +249,7 @@ def coal_distance(one: object, at: Pose, other: object, there: Pose) -> float:
 
 def bound(one: RoundedBox, at: Pose, other: RoundedBox, there: Pose) -> float:
     R_1, r_1, R_2, r_2 = (x[np.newaxis] for x in (at.R, at.r, there.R, there.r))
-    return float(separation(one, R_1, r_1, other, R_2, r_2)[0])
+    return float(widest_gaps(one, R_1, r_1, other, R_2, r_2)[0][0])
 
 
 @settings(max_examples=150, deadline=None)
