@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from spacerobot_ros.errors import PlanningError, counted, sentence_case
+from spacerobot_ros.errors import PlanningError, counted, quantity, sentence_case
 from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
@@ -27,7 +27,6 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
     PursuedGoals,
 )
-from spacerobot_ros.planning.execution.path_deviation import TrackingError
 from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
     ActiveGoal,
@@ -690,7 +689,7 @@ class Executive:
             return
         if job.reason.is_for_new_goal:
             self._accept_goal(ActiveGoal(job.identified, schedule, self._stamp_ns))
-        elif isinstance(job.error, TrackingError):
+        elif job.reason is PlanReason.TRACKING_ERROR:
             assert active is not None
             self._correct_path(active, job.error)
         else:
@@ -716,8 +715,9 @@ class Executive:
             message = why if active is None else f"{why} The earlier goal is still pursued."
             refused = PlannerStatus.of_goal(PlannerState.REFUSED, message, job.identified)
             self.outputs.append(refused)
-        elif isinstance(job.error, TrackingError):
-            message = f"{job.error}, and the remaining motion cannot be planned again: {why}"
+        elif reason is PlanReason.TRACKING_ERROR:
+            off = _deviation(job.error)
+            message = f"{off}, and the remaining motion cannot be planned again: {why}"
             self._add_notice("warning", message)
         else:
             assert active is not None
@@ -764,9 +764,9 @@ class Executive:
         )
         self.outputs += [status, ScheduleStart(schedule, begins)]
 
-    def _correct_path(self, active: ActiveGoal, error: TrackingError) -> None:
+    def _correct_path(self, active: ActiveGoal, error: PoseError | None) -> None:
         active.corrections += 1
-        message = f"{error}: the remaining motion is replanned."
+        message = f"{_deviation(error)}: the remaining motion is replanned."
         self._add_warning(EventKind.CORRECTION, message, active.identified, **active.counted)
 
     # -- ends of schedules and goals ----------------------------------------------------------
@@ -877,6 +877,12 @@ class Executive:
     def _add_abort(self, message: str, goal: IdentifiedGoal | None) -> None:
         goal_id = "" if goal is None else goal.goal_id
         self.outputs.append(PlannerStatus(PlannerState.ABORTED, message, goal_id=goal_id))
+
+
+def _deviation(error: PoseError | None) -> str:
+    assert error is not None
+    distance, angle = quantity(error.distance, "m"), quantity(error.angle, "rad")
+    return f"Deviates from the path by {distance} and {angle}"
 
 
 def _about(schedule: GaitSchedule) -> dict[str, str]:

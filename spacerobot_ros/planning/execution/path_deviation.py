@@ -10,13 +10,12 @@ a prior on the errors, yields the estimate (one Gauss-Newton step about the mode
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.errors import quantity
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
@@ -55,20 +54,6 @@ _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
 the remaining motion is replanned if its expected error exceeds the first fraction, and the expected
 error of the new plan may be at most the second fraction. Base rotations that are postponed until
 late in a motion take a long time."""
-
-
-@dataclass(frozen=True)
-class TrackingError:
-    """Deviation of the base from the path predicted by its schedule: m, rad."""
-
-    distance: float
-    angle: float
-
-    def __str__(self) -> str:
-        return (
-            f"Deviates from the path by {quantity(self.distance, 'm')} "
-            f"and {quantity(self.angle, 'rad')}"
-        )
 
 
 class PathCheck:
@@ -137,14 +122,13 @@ class PathCheck:
             self._next_pose += 1
         return self._next_pose < len(stamps) and stamps[self._next_pose] <= stamp_ns + slack
 
-    def error(self, state: RobotState) -> TrackingError | None:
-        """Return the tracking error in a state; None if within bounds."""
+    def error(self, state: RobotState) -> PoseError | None:
+        """Return the error of a state relative to the path; None if within bounds."""
         k = self._next_pose
         turn = attitude_error(state.quaternion, self._path.quaternion[k])
-        distance = float(np.linalg.norm(state.position - self._path.position[k]))
-        angle = float(np.linalg.norm(turn))
-        too_far = distance > self._max_distance or angle > self._max_angle
-        return TrackingError(distance, angle) if too_far else None
+        error = PoseError(self._path.position[k] - state.position, turn)
+        too_far = error.distance > self._max_distance or error.angle > self._max_angle
+        return error if too_far else None
 
     def average_pose(self, state: RobotState) -> RobotState:
         """Add a state to the mean deviation; return the state with the averaged pose.

@@ -26,7 +26,6 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
-from spacerobot_ros.planning.execution.path_deviation import TrackingError
 from spacerobot_ros.planning.execution.status import PlanReason
 from spacerobot_ros.planning.execution.tracker import TakeOver
 from spacerobot_ros.planning.methods.registry import METHODS, build_method
@@ -60,7 +59,7 @@ class PlanJob:
 
     identified: IdentifiedGoal
     reason: PlanReason
-    error: PoseError | TrackingError | None = None
+    error: PoseError | None = None
     take_over: TakeOver | None = None
 
 
