@@ -63,14 +63,14 @@ class Approach:
 class _Path:
     """A path of shapes (N + 1, n) at the ticks, with the base poses if obstacles matter, else None.
 
-    ``distance_bounds`` (N + 1, P) are lower bounds on the distances of pairs, m;
-    ``largest_motions`` (N, P) the largest relative motions of pairs in each tick, m.
+    ``largest_motions`` (N, P) are the largest relative motions of pairs in each tick, m, and
+    ``lower_bounds`` (N, P) lower bounds on their distances in each tick, m.
     """
 
     positions: Array
     base: BasePoses | None
-    distance_bounds: Array
     largest_motions: Array
+    lower_bounds: Array
 
     @classmethod
     def of(cls, geometry: CollisionGeometry, positions: Array, base: BasePoses | None) -> _Path:
@@ -87,16 +87,7 @@ class _Path:
             chord = np.linalg.norm(np.diff(base.quaternion, axis=0), axis=1)
             turned = 4 * np.arcsin(np.minimum(np.minimum(chord, np.sqrt(4 - chord**2)) / 2, 1.0))
             motion += np.outer(turned, from_base) + np.outer(straight, geometry.with_obstacles)
-        return cls(positions, base, bounds, motion)
-
-    @property
-    def lower_bounds_along_path(self) -> Array:
-        """Lower bounds (P,) on the distances along the whole path, m."""
-        return np.asarray(
-            ((self.distance_bounds[:-1] + self.distance_bounds[1:] - self.largest_motions) / 2).min(
-                axis=0
-            )
-        )
+        return cls(positions, base, motion, (bounds[:-1] + bounds[1:] - motion) / 2)
 
     def interpolated(self, ticks: Array) -> tuple[Array, BasePoses | None]:
         """Return configurations (K, n) and base poses at times (K,) in ticks."""
@@ -128,7 +119,7 @@ def nearest_approaches(
     if not len(geometry.pairs):
         return []
     path = _Path.of(geometry, positions, base)
-    near = np.flatnonzero(path.lower_bounds_along_path < required)
+    near = np.flatnonzero(path.lower_bounds.min(axis=0) < required)
     found = (_nearest(geometry, path, p, required[p]) for p in near.tolist())
     return sorted((each for each in found if each), key=lambda each: each.distance)
 
@@ -143,7 +134,7 @@ def nearest_approach(
     if not len(geometry.pairs):
         return None
     path = _Path.of(geometry, positions, base)
-    least = path.lower_bounds_along_path
+    least = path.lower_bounds.min(axis=0)
     best: Approach | None = None
     for pair in np.argsort(least, kind="stable").tolist():
         if best is not None and least[pair] >= best.distance:
@@ -155,13 +146,11 @@ def nearest_approach(
 
 def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) -> Approach | None:
     """Return the nearest approach of a pair; None if it does not come nearer than limit."""
-    motion, bounds = path.largest_motions, path.distance_bounds
 
     def distances(ticks: Array) -> Array:
         return geometry.distances(pair, geometry.poses(*path.interpolated(ticks)))
 
-    close = (bounds[:-1, pair] + bounds[1:, pair] - motion[:, pair]) / 2 < limit
-    starts = np.flatnonzero(close)
+    starts = np.flatnonzero(path.lower_bounds[:, pair] < limit)
     if not len(starts):
         return None
     ticks = np.unique(np.concatenate([starts, starts + 1])).astype(float)
@@ -170,7 +159,7 @@ def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) 
     best, at = float(known[least]), float(ticks[least])
     index = np.searchsorted(ticks, starts)
     left, right = starts.astype(float), starts + 1.0
-    d_0, d_1, v = known[index], known[index + 1], motion[starts, pair]
+    d_0, d_1, v = known[index], known[index + 1], path.largest_motions[starts, pair]
     while True:
         # Only where the distance may be smaller than all known ones, and relevant.
         open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _MOTION_RESOLUTION)

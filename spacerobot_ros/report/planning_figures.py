@@ -129,7 +129,7 @@ def _planar_figure(found: Analysis) -> Figure:
     """Draw H over the plane of two joints, and the phase of squares around its peak."""
     robot = found.robot
     i, j = sorted(robot.joint_names.index(name) for name in found.planar.joints)
-    plane = PlanarPhase(robot).plane(found.shape, i, j)
+    plane = PhasePlane(PlanarPhase(robot), found.shape, i, j)
     lower, upper = (bound[[i, j]] for bound in shape_box(robot))
     centre = curvature_peaks(plane, np.zeros(2), np.array([[lower, upper]]))[0]
     figure = new_figure(4.6)

@@ -23,6 +23,7 @@ from spacerobot_ros.planning import Tolerance, plan
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.methods.geometric_phase import (
+    PhasePlane,
     PlanarPhase,
     check_planar_chain,
     curvature_peaks,
@@ -149,7 +150,8 @@ def test_plan_and_execution_are_reported_with_the_duration_of_the_gait() -> None
 
 def test_a_box_without_width_has_its_largest_curvature_in_it() -> None:
     """As for the largest square that the limits of one joint leave room for."""
-    plane = PlanarPhase(SpaceRobot.from_file(FOLDER / "planar_chain.urdf")).plane(np.zeros(2), 0, 1)
+    phase = PlanarPhase(SpaceRobot.from_file(FOLDER / "planar_chain.urdf"))
+    plane = PhasePlane(phase, np.zeros(2), 0, 1)
     boxes = np.array([[[0.4, -2.0], [0.4, 2.0]], [[-0.3, 0.7], [-0.3, 0.7]]])
     line, point = curvature_peaks(plane, np.array([0.4, 0.1]), boxes)
     assert point.tolist() == [-0.3, 0.7]

@@ -87,7 +87,7 @@ def refusal(robot: SpaceRobot, state: RobotState, goal: Goal, **options: Any) ->
     request = PlanRequest(state, goal, Tolerance(1e-3, 2e-3, 1e-3))
     try:
         GoalSpecification.of(robot, chosen).boundary_conditions(
-            robot, request, goal.joint_positions, MotionLimits.of(robot, chosen)
+            request, goal.joint_positions, MotionLimits.of(robot, chosen)
         )
     except UnreachableError as error:
         pytest.fail(f"{error}")

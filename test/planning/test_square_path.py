@@ -35,7 +35,7 @@ from support.planners import refusal_in
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase, planar_axis
+from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, planar_axis
 
 
 @pytest.mark.parametrize("branched", [False, True])
@@ -49,7 +49,7 @@ def test_the_curvature_in_the_plane_of_two_joints(branched: bool) -> None:
         curl = (tree.s(psi + h[i]) - tree.s(psi - h[i]))[j]
         curl -= (tree.s(psi + h[j]) - tree.s(psi - h[j]))[i]
         # The plane knows where the other joints are, and not where these two were.
-        plane = phase.plane(np.where(np.isin(np.arange(4), [i, j]), 9.0, psi), i, j)
+        plane = PhasePlane(phase, np.where(np.isin(np.arange(4), [i, j]), 9.0, psi), i, j)
         K = plane.curvature(psi[[i, j]]) * phase.axis
         np.testing.assert_allclose(K, -curl / 2e-5 * tree.plane[:, 2], atol=1e-8)
 

@@ -341,8 +341,7 @@ class Goal:
         if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_ANGLE):
             raise GoalError(
                 f"The rotation vector {rotvec!r} does not consist of three finite numbers of at "
-                f"most "
-                f"{_MAX_ANGLE:.2g} rad."
+                f"most {_MAX_ANGLE:.2g} rad."
             )
         return cls.checked(position, quaternion_from_rotvec(vector))
 

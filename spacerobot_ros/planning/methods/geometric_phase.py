@@ -124,7 +124,7 @@ def check_planar_chain(robot: SpaceRobot) -> Controllability:
     middle = box.mean(axis=0)
     tops = []
     for i, j in itertools.combinations(range(robot.n), 2):
-        plane, shape = phase.plane(middle, i, j), middle.copy()
+        plane, shape = PhasePlane(phase, middle, i, j), middle.copy()
         shape[[i, j]] = curvature_peaks(plane, middle[[i, j]], box[np.newaxis, :, [i, j]])[0]
         tops.append((abs(float(plane.curvature(shape[[i, j]]))), (names[i], names[j]), shape))
     largest, pair, shape = max(tops, key=lambda top: top[0])
@@ -170,11 +170,6 @@ class PlanarPhase:
         A = self.robot.function("connection")(shapes.reshape(-1, self.robot.n).T).full()[3:]
         s = (self.axis @ A).reshape(shapes.shape)
         return np.asarray(-np.einsum("p,lpn,ln->l", weights, s, moves))
-
-    def plane(self, psi: Array, i: int, j: int) -> PhasePlane:
-        """Return the phase in the plane of joints i and j, with the other joints at rest at ``psi``
-        (n,)."""
-        return PhasePlane(self, psi, i, j)
 
 
 class PhasePlane:

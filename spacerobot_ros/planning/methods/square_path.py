@@ -278,7 +278,7 @@ class SquarePathGait(GaitMethod):
             room = 2 * float(np.minimum(self._centre - lower, upper - self._centre).min())
         if room <= 0:
             return None
-        plane = self._phase.plane(psi_e, *pair)
+        plane = PhasePlane(self._phase, psi_e, *pair)
         sides = np.linspace(0.0, min(room, _MAX_SIDE) * _USED_RANGE_SHARE, _SIDE_SAMPLES + 1)[1:]
         if self._centre is not None:
             centres = np.tile(self._centre, (_SIDE_SAMPLES, 1))

@@ -301,8 +301,8 @@ class EndEffectorSpecification:
         Rows for the end-effectors, and for the base link if its position is requested.
     base
         How the joints rotate the base.
-    attitude, position, shape
-        Whether base attitude, base position and joint positions are part of the goal.
+    base_parts, shape
+        The components of the base pose in the goal, and whether joint positions are part of it.
     overdetermined
         Whether the goal has more coordinates than the joints can move independently. Few such goals
         can be reached, and only in isolated shapes, which inverse kinematics finds before
@@ -311,29 +311,23 @@ class EndEffectorSpecification:
 
     rows: EndEffectorRows
     base: GoalSpecification
-    attitude: bool
-    position: bool
+    base_parts: frozenset[Controlled]
     shape: bool
     overdetermined: bool
 
     @classmethod
-    def of(cls, robot: SpaceRobot, base: GoalSpecification, goal: Goal) -> EndEffectorSpecification:
-        """Return the specification for goals with the components of this goal.
-
-        Raises
-        ------
-        GoalError
-            The link does not exist, or is the base.
+    def of(cls, base: GoalSpecification, goal: Goal) -> EndEffectorSpecification:
+        """Return the specification for goals with the components of this goal, whose links are
+        resolved (:meth:`.Goal.for_robot`).
         """
-        goal = goal.for_robot(robot.description)
-        attitude, position = "attitude" in goal.base, "position" in goal.base
+        robot = base.robot
         links = [(each.link, each.quaternion is not None) for each in goal.end_effectors]
-        if position:
+        if "position" in goal.base:
             links.append((robot.base_link, False))
         rows = EndEffectorRows(robot, links, base.base_rotations.loop_axes)
-        rank, count = rows.rank(attitude)
+        rank, count = rows.rank("attitude" in goal.base)
         shape = goal.joint_positions is not None
-        return cls(rows, base, attitude, position, shape, rank < count)
+        return cls(rows, base, goal.base, shape, rank < count)
 
     @staticmethod
     def key(goal: Goal) -> tuple[object, ...]:
@@ -344,12 +338,12 @@ class EndEffectorSpecification:
     @property
     def controls(self) -> frozenset[Controlled]:
         """The controlled components by name."""
-        parts: set[Controlled] = {"shape", "end_effectors"}
-        if self.attitude:
-            parts.add("attitude")
-        if self.position:
-            parts.add("position")
-        return frozenset(parts)
+        return self.base_parts | {"shape", "end_effectors"}
+
+    @property
+    def attitude(self) -> bool:
+        """Whether the base attitude is part of the goal."""
+        return "attitude" in self.base_parts
 
     @property
     def ends_in_one_shape(self) -> bool:
@@ -372,11 +366,7 @@ class EndEffectorSpecification:
         return None if self.ends_in_one_shape else self.rows
 
     def boundary_conditions(
-        self,
-        robot: SpaceRobot,
-        request: PlanRequest,
-        shape: Array | None,
-        limits: MotionLimits,
+        self, request: PlanRequest, shape: Array | None, limits: MotionLimits
     ) -> BoundaryConditions:
         """Return the boundary conditions for a request, and possible end states for the initial
         guesses.
@@ -392,17 +382,18 @@ class EndEffectorSpecification:
         PlanningError
             The method does not support such a goal.
         """
-        state, goal, tolerance = request.state, request.goal, request.tolerance
+        robot, state = self.base.robot, request.state
+        goal, tolerance = request.goal, request.tolerance
         if robot.n == 0:
             name = robot.description.name
             raise PlanningError(f"Robot '{name}' has no joints that could move an end-effector.")
         turn = quaternion_multiply(quaternion_inverse(state.quaternion), goal.quaternion)
         if self.attitude:
-            self.base.require_suitable(robot)
-            self.base.require_turning_with_drift(robot, state)
-            self.base.require_reachable_turn(robot, turn, tolerance.attitude)
+            self.base.require_suitable()
+            self.base.require_turning_with_drift(state)
+            self.base.require_reachable_turn(turn, tolerance.attitude)
         goals = list(goal.end_effectors)
-        if self.position:
+        if "position" in self.base_parts:
             goals.append(EndEffectorGoal(robot.base_link, goal.position))
         rows = self.rows
         rows.require_directions(state, goals, (tolerance.position, tolerance.attitude))

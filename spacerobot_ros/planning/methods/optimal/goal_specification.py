@@ -69,6 +69,8 @@ class GoalSpecification:
 
     Attributes
     ----------
+    robot
+        The model.
     position, attitude
         Whether these are controlled.
     same_shape
@@ -77,6 +79,7 @@ class GoalSpecification:
         How the joints rotate the base.
     """
 
+    robot: SpaceRobot
     position: bool
     attitude: bool
     same_shape: bool
@@ -88,12 +91,8 @@ class GoalSpecification:
         position = options.base_position == 1
         if options.base_position == 0:
             position = _slides_anywhere(robot)
-        return cls(
-            position,
-            bool(options.base_attitude),
-            bool(options.final_shape),
-            BaseRotations.of(robot),
-        )
+        attitude, same_shape = bool(options.base_attitude), bool(options.final_shape)
+        return cls(robot, position, attitude, same_shape, BaseRotations.of(robot))
 
     @property
     def controls(self) -> frozenset[Controlled]:
@@ -110,7 +109,7 @@ class GoalSpecification:
         """Directions (m, 3), in the base frame, along which the attitude must be reached."""
         return self.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
-    def require_suitable(self, robot: SpaceRobot) -> None:
+    def require_suitable(self) -> None:
         """Reject a robot that cannot reach any goal in the controlled components.
 
         Raises
@@ -118,8 +117,8 @@ class GoalSpecification:
         PlanningError
             The robot cannot reach any goal; the message says why.
         """
-        name = robot.description.name
-        if robot.n == 0:
+        name = self.robot.description.name
+        if self.robot.n == 0:
             raise PlanningError(NO_JOINTS.format(name))
         if self.attitude and self.base_rotations.turns_base and not len(self.base_rotations.axes):
             raise PlanningError(
@@ -129,18 +128,14 @@ class GoalSpecification:
             )
 
     def boundary_conditions(
-        self,
-        robot: SpaceRobot,
-        request: PlanRequest,
-        shape: Array | None,
-        limits: MotionLimits,
+        self, request: PlanRequest, shape: Array | None, limits: MotionLimits
     ) -> BoundaryConditions:
         """Return the boundary conditions for a request.
 
         Parameters
         ----------
-        robot, request, limits
-            The model, the request, and the motion limits.
+        request, limits
+            The request, and the motion limits.
         shape
             (n,) of the goal, within the joint limits; None: any.
 
@@ -153,20 +148,21 @@ class GoalSpecification:
         PlanningError
             The method does not plan for such a goal.
         """
-        self.require_suitable(robot)
+        self.require_suitable()
+        robot = self.robot
         state, goal, tolerance = request.state, request.goal, request.tolerance
         turn = quaternion_multiply(quaternion_inverse(state.quaternion), goal.quaternion)
         if shape is None and self.same_shape:
             shape = state.q
         if self.attitude:
-            self.require_turning_with_drift(robot, state)
-            self.require_reachable_turn(robot, turn, tolerance.attitude)
+            self.require_turning_with_drift(state)
+            self.require_reachable_turn(turn, tolerance.attitude)
             if robot.n == 1 and len(self.base_rotations.axes):
                 _require_within_one_joint(
                     robot, limits, state.q, self.base_rotations.axes[0], turn, tolerance.attitude
                 )
             if shape is not None and len(self.axes) and not self.base_rotations.loops_turn_base:
-                turn = self._turn_on_way_to_shape(robot, turn, state.q, shape, tolerance.attitude)
+                turn = self._turn_on_way_to_shape(turn, state.q, shape, tolerance.attitude)
                 # With one joint, the goal attitude fixes the final shape.
                 shape = shape if robot.n > 1 else None
         if not self.position:
@@ -186,9 +182,8 @@ class GoalSpecification:
             if miss > tolerance.position:
                 raise UnreachableError(
                     f"The goal attitude and shape put the base {miss:.3g} m from the goal "
-                    "position: "
-                    "without thrust the centre of mass stays where it is. Omit the shape, or "
-                    "ignore the position with optimal.base_position 2.",
+                    "position: without thrust the centre of mass stays where it is. Omit the "
+                    "shape, or ignore the position with optimal.base_position 2.",
                     Proof.MOMENTUM,
                 )
             return BoundaryConditions(state.q, turn, shape, shape)
@@ -201,7 +196,7 @@ class GoalSpecification:
             return BoundaryConditions(state.q, turn, likely, likely)
         return BoundaryConditions(state.q, turn, likely, center=center)
 
-    def require_turning_with_drift(self, robot: SpaceRobot, state: RobotState) -> None:
+    def require_turning_with_drift(self, state: RobotState) -> None:
         """Reject drifting robots whose joints do not rotate the base, or rotate it about another
         axis.
 
@@ -210,7 +205,7 @@ class GoalSpecification:
         PlanningError
             The robot cannot stop its base.
         """
-        L_W, name = state.angular_momentum, robot.description.name
+        L_W, name = state.angular_momentum, self.robot.description.name
         if not L_W.any():
             return
         size = float(np.linalg.norm(L_W))
@@ -223,7 +218,7 @@ class GoalSpecification:
             )
         if len(self.base_rotations.axes) == 1:
             axis = self.base_rotations.axes[0]
-            D = robot.function("locked_inertia", compile=False)(state.q)[0].full()
+            D = self.robot.function("locked_inertia", compile=False)(state.q)[0].full()
             turned = matrix_from_quaternion(state.quaternion).T @ L_W / size
             off = max(np.linalg.norm(np.cross(axis, x)) for x in (turned, D @ axis / D.max()))
             if off > _AXIS_TOLERANCE:
@@ -233,9 +228,9 @@ class GoalSpecification:
                     "0, the goal attitude is ignored."
                 )
 
-    def require_reachable_turn(self, robot: SpaceRobot, turn: Array, tolerance: float) -> None:
+    def require_reachable_turn(self, turn: Array, tolerance: float) -> None:
         """Reject attitudes that the joints cannot reach."""
-        axes, name = self.base_rotations.axes, robot.description.name
+        axes, name = self.base_rotations.axes, self.robot.description.name
         tilt = swing_angle(turn, axes)
         if tilt > max(tolerance, _ZERO_ROTATION_ANGLE):
             if not len(axes):
@@ -244,16 +239,16 @@ class GoalSpecification:
                     f"its base, and the goal is rotated by {tilt:.4g} rad.",
                     Proof.RANK,
                 )
-            raise tilted_goal_error(robot, axes[0], tilt)
+            raise tilted_goal_error(self.robot, axes[0], tilt)
 
     def _turn_on_way_to_shape(
-        self, robot: SpaceRobot, turn: Array, start: Array, shape: Array, tolerance: float
+        self, turn: Array, start: Array, shape: Array, tolerance: float
     ) -> Array:
         """Return the turn (4,) on any path to a shape (n,), for robots whose loops rotate nothing.
 
         UnreachableError if it is not the goal rotation.
         """
-        axis, way = self.base_rotations.axes[0], shape - start
+        axis, way, robot = self.base_rotations.axes[0], shape - start, self.robot
         nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
         rates = [-axis @ robot.connection(start + (1 + node) / 2 * way)[3:] @ way for node in nodes]
         angle = float(weights @ np.array(rates)) / 2

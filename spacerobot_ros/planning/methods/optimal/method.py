@@ -192,12 +192,11 @@ class OptimalGait(GaitMethod):
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
-        """Return the kind of a goal, created on demand; GoalError if the robot has no such link."""
         if not goal.end_effectors:
             return self._base_goals
         key = EndEffectorSpecification.key(goal)
         if key not in self._end_effector_goals:
-            of = EndEffectorSpecification.of(self.robot, self._specification, goal)
+            of = EndEffectorSpecification.of(self._specification, goal)
             model = replace(self._model, axes=of.axes, end_effectors=of.rows_at_end)
             self._end_effector_goals[key] = _GoalKind.of(of, model)
         return self._end_effector_goals[key]
@@ -206,7 +205,7 @@ class OptimalGait(GaitMethod):
     @override
     def require_suitable(cls, robot: SpaceRobot) -> None:
         """Reject robots that cannot rotate their base; see :meth:`GaitMethod.require_suitable`."""
-        GoalSpecification.of(robot, OptimalOptions()).require_suitable(robot)
+        GoalSpecification.of(robot, OptimalOptions()).require_suitable()
 
     @override
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
@@ -486,7 +485,7 @@ class OptimalGait(GaitMethod):
     def _boundary(self, request: PlanRequest, shape: Array | None) -> BoundaryConditions:
         """Return the boundary conditions of a request with this goal shape (n,); None: any."""
         specification, state = self._kind_of(request.goal).specification, request.state
-        ends = specification.boundary_conditions(self.robot, request, shape, self._limits)
+        ends = specification.boundary_conditions(request, shape, self._limits)
         R_BW, direction_W = (
             matrix_from_quaternion(state.quaternion).T,
             self._constraints.direction_W,

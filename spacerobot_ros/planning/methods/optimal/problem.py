@@ -48,9 +48,8 @@ class OptimalOptions(MotionOptions):
     )
     effort_limits: int = nonnegative(
         0,
-        "joint effort limits: 0: enforced if a manoeuvre within them is found, with "
-        "effort_reserve if a controller tracks the manoeuvre, 1: enforced, with effort_reserve, "
-        "2: ignored",
+        "joint effort limits: 0: enforced if a manoeuvre within them is found, with effort_reserve "
+        "if a controller tracks the manoeuvre, 1: enforced, with effort_reserve, 2: ignored",
         maximum=2,
     )
     max_effort: tuple[float, ...] = for_each_joint(
