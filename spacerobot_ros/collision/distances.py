@@ -90,24 +90,15 @@ class ExactDistances:
 
     def _geometry(self, solid: Solid) -> tuple[Any, Array, Array]:
         """Return the shape, and its attitude and position in the frame of its link."""
-        coal, shape = self._coal, solid.shape
-        match shape.kind:
-            case "sphere":
-                made = coal.Sphere(shape.size[0])
-            case "box":
-                made = coal.Box(*shape.size)
-            case "cylinder":
-                made = coal.Cylinder(*shape.size)
-            case "capsule":
-                made = coal.Capsule(*shape.size)
-            case _:
-                assert solid.vertices is not None
-                if (hull := self._hull(solid.vertices)) is not None:
-                    return hull, np.eye(3), np.zeros(3)
-                box = solid.enclosure
-                sides = 2 * (box.half + box.radius)
-                return coal.Box(*sides.tolist()), box.pose.R, box.pose.r
-        return made, shape.pose.R, shape.pose.r
+        coal, shape, box = self._coal, solid.shape, solid.enclosure
+        if solid.vertices is None:
+            kinds = {"sphere": coal.Sphere, "box": coal.Box, "cylinder": coal.Cylinder}
+            kind = kinds.get(shape.kind, coal.Capsule)
+            return kind(*shape.size), shape.pose.R, shape.pose.r
+        if (hull := self._hull(solid.vertices)) is not None:
+            return hull, np.eye(3), np.zeros(3)
+        sides = 2 * (box.half + box.radius)
+        return coal.Box(*sides.tolist()), box.pose.R, box.pose.r
 
     def _hull(self, vertices: Array) -> Any:
         """Return the convex hull of vertices (V, 3); None if coal has none for them."""

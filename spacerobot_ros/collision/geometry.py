@@ -291,14 +291,6 @@ class CollisionGeometry:
         a, b = self._link_of[i], self._link_of[j]
         return self.distance_function.planes(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
-    def nearest(self, shape: Array) -> tuple[float, int] | None:
-        """Return the smallest distance in a configuration (n,), m, and the pair with this distance;
-        None: no pairs."""
-        if not len(self.pairs):
-            return None
-        distances, pairs = self.nearest_along(shape[np.newaxis])
-        return float(distances[0]), int(pairs[0])
-
     def nearest_along(
         self, shapes: Array, base: BasePoses | None = None, required: Array | float = 0.0
     ) -> tuple[Array, npt.NDArray[np.int64]]:

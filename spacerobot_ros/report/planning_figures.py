@@ -23,7 +23,7 @@ from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
 from spacerobot_ros.planning.analysis import Analysis
-from spacerobot_ros.planning.core.controllability import curvature_matrices, curvatures, shape_box
+from spacerobot_ros.planning.core.controllability import curvature_matrices, curvatures
 from spacerobot_ros.planning.core.workspaces import Workspaces
 from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, curvature_peaks
 from spacerobot_ros.planning.methods.nominal_shape import JOINT_PLANES
@@ -130,7 +130,7 @@ def _planar_figure(found: Analysis) -> Figure:
     robot = found.robot
     i, j = sorted(robot.joint_names.index(name) for name in found.planar.joints)
     plane = PhasePlane(PlanarPhase(robot), found.shape, i, j)
-    lower, upper = (bound[[i, j]] for bound in shape_box(robot))
+    lower, upper = (bound[[i, j]] for bound in robot.description.shape_box)
     centre = curvature_peaks(plane, np.zeros(2), np.array([[lower, upper]]))[0]
     figure = new_figure(4.6)
     left = panel(figure, 0.75, 0.6, 3.55, 3.55)
@@ -236,7 +236,7 @@ def _curvature_over_plane(
     robot, joints = found.robot, found.nominal.joints
     i, j = (joints[k] for k in pair)
     count = _FINE_GRID if robot.n <= 3 else _COARSE_GRID
-    lower, upper = shape_box(robot)
+    lower, upper = robot.description.shape_box
     x, y = (np.linspace(lower[k], upper[k], count) for k in (i, j))
     shapes = np.tile(found.shape, (count * count, 1))
     shapes[:, i], shapes[:, j] = (grid.ravel() for grid in np.meshgrid(x, y))

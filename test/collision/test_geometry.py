@@ -204,7 +204,7 @@ def test_round_meshes_of_many_facets_have_distances(tmp_path: Path) -> None:
         mesh = f'<collision><geometry><mesh filename="{tmp_path}/{name}.obj"/></geometry>'
         text = chain((f"{mesh}</collision>",), (), (BALL.replace("0.2 0.1 0", "0 0 0"),))
         geometry = CollisionGeometry(parse_robot(text.replace("0.1 0 0.2", "0 0 0")))
-        bounds[name], _ = geometry.nearest(np.zeros(2)) or (np.nan, 0)
+        (bounds[name],), _ = geometry.nearest_along(np.zeros((1, 2)))
     # The ball of 0.1 m is at (2, 0, 0.2).
     assert bounds["disc"] == pytest.approx(np.hypot(1.5, 0.15) - 0.1, abs=1e-4)
     assert 1.5 - 0.1 - 1e-6 <= bounds["cone"] <= np.hypot(1.5, 0.2) - 0.1
@@ -240,9 +240,8 @@ def test_distances_are_those_of_pinocchio(name: str) -> None:
         assert len(found) >= 15
         for names, distance in found.items():
             assert distance == pytest.approx(truth[names], abs=1e-5), names
-        nearest = geometry.nearest(q)
-        assert nearest is not None
-        assert nearest[0] == pytest.approx(min(found.values()), abs=1e-9)
+        nearest, _ = geometry.nearest_along(q[np.newaxis])
+        assert nearest == pytest.approx(min(found.values()), abs=1e-9)
 
 
 WITHOUT_COAL = """
@@ -319,7 +318,7 @@ def test_a_robot_without_shapes_has_no_pairs() -> None:
     robot: RobotDescription = parse_robot(chain((), (), ()))
     geometry = CollisionGeometry(robot)
     assert len(geometry.pairs) == 0
-    assert geometry.nearest(np.zeros(2)) is None
+    assert geometry.nearest_along(np.zeros((1, 2)))[0] == np.inf
     assert geometry.notes == ()
 
 
@@ -344,12 +343,9 @@ def test_the_collision_shapes_of_surveyor_are_its_parts_and_leave_the_arm_its_ro
                 beyond = np.minimum(beyond, away.max(axis=1))
         assert beyond.max() < 1e-3, mesh.link
     # The hull of the bus and its dish would touch the arm; they are 5 cm apart.
-    q = np.array([1.57, -0.77, 1.3, 0.19])
-    hull, found = drawn.nearest(q), CollisionGeometry(robot).nearest(q)
-    assert hull is not None
-    assert found is not None
-    assert hull[0] < 0.0
-    assert found[0] == pytest.approx(0.05, abs=1e-4)
+    q = np.array([[1.57, -0.77, 1.3, 0.19]])
+    assert drawn.nearest_along(q)[0] < 0.0
+    assert CollisionGeometry(robot).nearest_along(q)[0] == pytest.approx(0.05, abs=1e-4)
 
 
 def test_a_capsule_is_a_cylinder_with_round_ends() -> None:

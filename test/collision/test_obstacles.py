@@ -67,9 +67,7 @@ def test_pairs_with_obstacles_are_of_every_link(geometry: CollisionGeometry) -> 
     ]
     assert geometry.with_obstacles.tolist() == [False, True, True]
     # Without the pose of the base they are far away.
-    nearest = geometry.nearest(np.array([1.0, 1.0]))
-    assert nearest is not None
-    assert nearest[1] == 0
+    assert geometry.nearest_along(np.array([[1.0, 1.0]]))[1] == 0
 
 
 def test_distances_are_those_of_balls(geometry: CollisionGeometry) -> None:

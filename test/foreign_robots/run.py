@@ -36,7 +36,6 @@ from spacerobot_ros.planning import (
     build_method,
     method_options,
 )
-from spacerobot_ros.planning.core.controllability import shape_box
 from spacerobot_ros.resources import robot_file
 
 Array = npt.NDArray[np.float64]
@@ -105,7 +104,7 @@ def tasks(robot: SpaceRobot, count: int) -> Iterator[Task]:
     Positions are those that the base has in a random shape, some of them put farther away: up to
     some of these are out of reach. One shape in ten is beyond the joint limits.
     """
-    lower, upper = shape_box(robot)
+    lower, upper = robot.description.shape_box
     for number in range(count):
         rng = np.random.default_rng([2026, number])
         start = lower + (upper - lower) * rng.uniform(0.1, 0.9, robot.n)
@@ -151,7 +150,7 @@ def out_of_reach(robot: SpaceRobot, task: Task, starts: int = 100) -> float:
     def beside(q: Array) -> float:
         return float(np.sum((robot.center_of_mass(q) - wanted) ** 2)) / scale**2
 
-    lower, upper = shape_box(robot)
+    lower, upper = robot.description.shape_box
     found = [
         minimize(
             beside,

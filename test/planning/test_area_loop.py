@@ -517,8 +517,7 @@ def test_required_distances_are_kept_at_all_shapes() -> None:
     clearance = Clearance(robot, 0.05)
     away, near = np.array([0.0, -1.4, 0.5, 0, 0, 0]), np.array([-2.5, -0.37, 1.86, 0.0, 0.0, 0.0])
     geometry = clearance.geometry
-    nearest = [geometry.nearest(each) for each in (away, near)]
-    distances = [each[0] for each in nearest if each is not None]
+    distances, pairs = geometry.nearest_along(np.stack([away, near]))
     assert distances[0] > 2 * distances[1]
     between = np.full(len(geometry.pairs), 0.5 * sum(distances))
     assert clearance.is_clear(away[np.newaxis], between)
@@ -527,8 +526,7 @@ def test_required_distances_are_kept_at_all_shapes() -> None:
     assert clearance.is_clear(np.stack([away, near]), np.full(len(between), distances[1] - 1e-6))
     # A pair that need not keep any distance does not count.
     free = between.copy()
-    assert nearest[1] is not None
-    free[nearest[1][1]] = -np.inf
+    free[pairs[1]] = -np.inf
     others = sorted(
         float(geometry.distances(k, geometry.poses(near[np.newaxis]))[0]) for k in range(len(free))
     )

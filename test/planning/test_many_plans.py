@@ -180,8 +180,7 @@ def random_goals(robot: SpaceRobot, start: Array, count: int) -> Iterator[Goal]:
     low, high = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
 
     def keeps_clear(shape: Array) -> bool:
-        nearest = geometry.nearest(shape)
-        return nearest is None or nearest[0] >= CLEARANCE
+        return bool(geometry.nearest_along(shape[np.newaxis])[0] >= CLEARANCE)
 
     for number in range(count):
         axis = rng.normal(size=3)
@@ -506,8 +505,7 @@ def moving_cases(robot: SpaceRobot, count: int) -> Iterator[MovingCase]:
         def clear_shape(rng: np.random.Generator = rng) -> Array:
             while True:
                 q = np.asarray(rng.uniform(low, high))
-                nearest = geometry.nearest(q)
-                if nearest is None or nearest[0] >= CLEARANCE:
+                if geometry.nearest_along(q[np.newaxis])[0] >= CLEARANCE:
                     return q
 
         start, goals = clear_shape(), []

@@ -16,7 +16,6 @@ from support.oracles.pinocchio_oracle import PinocchioOracle
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance, plan
-from spacerobot_ros.planning.core.controllability import shape_box
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.motion_bounds import (
@@ -201,7 +200,7 @@ def test_no_motion_is_faster_than_the_bound(kind: str, seed: int) -> None:
     velocity, acceleration = rng.uniform(0.1, 0.6, robot.n), rng.uniform(0.2, 2.0, robot.n)
     ticks = int(rng.integers(2, 30))
     rates = held_rates(ticks, velocity, acceleration) * rng.choice([-1, 1], robot.n)
-    lower, upper = shape_box(robot)
+    lower, upper = robot.description.shape_box
     way = rates.sum(axis=0) * PERIOD
     share = np.minimum(1.0, (upper - lower) / np.abs(way))
     rates, way = rates * share, way * share

@@ -372,9 +372,8 @@ def test_a_pair_that_begins_nearer_comes_no_nearer(arm: SpaceRobot) -> None:
     far, near = 1.9, 2.175
     for _ in range(40):
         middle = (far + near) / 2
-        nearest = clearance.geometry.nearest(np.array([0.0, -0.1, middle]))
-        assert nearest is not None
-        far, near = (middle, near) if nearest[0] > 0.07 else (far, middle)
+        (nearest,), _ = clearance.geometry.nearest_along(np.array([[0.0, -0.1, middle]]))
+        far, near = (middle, near) if nearest > 0.07 else (far, middle)
     required = clearance.required(np.array([0.0, -0.1, middle]))
     assert np.sort(required) == pytest.approx([0.07, 0.1, 0.1], abs=1e-5)
 
@@ -383,9 +382,7 @@ def test_links_that_begin_much_nearer_keep_half_of_their_distance(
     arm: SpaceRobot, caplog: pytest.LogCaptureFixture
 ) -> None:
     clearance = Clearance(arm.description, 0.6)
-    closest = clearance.geometry.nearest(np.zeros(3))
-    assert closest is not None
-    assert closest[0] == pytest.approx(0.25)
+    assert clearance.geometry.nearest_along(np.zeros((1, 3)))[0] == pytest.approx(0.25)
     schedule = planned(arm, "optimal", (0.1, 0.0, 0.0), np.zeros(3), clearance, **QUICK)
     assert 0.125 <= nearest_of(clearance.geometry, schedule.positions) < 0.3
     assert "apart at the start, closer than planner.clearance = 0.6 m: they are kept" in caplog.text
@@ -488,9 +485,7 @@ def test_a_clear_path_keeps_to_the_planes_between_its_links() -> None:
     robot = SpaceRobot(load_robot(robot_file("servicer")))
     away, near = np.array([0.0, -1.4, 0.5, 0, 0, 0]), np.array([0.0, 0.6, 0.5, 0, 0, 0])
     geometry = Clearance(robot.description, 0.0).geometry
-    closest = geometry.nearest(near)
-    assert closest is not None
-    distance, pair = closest[:2]
+    distance, pair = (each[0].item() for each in geometry.nearest_along(near[np.newaxis]))
     library = DistanceLibrary(
         Clearance(robot.description, distance - 1e-4), robot, BasePrediction(robot, 0.05, 0.01)
     )

@@ -28,7 +28,6 @@ from spacerobot_ros.planning import (
     method_options,
     plan,
 )
-from spacerobot_ros.planning.core.controllability import shape_box
 from spacerobot_ros.planning.core.workspaces import Workspaces, workspaces
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
@@ -54,7 +53,7 @@ def urdf_of(kind: str, rng: np.random.Generator) -> str:
 
 
 def some_shape(robot: SpaceRobot, rng: np.random.Generator) -> Array:
-    lower, upper = shape_box(robot)
+    lower, upper = robot.description.shape_box
     # Ends of travel are likely, and the hardest.
     return np.asarray(lower + (upper - lower) * np.clip(rng.uniform(-0.3, 1.3, robot.n), 0.0, 1.0))
 
@@ -135,7 +134,7 @@ def test_the_bound_holds_every_centre_of_mass(kind: str, seed: int) -> None:
     urdf = urdf_of(kind, rng)
     robot = SpaceRobot.from_urdf(urdf)
     oracle = PinocchioOracle(urdf, robot.joint_names)
-    reach = CenterReach.of(robot, *shape_box(robot))
+    reach = CenterReach.of(robot, *robot.description.shape_box)
     centres = [oracle.center_of_mass(some_shape(robot, rng)) for _ in range(20)]
     assert max(reach.distance_outside(center) for center in centres) < 1e-9
     # It is no empty claim: half again as far off is out of reach.
@@ -149,7 +148,7 @@ def test_the_bound_holds_every_centre_of_mass(kind: str, seed: int) -> None:
 def test_of_sliders_the_bound_is_exact(seed: int) -> None:
     rng = np.random.default_rng(seed)
     robot = SpaceRobot.from_urdf(random_sliding_robot(rng, 4).urdf)
-    lower, upper = shape_box(robot)
+    lower, upper = robot.description.shape_box
     reach = CenterReach.of(robot, lower, upper)
     for direction in rng.normal(size=(5, 3)):
         direction = direction / np.linalg.norm(direction)

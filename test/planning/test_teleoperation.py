@@ -239,18 +239,14 @@ def test_links_do_not_come_too_near() -> None:
         rates, reason = follower.rates(base, pose, q, rates)
         said.add(reason.split(" ")[0])
         q = q + TICK * rates
-        found = clearance.geometry.nearest(q)
-        assert found is not None
-        nearest = min(nearest, found[0])
+        nearest = min(nearest, clearance.geometry.nearest_along(q[np.newaxis])[0][0])
     assert nearest >= 0.05 - 2e-6
     q, rates = np.array([0.0, -0.9, 2.2]), np.zeros(3)
     least = np.inf
     for _ in range(150):
         rates, _ = free.rates(base, pose, q, rates)
         q = q + TICK * rates
-        found = clearance.geometry.nearest(q)
-        assert found is not None
-        least = min(least, found[0])
+        least = min(least, clearance.geometry.nearest_along(q[np.newaxis])[0][0])
     assert least < 0.04
 
 

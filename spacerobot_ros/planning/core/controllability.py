@@ -81,14 +81,9 @@ class Controllability:
         return float(largest / smallest) if smallest > ZERO_TURN_PER_AREA else np.inf
 
 
-def shape_box(robot: SpaceRobot) -> tuple[Array, Array]:
-    """Return finite bounds of the shape space, (n,) each: one revolution for unlimited joints."""
-    return robot.description.shape_box
-
-
 def sample_shapes(robot: SpaceRobot, count: int) -> Array:
     """Return shapes (count, n) spread evenly over the shape space, independent of any seed."""
-    lower, upper = shape_box(robot)
+    lower, upper = robot.description.shape_box
     # Multiples of independent irrational numbers are evenly spread.
     fractions = np.outer(np.arange(1, count + 1), np.sqrt(_first_primes(robot.n))) % 1.0
     return np.asarray(lower + fractions * (upper - lower))
@@ -138,31 +133,29 @@ def sliders_of(robot: SpaceRobot) -> list[int]:
     return [i for i, joint in enumerate(joints) if joint.kind is JointKind.PRISMATIC]
 
 
-def slot_matrix(robot: SpaceRobot, shape: Array, sliders: Sequence[int]) -> Array:
-    """Return the centre-of-mass motion (3, s), in B, per unit of slider motion, m/m.
+def independent_slots(robot: SpaceRobot, shape: Array | None = None) -> Array:
+    """Return the slots (3, s) of sliders that can move the base to any position (paper 1, section
+    4.1): the centre-of-mass motion, in B, per unit of slider motion, m/m.
 
-    This motion is linear in the slider position, so a unit step is exact.
-    """
-    c = robot.center_of_mass(shape)
-    steps = [robot.center_of_mass(shape + np.eye(robot.n)[i]) - c for i in sliders]
-    return np.column_stack(steps) if steps else np.zeros((3, 0))
-
-
-def require_three_slots(robot: SpaceRobot, slots: Array) -> None:
-    """Check that sliders with slots (3, s) can move the base to any position (paper 1, section
-    4.1).
+    ``shape`` (n,) is the shape at which the slots are taken; None: the middle of the joint ranges.
 
     Raises
     ------
     PlanningError
-        They cannot.
+        Fewer than three slots are linearly independent.
     """
+    if shape is None:
+        shape = np.mean(robot.description.shape_box, axis=0)
+    c, sliders = robot.center_of_mass(shape), sliders_of(robot)
+    # The motion is linear in the slider position, so a unit step is exact.
+    steps = [robot.center_of_mass(shape + np.eye(robot.n)[i]) - c for i in sliders]
+    slots = np.column_stack(steps) if steps else np.zeros((3, 0))
     rank = int(np.linalg.matrix_rank(slots, tol=1e-9 * np.abs(slots).max(initial=0.0)))
     if rank == 3:
-        return
+        return slots
     raise PlanningError(
         "lie_bracket needs three sliders with linearly independent slots (paper 1, section 4.1); "
-        f"robot '{robot.description.name}' has {counted(slots.shape[1], 'movable slider')}, whose "
+        f"robot '{robot.description.name}' has {counted(len(sliders), 'movable slider')}, whose "
         f"slots have rank {rank}."
     )
 
@@ -182,7 +175,7 @@ def check_sliding_masses(robot: SpaceRobot) -> Controllability:
     """Test a robot as in paper 1: three independent slots and spanning slider brackets."""
     sliders = sliders_of(robot)
     try:
-        require_three_slots(robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders))
+        independent_slots(robot)
     except PlanningError as refusal:
         names = tuple(robot.joint_names[i] for i in sliders)
         return Controllability(0, 3, np.zeros(3), names, np.zeros(robot.n), str(refusal))

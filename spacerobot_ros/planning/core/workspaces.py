@@ -25,7 +25,7 @@ import numpy as np
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
-from spacerobot_ros.planning.core.controllability import sample_shapes, shape_box
+from spacerobot_ros.planning.core.controllability import sample_shapes
 
 _SEED = 20
 _SAMPLED_SHAPES = 48
@@ -123,7 +123,7 @@ def _search(
         return found
     box = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     if within_limits:
-        box = shape_box(robot)
+        box = robot.description.shape_box
     shapes = np.random.default_rng(_SEED).uniform(*box, (_SAMPLED_SHAPES, robot.n))
     # At an extreme distance, joint rates do not change it.
     starts = np.vstack([shapes, extremes])
@@ -137,7 +137,7 @@ def _bounds(robot: SpaceRobot, within_limits: bool) -> tuple[Array, Array]:
     """Return bounds (n,), (n,) of the shape; infinite for joints that rotate freely."""
     lower, upper = robot.lower.copy(), robot.upper.copy()
     followed = {x.mimic.joint for x in robot.description.moving_joints if x.mimic is not None}
-    box = shape_box(robot)
+    box = robot.description.shape_box
     for k, joint in enumerate(robot.description.movable_joints):
         if joint.kind is JointKind.PRISMATIC:
             lower[k], upper[k] = box[0][k], box[1][k]

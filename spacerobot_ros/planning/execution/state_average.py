@@ -65,7 +65,7 @@ class StateAverage:
     @property
     def count(self) -> int:
         """Number of states since the last restart."""
-        return len(self._poses)
+        return len(self._states)
 
     @property
     def complete(self) -> bool:
@@ -74,9 +74,8 @@ class StateAverage:
 
     def restart(self) -> None:
         """Discard the averaged states, but keep the momenta."""
-        self._poses: list[Array] = []
-        self._rates: list[Array] = []
-        self._shapes: list[Array] = []
+        self._states: list[tuple[Array, Array, Array]] = []
+        """Poses (7,), rates (6 + n,) and shapes (n,)."""
 
     def forget(self) -> None:
         """Discard the states and the momenta, because the robot state has changed."""
@@ -86,9 +85,7 @@ class StateAverage:
 
     def add(self, pose: Array, twist: Array, q: Array, qdot: Array) -> None:
         """Add a state: pose (7,), twist (6,), shape and joint rates (n,), as reported by plants."""
-        self._poses.append(pose.copy())
-        self._rates.append(np.concatenate([twist, qdot]))
-        self._shapes.append(q.copy())
+        self._states.append((pose.copy(), np.concatenate([twist, qdot]), q.copy()))
 
     def take(self, measured: MeasuredState, *, alone: bool = False) -> bool:
         """Add a state if its base was measured, and return whether it was added; if ``alone``, it
@@ -109,8 +106,8 @@ class StateAverage:
         PlanningError
             The average is not finite.
         """
-        poses, q = np.array(self._poses), np.mean(self._shapes, axis=0)
-        rates = np.mean(self._rates, axis=0)
+        poses, measured_rates, shapes = map(np.array, zip(*self._states, strict=True))
+        rates, q = measured_rates.mean(axis=0), shapes.mean(axis=0)
         if not (np.all(np.isfinite(poses)) and np.all(np.isfinite(np.concatenate([q, rates])))):
             raise PlanningError("The measured state is not finite; see odom and joint_states.")
         # Attitudes differ by noise, so the mean of small rotations from the first attitude is exact

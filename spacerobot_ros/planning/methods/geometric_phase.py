@@ -26,7 +26,6 @@ from spacerobot_ros.planning.core.controllability import (
     ZERO_TURN_PER_AREA,
     Controllability,
     curvatures,
-    shape_box,
 )
 
 _MAX_AXIS_TILT = 1e-5
@@ -120,7 +119,7 @@ def check_planar_chain(robot: SpaceRobot) -> Controllability:
         phase = PlanarPhase(robot)
     except PlanningError as refusal:
         return Controllability(0, 1, np.zeros(3), names, rest, str(refusal))
-    box = np.stack(shape_box(robot))
+    box = np.stack(robot.description.shape_box)
     middle = box.mean(axis=0)
     tops = []
     for i, j in itertools.combinations(range(robot.n), 2):

@@ -34,9 +34,8 @@ from spacerobot_ros.planning.core.controllability import (
     MAX_CONDITION,
     best_triple,
     check_sliding_masses,
-    require_three_slots,
+    independent_slots,
     sliders_of,
-    slot_matrix,
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Goal, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
@@ -150,8 +149,7 @@ class LieBracketGait(GaitMethod):
         c0 = robot.center_of_mass(state.q)
         # The system's centre of mass is fixed: r_f + R_f c(zf) = r_0 + R_0 c(z0).
         shift = Rf.T @ (state.position + R0 @ c0 - goal.position) - c0
-        P = slot_matrix(robot, state.q, self.sliders)
-        require_three_slots(robot, P)
+        P = independent_slots(robot, state.q)
         z0, lower, upper = (x[self.sliders] for x in (state.q, robot.lower, robot.upper))
         dz: Array = np.linalg.lstsq(P, shift, rcond=None)[0].astype(float)
         if np.any(z0 + dz < lower) or np.any(z0 + dz > upper):

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import ParameterError, PlanningError, counted
+from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.planning.core.controllability import (
@@ -24,8 +24,8 @@ from spacerobot_ros.planning.core.controllability import (
     curvature_matrices,
     curvatures,
     sample_shapes,
-    shape_box,
 )
+from spacerobot_ros.planning.methods.optimal.problem import per_joint
 
 JOINT_PLANES = ((0, 1), (1, 2), (2, 0))
 """The planes of three joints in which loops enclose areas."""
@@ -133,9 +133,7 @@ class NominalShapeChooser:
     ) -> None:
         self._robot, self._largest_edge, self._is_roomy = robot, largest_edge, is_roomy
         self.triples = _list_triples(robot, joints.split())
-        self._given_shape = (
-            _require_shape(robot, np.array(nominal, dtype=float)) if len(nominal) else None
-        )
+        self._given_shape = _nominal_shape(robot, nominal) if len(nominal) else None
         kinds = [joint.kind for joint in robot.description.movable_joints]
         turning = np.array([kind is not JointKind.PRISMATIC for kind in kinds], dtype=bool)
         self._repeating = turning & np.isinf(robot.lower) & np.isinf(robot.upper)
@@ -283,7 +281,7 @@ class NominalShapeChooser:
         return NominalShape(shape, triple, matrices[best], longest[best])
 
     def _box(self, triple: Triple) -> tuple[Array, Array]:
-        lower, upper = shape_box(self._robot)
+        lower, upper = self._robot.description.shape_box
         return lower[list(triple)], upper[list(triple)]
 
     def _loops_at(self, held: Array, triple: Triple, at: Array) -> tuple[Array, Array, Array]:
@@ -330,12 +328,8 @@ def _list_triples(robot: SpaceRobot, names: Sequence[str]) -> list[Triple]:
     return [(i, j, k)]
 
 
-def _require_shape(robot: SpaceRobot, shape: Array) -> Array:
-    if len(shape) != robot.n:
-        raise ParameterError(
-            f"area_loop.nominal has {counted(len(shape), 'number')}; robot "
-            f"'{robot.description.name}' has {counted(robot.n, 'joint')}."
-        )
+def _nominal_shape(robot: SpaceRobot, values: Sequence[float]) -> Array:
+    shape = per_joint(robot, "nominal", values, np.zeros(robot.n), "area_loop")
     outside = np.flatnonzero((shape < robot.lower) | (shape > robot.upper))
     if outside.size:
         i = int(outside[0])

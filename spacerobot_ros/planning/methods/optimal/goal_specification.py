@@ -24,11 +24,8 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning.core.controllability import (
     curvatures,
-    require_three_slots,
+    independent_slots,
     sample_shapes,
-    shape_box,
-    sliders_of,
-    slot_matrix,
     tilted_goal_error,
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Controlled, RobotState
@@ -344,9 +341,7 @@ def _require_within_one_joint(
 def _slides_anywhere(robot: SpaceRobot) -> bool:
     """Whether the slots of sliders span three directions, so that the base moves anywhere."""
     try:
-        require_three_slots(
-            robot, slot_matrix(robot, np.mean(shape_box(robot), axis=0), sliders_of(robot))
-        )
+        independent_slots(robot)
     except PlanningError:
         return False
     return True

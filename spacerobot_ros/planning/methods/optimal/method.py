@@ -446,8 +446,8 @@ class OptimalGait(GaitMethod):
             first = self._plan_about_center(
                 replace(request, goal=halfway), task.cancellation, task.clock
             )
-            base, rates = self._prediction.poses(state, first.positions), np.zeros(self.robot.n)
-            rates[:] = first.final_velocity
+            base = self._prediction.poses(state, first.positions)
+            rates = np.broadcast_to(first.final_velocity, self.robot.n)
             r_WB, attitude = base.position[-1], base.quaternion[-1]
             q = first.positions[-1]
             arrived = replace(state, position=r_WB, quaternion=attitude, q=q, qdot=rates)
@@ -486,10 +486,8 @@ class OptimalGait(GaitMethod):
         """Return the boundary conditions of a request with this goal shape (n,); None: any."""
         specification, state = self._kind_of(request.goal).specification, request.state
         ends = specification.boundary_conditions(request, shape, self._limits)
-        R_BW, direction_W = (
-            matrix_from_quaternion(state.quaternion).T,
-            self._constraints.direction_W,
-        )
+        R_BW = matrix_from_quaternion(state.quaternion).T
+        direction_W = self._constraints.direction_W
         return replace(
             ends,
             direction=np.zeros(3) if direction_W is None else R_BW @ direction_W,
@@ -706,9 +704,9 @@ class OptimalGait(GaitMethod):
     def _is_within_efforts(self, task: SearchProblem, found: Manoeuvre) -> bool:
         if self._efforts is None:
             return True
-        L_B, after = task.boundary.momenta_in_base(found.held.quaternions), np.zeros(self.robot.n)
-        after[:] = task.boundary.final_velocity
-        excess = self._efforts.excess(found.held.positions, task.velocity, L_B, after)
+        boundary, held = task.boundary, found.held
+        L_B = boundary.momenta_in_base(held.quaternions)
+        excess = self._efforts.excess(held.positions, task.velocity, L_B, boundary.final_velocity)
         return excess <= 1 + _LIMIT_ROUNDING
 
     def _is_reached(self, state: RobotState, goal: Goal) -> bool:
@@ -718,13 +716,8 @@ class OptimalGait(GaitMethod):
 
     def _build_schedule(self, request: PlanRequest, plan: _Plan) -> GaitSchedule:
         """Return a plan as a schedule, with notes on its end."""
-        state, goal, positions, after = (
-            request.state,
-            request.goal,
-            plan.positions,
-            np.zeros(self.robot.n),
-        )
-        after[:] = plan.final_velocity
+        state, goal, positions = request.state, request.goal, plan.positions
+        after = np.broadcast_to(plan.final_velocity, self.robot.n)
         before = (
             self._wheel_rates(state.qdot) if request.motion is None else request.motion.velocity
         )
