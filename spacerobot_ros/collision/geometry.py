@@ -292,22 +292,26 @@ class CollisionGeometry:
         return self.distance_function.planes(i, R[:, a], r[:, a], j, R[:, b], r[:, b])
 
     def nearest_along(
-        self, shapes: Array, base: BasePoses | None = None, required: Array | float = 0.0
+        self,
+        shapes: Array,
+        base: BasePoses | None = None,
+        required: Array | float = 0.0,
+        most: float = np.inf,
     ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the smallest distances (N,) for configurations (N, n), m, and their pairs (N,).
 
         ``required`` (P,), m, is subtracted from the distances of the pairs; a pair with minus
-        infinity is ignored. The results are infinite if there are no pairs; without base poses,
-        obstacles are ignored.
+        infinity is ignored. Results that are not below ``most``, m, are equal to it; without base
+        poses, obstacles are ignored.
         """
-        return self.nearest_at(self.poses(shapes, base), required)
+        return self.nearest_at(self.poses(shapes, base), required, most)
 
     def nearest_at(
-        self, poses: Poses, required: Array | float = 0.0
+        self, poses: Poses, required: Array | float = 0.0, most: float = np.inf
     ) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return the smallest distances, as in :meth:`nearest_along`, given the link poses."""
         R, r = poses
-        distances = np.full(len(R), np.inf)
+        distances = np.full(len(R), most)
         pairs = np.zeros(len(R), dtype=np.int64)
         if not len(self.pairs) or not len(R):
             return distances, pairs

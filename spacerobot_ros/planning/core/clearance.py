@@ -208,17 +208,8 @@ class Clearance:
 
     def _keep_distances(self, shapes: Array, required: Array | float) -> npt.NDArray[np.bool_]:
         """Return (N,) whether all pairs except obstacles keep their distances (P,), m."""
-        geometry = self.geometry
-        keep = np.ones(len(shapes), dtype=np.bool_)
-        if not len(geometry.pairs):
-            return keep
-        R, r = geometry.poses(shapes)
-        needed = np.broadcast_to(required, len(geometry.pairs))
-        near = geometry.lower_bounds((R, r)) < needed
-        for pair in np.flatnonzero(near.any(axis=0)).tolist():
-            at = np.flatnonzero(near[:, pair] & keep)
-            keep[at] = geometry.distances(pair, (R[at], r[at])) >= needed[pair]
-        return keep
+        beyond, _ = self.geometry.nearest_along(shapes, required=required, most=0.0)
+        return np.asarray(beyond >= 0.0)
 
     def approaches(
         self,

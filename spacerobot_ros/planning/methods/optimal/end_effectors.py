@@ -357,14 +357,6 @@ class EndEffectorSpecification:
             return self.rows.axes
         return self.base.base_rotations.axes if self.attitude else np.zeros((0, 3))
 
-    @property
-    def rows_at_end(self) -> EndEffectorRows | None:
-        """Rows of the optimal control problem; none if it ends in a single shape.
-
-        The goal attitude then follows from that shape.
-        """
-        return None if self.ends_in_one_shape else self.rows
-
     def boundary_conditions(
         self, request: PlanRequest, shape: Array | None, limits: MotionLimits
     ) -> BoundaryConditions:
@@ -445,9 +437,7 @@ class EndEffectorSpecification:
                 replace(limits, lower=shape, upper=shape),
                 parameters,
                 candidates,
-                fixed=False,
-                damping=_DAMPING_OF_EXACT_ENDS,
-                error=_GIVEN_SHAPE_ERROR,
+                exact=True,
             )
             X = turns[np.argmin(miss)]
         values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], parameters)
@@ -475,9 +465,7 @@ class EndEffectorSpecification:
             turns = None if follows else self.rows.turns_along_direct_path(start, shapes)
             if self.attitude:
                 turns = np.tile(turn, (count, 1))
-            shapes, X, miss = self._inverse_kinematics(
-                shapes, start, limits, parameters, turns, fixed=self.attitude
-            )
+            shapes, X, miss = self._inverse_kinematics(shapes, start, limits, parameters, turns)
             nearest = min(nearest, float(miss.min()))
             speeds = np.maximum(limits.speeds(start), 1e-9)
             times = np.abs((shapes - start) / speeds).max(axis=1)
@@ -508,9 +496,7 @@ class EndEffectorSpecification:
             limits,
             parameters,
             turns if self.attitude or len(self.rows.axes) else None,
-            fixed=self.attitude,
-            damping=_DAMPING_OF_EXACT_ENDS,
-            error=_GIVEN_SHAPE_ERROR,
+            exact=True,
         )
         exact = miss <= max(_GIVEN_SHAPE_ERROR, min(tolerance.position, tolerance.attitude))
         if not exact.any():
@@ -545,19 +531,20 @@ class EndEffectorSpecification:
         parameters: Array,
         turns: Array | None,
         *,
-        fixed: bool,
-        damping: float = _DAMPING,
-        error: float = _END_ERROR / 10,
+        exact: bool = False,
     ) -> tuple[Array, Array, Array]:
         """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from initial shapes (K, n).
 
-        The ``turns`` (K, 4) of the base are ``fixed``, or initial values that are free along the
-        axes; None: they follow from the direct path.
+        The ``turns`` (K, 4) of the base are fixed if the goal contains its attitude; otherwise,
+        they are initial values that are free along the axes; None: they follow from the direct
+        path. ``exact``: whether the ends must meet the goal exactly.
         """
+        damping = _DAMPING_OF_EXACT_ENDS if exact else _DAMPING
+        error = _GIVEN_SHAPE_ERROR if exact else _END_ERROR / 10
         rows, n, count = self.rows, len(start), len(shapes)
         connection = rows.robot.function("connection", compile=False)
         X = rows.turns_along_direct_path(start, shapes) if turns is None else turns
-        free = turns is not None and not fixed
+        free = turns is not None and not self.attitude
         for _ in range(_ITERATIONS):
             values, by_rotation, by_shape = rows.evaluate(X, shapes, parameters)
             J = by_shape

@@ -59,9 +59,8 @@ class LimitedEfforts(JointEfforts):
         if options.effort_limits == 0:
             given = given_effort_limits(robot)
             limit = np.full(robot.n, np.inf) if given is None else given
-        if options.max_effort:
-            given = per_joint(robot, "max_effort", options.max_effort, np.full(robot.n, np.inf))
-            limit = np.minimum(limit, given)
+        most = per_joint(robot, "max_effort", options.max_effort, np.full(robot.n, np.inf))
+        limit = np.minimum(limit, most)
         if options.effort_limits == 1:
             limit *= 1 - options.effort_reserve
         return cls(robot, limit, control_period) if np.any(np.isfinite(limit)) else None

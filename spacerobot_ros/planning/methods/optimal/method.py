@@ -168,9 +168,7 @@ class OptimalGait(GaitMethod):
         self._specification = GoalSpecification.of(robot, chosen)
         self.controls = self._specification.controls
         self._limits = MotionLimits.of(robot, chosen)
-        self._margin = np.zeros(robot.n)
-        if chosen.joint_margin:
-            self._margin = per_joint(robot, "joint_margin", chosen.joint_margin, np.zeros(robot.n))
+        self._margin = per_joint(robot, "joint_margin", chosen.joint_margin, np.zeros(robot.n))
         self._constraints = PathConstraints.of(robot, chosen)
         self._efforts = LimitedEfforts.of(robot, chosen, self.control_period)
         self._wheels = ReactionWheels.of(robot.description)
@@ -197,7 +195,9 @@ class OptimalGait(GaitMethod):
         key = EndEffectorSpecification.key(goal)
         if key not in self._end_effector_goals:
             of = EndEffectorSpecification.of(self._specification, goal)
-            model = replace(self._model, axes=of.axes, end_effectors=of.rows_at_end)
+            # A motion to a given shape has no rows at its end: the attitude follows from the shape.
+            rows = None if of.ends_in_one_shape else of.rows
+            model = replace(self._model, axes=of.axes, end_effectors=rows)
             self._end_effector_goals[key] = _GoalKind.of(of, model)
         return self._end_effector_goals[key]
 

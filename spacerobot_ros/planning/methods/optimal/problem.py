@@ -238,22 +238,20 @@ class MotionLimits:
             A list does not have one number per joint, or a joint has no speed limit and no
             acceleration limit.
         """
-        velocity = robot.velocity_limit.copy()
+        velocity = robot.velocity_limit
         for i in np.flatnonzero(velocity == 0)[:1]:
             raise ParameterError(
                 f"Joint '{robot.joint_names[i]}' has a velocity limit of 0, but {method} requires "
                 'that all joints can move: give it <limit velocity="..."/> in the URDF, or make it '
                 "fixed."
             )
-        if options.max_velocity:
-            fastest = per_joint(robot, "max_velocity", options.max_velocity, velocity, method)
-            velocity = np.minimum(velocity, fastest)
+        fastest = per_joint(robot, "max_velocity", options.max_velocity, velocity, method)
+        velocity = np.minimum(velocity, fastest)
         acceleration = velocity / options.ramp_time
         wheels = ReactionWheels.of(robot.description)
         acceleration[wheels.index] = wheels.torque / wheels.inertia
-        if options.max_acceleration:
-            given = options.max_acceleration
-            acceleration = per_joint(robot, "max_acceleration", given, acceleration, method)
+        given = options.max_acceleration
+        acceleration = per_joint(robot, "max_acceleration", given, acceleration, method)
         for name, v, a in zip(robot.joint_names, velocity, acceleration, strict=True):
             if np.isinf(v) and not np.isfinite(a):
                 raise ParameterError(
@@ -557,7 +555,8 @@ def per_joint(
 ) -> Array:
     """Return a list-valued method option as (n,) numbers.
 
-    ``default`` (n,) are the values for joints not named in a list of strings ``NAME:VALUE``.
+    ``default`` (n,) are the values for joints not named in a list of strings ``NAME:VALUE``, and
+    for all joints if the list is empty.
 
     Raises
     ------
@@ -565,7 +564,7 @@ def per_joint(
         A list of numbers has the wrong length, or a name is not a joint name.
     """
     names = robot.joint_names
-    if any(isinstance(each, str) for each in values):
+    if not values or any(isinstance(each, str) for each in values):
         given = default.copy()
         for name, _, number in (str(each).rpartition(":") for each in values):
             if name not in names:
