@@ -211,9 +211,8 @@ class ManoeuvreModel:
         """
         positions = self._move_to_final(positions, boundary, final, limits)
         for _ in range(_MAX_PROGRAMS_IN_TURN):
-            quaternions = self._attitudes(positions, boundary)
-            error, *by_end = self._end_error(positions, quaternions, boundary)
-            rows = self._end_rows(positions, quaternions, boundary, *by_end)
+            held = self._with_attitudes(positions, boundary)
+            error, rows = self._end_error(held, boundary), self._end_rows(held, boundary)
             change = _least_change(
                 positions,
                 rows,
@@ -231,18 +230,21 @@ class ManoeuvreModel:
                 break
         else:
             return None
-        held = self._adjust_to_goal(positions, boundary, positions[-1], limits, moves_end=moves_end)
-        if held is None:
+        found = self._adjust_to_goal(
+            positions, boundary, positions[-1], limits, moves_end=moves_end
+        )
+        if found is None:
             return None
         after = boundary.final_velocity
-        needed, overrun = limits.excess(held.positions, self.control_period, before, after)
-        needed = max(needed, self._slowing_factor(held, boundary, before))
-        return held if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
+        needed, overrun = limits.excess(found.positions, self.control_period, before, after)
+        needed = max(needed, self._slowing_factor(found, boundary, before))
+        return found if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
 
-    def _attitudes(self, positions: Array, boundary: BoundaryConditions) -> Array:
-        """Return the attitudes (N + 1, 4) at the ticks, from the initial one."""
+    def _with_attitudes(self, positions: Array, boundary: BoundaryConditions) -> HeldCommands:
+        """Return shapes (N + 1, n) at the ticks with the attitudes to which they lead."""
         start = np.array([0.0, 0.0, 0.0, 1.0])
-        return self.prediction.attitudes(positions, start, boundary.angular_momentum)
+        attitudes = self.prediction.attitudes(positions, start, boundary.angular_momentum)
+        return HeldCommands(positions, attitudes)
 
     def _move_to_final(
         self, positions: Array, boundary: BoundaryConditions, final: Array, limits: MotionLimits
@@ -264,7 +266,7 @@ class ManoeuvreModel:
         The goal attitude is rotated by the difference between the end attitudes of a trajectory and
         of its commands. If the robot drifts, the solver's attitude is only second-order accurate.
         """
-        reached = self._attitudes(trajectory.at_ticks(ticks), boundary)[-1]
+        reached = self._with_attitudes(trajectory.at_ticks(ticks), boundary).quaternions[-1]
         error = quaternion_from_rotvec(attitude_error(reached, trajectory.quaternions[-1]))
         return replace(boundary, goal_rotation=quaternion_multiply(boundary.goal_rotation, error))
 
@@ -290,18 +292,17 @@ class ManoeuvreModel:
             ramps = (s**2 * (3 - 2 * s))[:, :, np.newaxis] * np.eye(self.robot.n) * speed
             waves = np.hstack([waves, ramps])
         for _ in range(_MAX_NEWTON_STEPS):
-            quaternions = self._attitudes(positions, boundary)
-            error, by_turn, by_shape = self._end_error(positions, quaternions, boundary)
+            held = self._with_attitudes(positions, boundary)
+            error = self._end_error(held, boundary)
             miss = float(np.linalg.norm(error))
             if miss <= _ATTITUDE_TOLERANCE or (
                 miss <= 1e3 * _ATTITUDE_TOLERANCE and miss > best / 2
             ):
-                return HeldCommands(positions, quaternions)
+                return held
             if miss > 2 * best:
                 return None
             best = min(best, miss)
-            rows = self._end_rows(positions, quaternions, boundary, by_turn, by_shape)
-            J = np.einsum("mkn,kwn->mw", rows, waves)
+            J = np.einsum("mkn,kwn->mw", self._end_rows(held, boundary), waves)
             amplitudes = np.linalg.lstsq(J, error, rcond=1e-10)[0]
             positions = positions + np.einsum("kin,i->kn", waves, amplitudes)
         return None
@@ -326,42 +327,30 @@ class ManoeuvreModel:
             share = np.clip(np.nan_to_num(room / (_FADING_ZONE * half), nan=0.0), 0.0, 1.0)
         return np.asarray(share**2 * (3 - 2 * share))
 
-    def _end_error(
-        self, positions: Array, quaternions: Array, boundary: BoundaryConditions
-    ) -> tuple[Array, Array | None, Array | None]:
-        """Return the remaining error (m,) at the end, along the axes and of end-effectors.
-
-        Also return derivatives of end-effector rows by rotation (m', 3) and last shape (m', n).
-        """
-        error = self.axes @ attitude_error(quaternions[-1], boundary.goal_rotation)
+    def _end_error(self, held: HeldCommands, boundary: BoundaryConditions) -> Array:
+        """Return the remaining error (m,) at the end, along the axes and of end-effectors."""
+        error = self.axes @ attitude_error(held.quaternions[-1], boundary.goal_rotation)
         if self.end_effectors is None:
-            return np.asarray(error), None, None
-        rows, by_turn, by_shape = self.end_effectors.evaluate(
-            quaternions[-1:], positions[-1:], boundary.end_effectors
-        )
-        return np.concatenate([error, -rows[0]]), by_turn[0], by_shape[0]
+            return np.asarray(error)
+        end = held.quaternions[-1:], held.positions[-1:]
+        rows, _, _ = self.end_effectors.evaluate(*end, boundary.end_effectors)
+        return np.concatenate([error, -rows[0]])
 
-    def _end_rows(
-        self,
-        positions: Array,
-        quaternions: Array,
-        boundary: BoundaryConditions,
-        by_turn: Array | None,
-        by_shape: Array | None,
-    ) -> Array:
+    def _end_rows(self, held: HeldCommands, boundary: BoundaryConditions) -> Array:
         """Return derivatives (m, N + 1, n) of the end values with respect to the shapes."""
-        turns = self._turns_by_shapes(positions, quaternions, boundary)
+        turns = self._turns_by_shapes(held, boundary)
         rows = np.tensordot(self.axes, turns, axes=1)
-        if by_turn is None or by_shape is None:
+        if self.end_effectors is None:
             return rows
-        others = np.tensordot(by_turn, turns, axes=1)
-        others[:, -1] += by_shape
+        end = held.quaternions[-1:], held.positions[-1:]
+        _, by_turn, by_shape = self.end_effectors.evaluate(*end, boundary.end_effectors)
+        others = np.tensordot(by_turn[0], turns, axes=1)
+        others[:, -1] += by_shape[0]
         return np.concatenate([rows, others])
 
-    def _turns_by_shapes(
-        self, positions: Array, quaternions: Array, boundary: BoundaryConditions
-    ) -> Array:
+    def _turns_by_shapes(self, held: HeldCommands, boundary: BoundaryConditions) -> Array:
         """Return derivatives (3, N + 1, n) of the final attitude by all shapes, base components."""
+        positions, quaternions = held.positions, held.quaternions
         moved = np.gradient(positions, axis=0)
         curvature = self.robot.function("curvature", compile=False)
         K = curvature(positions.T).full().reshape(6, len(positions), self.robot.n, -1)[3:]
