@@ -33,6 +33,7 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.core.schedule import HeldMotion
 from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
@@ -130,17 +131,19 @@ def test_efforts_of_a_robot_that_drifts_are_those_of_forward_dynamics(arm: Space
     L_B, period = np.array([0.7, -1.2, 0.4]), 0.1
     positions = np.array([q - period * qdot / 2, q + period * qdot / 2])
     limit = np.array([2.0, 3.0, 5.0])
-    efforts = JointEfforts(arm, limit, period)
-    tau = efforts.shares(positions, qdot, np.array([L_B, L_B]))[0] * limit
+    efforts = JointEfforts(arm, limit)
+    at_rest = HeldMotion(positions, period, qdot)
+    drifting = replace(at_rest, L_B=np.array([L_B, L_B]))
+    tau = efforts.shares(drifting)[0] * limit
     _, omega = arm.base_twist(NO_TURN, positions[0], qdot, L_W=L_B)
     rates = arm.forward_dynamics(positions[0], np.zeros(3), omega, qdot, np.zeros(6), tau)
     np.testing.assert_allclose(rates[6:], 0.0, atol=1e-10)
-    still = efforts.shares(positions, qdot)[0] * limit
+    still = efforts.shares(at_rest)[0] * limit
     assert np.abs(tau - still).max() > 0.01
-    none = efforts.shares(positions, qdot, np.zeros((2, 3)))[0] * limit
+    none = efforts.shares(replace(at_rest, L_B=np.zeros((2, 3))))[0] * limit
     np.testing.assert_allclose(none, still, atol=1e-12)
-    peak = np.abs(efforts.shares(positions, qdot, np.array([L_B, L_B]))).max()
-    assert efforts.excess(positions, qdot, np.array([L_B, L_B])) == pytest.approx(np.sqrt(peak))
+    peak = np.abs(efforts.shares(drifting)).max()
+    assert efforts.excess(drifting) == pytest.approx(np.sqrt(peak))
 
 
 def test_the_momentum_in_the_base_turns_against_it() -> None:

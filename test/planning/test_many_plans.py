@@ -38,6 +38,7 @@ from spacerobot_ros.planning import (
 )
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.prediction import BasePrediction, coasting_positions
+from spacerobot_ros.planning.core.schedule import HeldMotion
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
 from spacerobot_ros.resources import robot_file, share_directory
@@ -427,7 +428,8 @@ def planned(name: str, count: int) -> Iterator[GaitSchedule]:
         except PlanningError:
             continue
         limits = MotionLimits.of(robot, OptimalOptions())
-        factor, overrun = limits.excess(schedule.positions, schedule.control_period)
+        motion = HeldMotion(schedule.positions, schedule.control_period)
+        factor, overrun = limits.excess(motion)
         assert factor <= 1 + 1e-9
         assert overrun <= 1e-9
         found += 1

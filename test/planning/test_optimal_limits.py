@@ -29,6 +29,7 @@ from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
+from spacerobot_ros.planning.core.schedule import HeldMotion
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal import search
 from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
@@ -503,7 +504,7 @@ def test_a_chain_keeps_a_tenth_of_its_efforts() -> None:
     peak = np.abs(track(free, fast).asked).max(axis=0)
     assert "effort" not in str(fast.notes["limited_by"])
     # What the controller asks for is what the planner predicts, but for feedback.
-    shares = JointEfforts(free, np.ones(2), PERIOD).shares(fast.positions)
+    shares = JointEfforts(free, np.ones(2)).shares(HeldMotion(fast.positions, PERIOD))
     np.testing.assert_allclose(np.abs(shares).max(axis=0), peak, rtol=0.1)
     # Limits that are not reached change nothing, and neither do those that are not to be kept.
     for unlimited in ({"effort_limits": 1}, {"max_effort": [1.0, 1.0], "effort_limits": 2}):
@@ -639,7 +640,8 @@ def test_a_correction_keeps_them(chain: SpaceRobot) -> None:
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.4, -0.3]))
     goal = Goal.checked(np.zeros(3), Rotation.from_rotvec([0, 0, 0.02]).as_quat())
     schedule = planner.plan(state, goal, correction=True)
-    shares = JointEfforts(chain, np.array([0.05, 0.04]), PERIOD).shares(schedule.positions)
+    motion = HeldMotion(schedule.positions, PERIOD)
+    shares = JointEfforts(chain, np.array([0.05, 0.04])).shares(motion)
     assert 0.5 < np.abs(shares).max() <= 0.85 * (1 + 1e-8)
 
 
@@ -649,7 +651,8 @@ def test_a_given_duration_is_long_enough_or_refused(chain: SpaceRobot) -> None:
     limited: dict[str, Any] = {"effort_limits": 1, "max_effort": [3.4, 1.6]}
     schedule = plan(chain, **asked, **limited, duration=4.0)
     assert schedule.duration == pytest.approx(4.0)
-    shares = JointEfforts(chain, np.array([3.4, 1.6]), PERIOD).shares(schedule.positions)
+    motion = HeldMotion(schedule.positions, PERIOD)
+    shares = JointEfforts(chain, np.array([3.4, 1.6])).shares(motion)
     assert np.abs(shares).max() <= 0.85 * (1 + 1e-8)
     with pytest.raises(PlanningError, match=r"= 1\.5 s: the fastest one found takes 3"):
         plan(chain, **asked, **limited, duration=1.5)

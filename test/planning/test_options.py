@@ -256,7 +256,7 @@ def test_a_faster_velocity_than_that_of_the_robot_is_not_taken() -> None:
 
 def test_efforts_are_given_by_name_and_others_stay() -> None:
     options = configured(OptimalOptions, {"max_effort": {SECOND: 0.375}, "effort_limits": 1})
-    efforts = LimitedEfforts.of(NAMED_ARM, options, 0.05)
+    efforts = LimitedEfforts.of(NAMED_ARM, options)
     assert efforts is not None
     expected = NAMED_ARM.effort_limit.copy()
     expected[1] = 0.375

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.schedule import held_velocities
+from spacerobot_ros.planning.core.schedule import HeldMotion
 
 _MAX_EXCESS = 1e-6
 """Fraction of a limit by which an effort may exceed it through rounding errors."""
@@ -34,62 +34,37 @@ class JointEfforts:
         The model.
     limit
         (n,) largest effort of every joint in a motion, N or N m; infinite: no limit.
-    control_period
-        Command duration, s.
     """
 
-    def __init__(self, robot: SpaceRobot, limit: Array, control_period: float) -> None:
-        self._period = control_period
+    def __init__(self, robot: SpaceRobot, limit: Array) -> None:
         self._joints = robot.description.movable_joints
         self.limit = limit
         self._function = robot.function("joint_efforts", compile=False)
         self._robot = robot
 
-    def shares(
-        self,
-        positions: Array,
-        velocity: Array | float = 0.0,
-        L_B: Array | None = None,
-        after: Array | float = 0.0,
-    ) -> Array:
+    def shares(self, motion: HeldMotion) -> Array:
         """Return the efforts (N + 1, n) at the ticks under held commands, as fractions of their
         limits.
-
-        ``positions`` (N + 1, n) are the shapes at the ticks; the velocities ``velocity`` and
-        ``after`` (n,) are held before and after the motion. ``L_B`` (N + 1, 3) is the angular
-        momentum about the centre of mass in the base frame, kg m^2/s; None: zero.
         """
-        return self._effort_shares(positions, *self._rates(positions, velocity, after), L_B)
+        state = motion.positions, motion.rates, motion.accelerations
+        return self._effort_shares(*state, motion.L_B)
 
-    def excess(
-        self,
-        positions: Array,
-        velocity: Array | float = 0.0,
-        L_B: Array | None = None,
-        after: Array | float = 0.0,
-    ) -> float:
+    def excess(self, motion: HeldMotion) -> float:
         """Return the factor by which held commands must be slowed down; at most 1 if no slowdown is
         needed.
 
-        Arguments are as in :meth:`shares`. For a drifting robot this is an estimate, as the
-        efforts are not quadratic in the speed.
+        For a drifting robot this is an estimate, as the efforts are not quadratic in the speed.
         """
-        shares = self.shares(positions, velocity, L_B, after)
-        return math.sqrt(float(np.abs(shares).max(initial=0.0)))
+        return math.sqrt(float(np.abs(self.shares(motion)).max(initial=0.0)))
 
-    def beyond_limits(
-        self,
-        positions: Array,
-        velocity: Array | float = 0.0,
-        L_B: Array | None = None,
-        after: Array | float = 0.0,
-    ) -> str:
+    def beyond_limits(self, motion: HeldMotion) -> str:
         """Return a clause that names the joints exceeding their effort limits; empty if none do.
 
-        Arguments are as in :meth:`shares`. If there are many ticks, only the ticks with the largest
-        accelerations and some in between are checked.
+        If there are many ticks, only the ticks with the largest accelerations and some in between
+        are checked.
         """
-        rates, changes = self._rates(positions, velocity, after)
+        positions, L_B = motion.positions, motion.L_B
+        rates, changes = motion.rates, motion.accelerations
         if len(positions) > _MAX_CHECKED_TICKS:
             scale = np.maximum(np.abs(changes).max(axis=0), np.finfo(float).tiny)
             most = np.argsort(-np.abs(changes / scale).max(axis=1))[: _MAX_CHECKED_TICKS // 2]
@@ -107,13 +82,6 @@ class JointEfforts:
                     f"{joint.name} requires {taken}, {share:.3g} times its limit of {allowed}"
                 )
         return ", ".join(clauses)
-
-    def _rates(
-        self, positions: Array, velocity: Array | float, after: Array | float
-    ) -> tuple[Array, Array]:
-        """Return the joint rates and their changes per second (N + 1, n) at the ticks."""
-        held = held_velocities(positions, self._period, velocity, after)
-        return (held[:-1] + held[1:]) / 2, np.diff(held, axis=0) / self._period
 
     def _effort_shares(
         self,

@@ -28,7 +28,7 @@ from spacerobot_ros.planning.core.goal import (
 )
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, HeldMotion, Notes
 
 _REST_MOMENTUM = 1e-9  # per mass: m/s and m^2/s
 
@@ -193,7 +193,7 @@ class GaitMethod(ABC):
     def _joint_efforts(self) -> JointEfforts | None:
         """The efforts of held commands; None if the URDF does not limit efforts."""
         limit = given_effort_limits(self.robot)
-        return None if limit is None else JointEfforts(self.robot, limit, self.control_period)
+        return None if limit is None else JointEfforts(self.robot, limit)
 
     @classmethod  # noqa: B027 - any robot is suitable by default
     def require_suitable(cls, robot: SpaceRobot) -> None:
@@ -253,7 +253,8 @@ class GaitMethod(ABC):
             self._require_clear(positions, self._base_poses(start, positions))
         if self._joint_efforts is not None:
             after = 0.0 if end_velocities is None else end_velocities
-            beyond = self._joint_efforts.beyond_limits(positions, velocity, L_B, after)
+            motion = HeldMotion(positions, self.control_period, velocity, after, L_B)
+            beyond = self._joint_efforts.beyond_limits(motion)
             notes = {**notes, BEYOND_EFFORT_LIMITS: beyond} if beyond else notes
         return GaitSchedule(
             method=self.name,

@@ -125,17 +125,46 @@ class GaitSchedule:
         return np.diff(self.positions, axis=0) / self.control_period
 
 
-def held_velocities(
-    positions: Array, period: float, before: Array | float = 0.0, after: Array | float = 0.0
-) -> Array:
-    """Return the joint velocities (N + 2, n) held before, between and after ticks.
+@dataclass(frozen=True)
+class HeldMotion:
+    """Shapes at ticks, between which joint velocities are held.
 
-    ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds; ``before`` and ``after``
-    (n,) are the velocities before the first tick and after the last.
+    Attributes
+    ----------
+    positions
+        (N + 1, n) shapes at the ticks, m or rad.
+    period
+        Time between ticks, s.
+    before, after
+        (n,) velocities held before the first tick and after the last, m/s or rad/s.
+    L_B
+        (N + 1, 3) angular momentum about the centre of mass in the base frame, kg m^2/s; None: it
+        is zero.
     """
-    ends = np.zeros((2, positions.shape[1]))
-    ends[0], ends[1] = before, after
-    return np.vstack([ends[:1], np.diff(positions, axis=0) / period, ends[1:]])
+
+    positions: Array
+    period: float
+    before: Array | float = 0.0
+    after: Array | float = 0.0
+    L_B: Array | None = None
+
+    @cached_property
+    def velocities(self) -> Array:
+        """Joint velocities (N + 2, n) before, between and after the ticks."""
+        ends = np.zeros((2, self.positions.shape[1]))
+        ends[0], ends[1] = self.before, self.after
+        between = np.diff(self.positions, axis=0) / self.period
+        return np.vstack([ends[:1], between, ends[1:]])
+
+    @property
+    def rates(self) -> Array:
+        """Joint rates (N + 1, n) at the ticks: the means of the velocities before and after."""
+        return np.asarray((self.velocities[:-1] + self.velocities[1:]) / 2)
+
+    @cached_property
+    def accelerations(self) -> Array:
+        """Changes in velocity at the ticks (N + 1, n), per second."""
+        return np.asarray(np.diff(self.velocities, axis=0) / self.period)
 
 
 _MIN_JOINT_MOTION = 1e-9  # m or rad

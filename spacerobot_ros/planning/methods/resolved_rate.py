@@ -47,7 +47,7 @@ from spacerobot_ros.planning.core.goal import (
     end_effector_pose,
 )
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
-from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.core.schedule import GaitSchedule, HeldMotion, Notes
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
@@ -778,7 +778,7 @@ class ResolvedRateGait(GaitMethod):
         for _ in range(_MAX_CORRECTION_ITERATIONS):
             shapes, shares = timed.at_ticks(ticks)
             positions = self._shapes_on_lines(lines, state, shapes, shares)
-            factor, overrun = self._limits.excess(positions, period)
+            factor, overrun = self._limits.excess(HeldMotion(positions, period))
             if overrun > _LIMIT_ROUNDING:
                 break
             if factor <= 1 + _LIMIT_ROUNDING:

@@ -40,7 +40,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
 )
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.schedule import held_velocities
+from spacerobot_ros.planning.core.schedule import HeldMotion
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_shape_for_center
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
@@ -157,10 +157,10 @@ class ManoeuvreModel:
             positions = trajectory.at_ticks(ticks)
             held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
             if held is not None:
-                after = boundary.final_velocity
-                needed, overrun = limits.excess(held.positions, self.control_period, before, after)
+                motion = self._motion(held, boundary, before)
+                needed, overrun = limits.excess(motion)
                 too_fast = max(needed - 1, overrun) > _LIMIT_ROUNDING
-                factor = max(needed, self._slowing_factor(held, boundary, before))
+                factor = max(needed, self._slowing_factor(held, motion))
                 if not too_fast and factor <= 1 + _LIMIT_ROUNDING:
                     return held
             if too_fast and programs < _MAX_PROGRAMS:
@@ -183,18 +183,18 @@ class ManoeuvreModel:
         guess = self.constraints.slowed(guess)
         return guess if self.efforts is None else self.efforts.slowed(guess, boundary)
 
-    def _slowing_factor(
+    def _motion(
         self, held: HeldCommands, boundary: BoundaryConditions, before: Array | float
-    ) -> float:
+    ) -> HeldMotion:
+        L_B, after = boundary.momenta_in_base(held.quaternions), boundary.final_velocity
+        return HeldMotion(held.positions, self.control_period, before, after, L_B)
+
+    def _slowing_factor(self, held: HeldCommands, motion: HeldMotion) -> float:
         """Return the factor by which commands must be slowed down to satisfy the limits on joint
         efforts and base rate.
         """
         rate = self.constraints.excess_rate(held.quaternions, self.control_period)
-        if self.efforts is None:
-            return rate
-        L_B = boundary.momenta_in_base(held.quaternions)
-        after = boundary.final_velocity
-        return max(rate, self.efforts.excess(held.positions, before, L_B, after))
+        return rate if self.efforts is None else max(rate, self.efforts.excess(motion))
 
     def _fit_to_limits(
         self,
@@ -213,16 +213,8 @@ class ManoeuvreModel:
         for _ in range(_MAX_PROGRAMS_IN_TURN):
             held = self._with_attitudes(positions, boundary)
             error, rows = self._end_error(held, boundary), self._end_rows(held, boundary)
-            change = _least_change(
-                positions,
-                rows,
-                error,
-                limits,
-                self.control_period,
-                before,
-                boundary.final_velocity,
-                moves_end=moves_end,
-            )
+            motion = self._motion(held, boundary, before)
+            change = _least_change(motion, rows, error, limits, moves_end=moves_end)
             if change is None:
                 return None
             positions = np.clip(positions + change, limits.lower, limits.upper)
@@ -235,9 +227,9 @@ class ManoeuvreModel:
         )
         if found is None:
             return None
-        after = boundary.final_velocity
-        needed, overrun = limits.excess(found.positions, self.control_period, before, after)
-        needed = max(needed, self._slowing_factor(found, boundary, before))
+        motion = self._motion(found, boundary, before)
+        needed, overrun = limits.excess(motion)
+        needed = max(needed, self._slowing_factor(found, motion))
         return found if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
 
     def _with_attitudes(self, positions: Array, boundary: BoundaryConditions) -> HeldCommands:
@@ -433,21 +425,14 @@ _OPTIONS = {
 
 
 def _least_change(
-    positions: Array,
-    rows: Array,
-    error: Array,
-    limits: MotionLimits,
-    period: float,
-    before: Array | float,
-    after: Array | float = 0.0,
-    *,
-    moves_end: bool,
+    motion: HeldMotion, rows: Array, error: Array, limits: MotionLimits, *, moves_end: bool
 ) -> Array | None:
     """Return the smallest change (N + 1, n) in the shapes at ticks that satisfies all limits and
     changes m end values, with derivatives ``rows`` (m, N + 1, n), by ``error`` (m,); None: none.
 
     Smallest is the sum of squares of changes divided by joint speeds; the first shape is fixed.
     """
+    positions, period = motion.positions, motion.period
     N, n = len(positions) - 1, positions.shape[1]
     moving = slice(1, N + 1 if moves_end else N)
     count = N - 1 + moves_end
@@ -468,10 +453,9 @@ def _least_change(
         ca.kron(first, ca.diag(speed_share)),
         ca.kron(second, ca.diag(change_share)),
     )
-    rates = held_velocities(positions, period, before, after)
-    changes = np.diff(rates, axis=0) / period
+    speeds, changes = motion.velocities[1:-1], motion.accelerations
     shares = np.concatenate(
-        [(rates[1:-1] / limits.velocity).ravel(), (changes / limits.acceleration).ravel()]
+        [(speeds / limits.velocity).ravel(), (changes / limits.acceleration).ravel()]
     )
     most = 1.0 - _LIMIT_RESERVE
     wanted = weight * error

@@ -39,19 +39,17 @@ class LimitedEfforts(JointEfforts):
         A joint effort limit is not positive.
     """
 
-    def __init__(self, robot: SpaceRobot, limit: Array, control_period: float) -> None:
+    def __init__(self, robot: SpaceRobot, limit: Array) -> None:
         for name, value in zip(robot.joint_names, limit, strict=True):
             if not value > 0:
                 raise ParameterError(
                     f"Joint '{name}' is limited to an effort of {value:g}, which cannot move it; "
                     "with optimal.effort_limits 2, efforts are not limited."
                 )
-        super().__init__(robot, limit, control_period)
+        super().__init__(robot, limit)
 
     @classmethod
-    def of(
-        cls, robot: SpaceRobot, options: OptimalOptions, control_period: float
-    ) -> LimitedEfforts | None:
+    def of(cls, robot: SpaceRobot, options: OptimalOptions) -> LimitedEfforts | None:
         """Return the efforts that the options limit; None if there are none."""
         if options.effort_limits == 2:
             return None
@@ -63,7 +61,7 @@ class LimitedEfforts(JointEfforts):
         limit = np.minimum(limit, most)
         if options.effort_limits == 1:
             limit *= 1 - options.effort_reserve
-        return cls(robot, limit, control_period) if np.any(np.isfinite(limit)) else None
+        return cls(robot, limit) if np.any(np.isfinite(limit)) else None
 
     def slowed(self, trajectory: Trajectory, boundary: BoundaryConditions) -> Trajectory:
         """Return the trajectory, slowed along its path until its efforts satisfy the limits."""

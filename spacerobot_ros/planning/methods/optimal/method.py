@@ -38,7 +38,7 @@ from spacerobot_ros.planning.core.goal import (
     Tolerance,
 )
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
-from spacerobot_ros.planning.core.schedule import GaitSchedule, Notes
+from spacerobot_ros.planning.core.schedule import GaitSchedule, HeldMotion, Notes
 from spacerobot_ros.planning.methods.optimal.end_effectors import (
     EndEffectorSpecification,
 )
@@ -170,7 +170,7 @@ class OptimalGait(GaitMethod):
         self._limits = MotionLimits.of(robot, chosen)
         self._margin = per_joint(robot, "joint_margin", chosen.joint_margin, np.zeros(robot.n))
         self._constraints = PathConstraints.of(robot, chosen)
-        self._efforts = LimitedEfforts.of(robot, chosen, self.control_period)
+        self._efforts = LimitedEfforts.of(robot, chosen)
         self._wheels = ReactionWheels.of(robot.description)
         self._model = ManoeuvreModel(
             robot,
@@ -682,7 +682,8 @@ class OptimalGait(GaitMethod):
         base = self._prediction.poses(state, braking)
         beyond = np.any(braking < limits.lower) or np.any(braking > limits.upper)
         if self._efforts is not None and self._efforts_are_strict:
-            beyond |= self._efforts.excess(braking, motion.velocity) > 1 + _LIMIT_ROUNDING
+            held = HeldMotion(braking, period, motion.velocity)
+            beyond |= self._efforts.excess(held) > 1 + _LIMIT_ROUNDING
         if beyond or self._too_near(braking, base if self._has_obstacles else None):
             raise refusal
         try:
@@ -704,10 +705,10 @@ class OptimalGait(GaitMethod):
     def _is_within_efforts(self, task: SearchProblem, found: Manoeuvre) -> bool:
         if self._efforts is None:
             return True
-        boundary, held = task.boundary, found.held
-        L_B = boundary.momenta_in_base(held.quaternions)
-        excess = self._efforts.excess(held.positions, task.velocity, L_B, boundary.final_velocity)
-        return excess <= 1 + _LIMIT_ROUNDING
+        shapes, after = found.held.positions, task.boundary.final_velocity
+        L_B = task.boundary.momenta_in_base(found.held.quaternions)
+        motion = HeldMotion(shapes, self.control_period, task.velocity, after, L_B)
+        return self._efforts.excess(motion) <= 1 + _LIMIT_ROUNDING
 
     def _is_reached(self, state: RobotState, goal: Goal) -> bool:
         error = PoseError.between(state.position, state.quaternion, goal, state.q, self.robot)
@@ -740,7 +741,8 @@ class OptimalGait(GaitMethod):
             notes["final_base_rate"] = omega.tolist()
         if after.any():
             notes["final_wheel_rates"] = after[self._wheels.index].tolist()
-        notes["limited_by"] = self._list_active_limits(positions, before, L_B, after)
+        motion = HeldMotion(positions, self.control_period, before, after, L_B)
+        notes["limited_by"] = self._list_active_limits(motion)
         schedule = self.schedule_of(
             goal,
             positions,
@@ -753,15 +755,13 @@ class OptimalGait(GaitMethod):
         )
         return replace(schedule, controls=controls)
 
-    def _list_active_limits(
-        self, positions: Array, velocity: Array, L_B: Array | None, after: Array
-    ) -> str:
-        if len(positions) < 2:
+    def _list_active_limits(self, motion: HeldMotion) -> str:
+        if len(motion.positions) < 2:
             return "nothing"
-        speed, change = self._limits.limit_shares(positions, self.control_period, velocity, after)
+        speed, change = self._limits.limit_shares(motion)
         shares = {"velocity": speed, "acceleration": change}
         if self._efforts is not None:
-            shares["effort"] = np.abs(self._efforts.shares(positions, velocity, L_B, after))
+            shares["effort"] = np.abs(self._efforts.shares(motion))
         names = np.array(self.robot.joint_names)
         active = {
             limit: names[share.max(axis=0) > _ACTIVE_LIMIT_SHARE].tolist()

@@ -16,7 +16,7 @@ from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_fro
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import for_each_joint, nonnegative, parameter
 from spacerobot_ros.planning.core.goal import RobotState
-from spacerobot_ros.planning.core.schedule import held_velocities
+from spacerobot_ros.planning.core.schedule import HeldMotion
 from spacerobot_ros.resources import suggestion
 
 
@@ -296,39 +296,21 @@ class MotionLimits:
         second if its velocity is unlimited."""
         return np.where(np.isfinite(self.velocity), self.velocity, self.joint_ranges(q)[1])
 
-    def excess(
-        self,
-        positions: Array,
-        period: float,
-        velocity: Array | float = 0.0,
-        after: Array | float = 0.0,
-    ) -> tuple[float, float]:
+    def excess(self, motion: HeldMotion) -> tuple[float, float]:
         """Return the factor by which held commands must be slowed down, and the largest overrun.
 
-        ``positions`` (N + 1, n) are the shapes at ticks of ``period`` seconds; the velocities
-        ``velocity`` and ``after`` (n,) are held before and after these ticks. The factor is at most
-        1 if velocities and accelerations are within their limits; the overrun is the largest
-        distance of a joint beyond its limits, m or rad.
+        The factor is at most 1 if velocities and accelerations are within their limits; the overrun
+        is the largest distance of a joint beyond its limits, m or rad.
         """
-        speed, change = self.limit_shares(positions, period, velocity, after)
-        beyond = np.maximum(self.lower - positions, positions - self.upper)
+        speed, change = self.limit_shares(motion)
+        beyond = np.maximum(self.lower - motion.positions, motion.positions - self.upper)
         factor = max(float(speed.max(initial=0.0)), float(np.sqrt(change.max(initial=0.0))))
         return factor, float(beyond.max(initial=0.0))
 
-    def limit_shares(
-        self,
-        positions: Array,
-        period: float,
-        velocity: Array | float = 0.0,
-        after: Array | float = 0.0,
-    ) -> tuple[Array, Array]:
-        """Return velocities (N + 2, n) and accelerations (N + 1, n) as fractions of their limits.
-
-        Arguments are as in :meth:`excess`.
-        """
-        rates = held_velocities(positions, period, velocity, after)
-        change = np.abs(np.diff(rates, axis=0)) / period
-        return np.abs(rates) / self.velocity, change / self.acceleration
+    def limit_shares(self, motion: HeldMotion) -> tuple[Array, Array]:
+        """Return velocities (N + 2, n) and accelerations (N + 1, n) as fractions of limits."""
+        speeds, changes = np.abs(motion.velocities), np.abs(motion.accelerations)
+        return speeds / self.velocity, changes / self.acceleration
 
 
 @dataclass(frozen=True)
