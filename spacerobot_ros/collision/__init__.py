@@ -2,11 +2,7 @@
 
 from spacerobot_ros.collision.distances import Solid
 from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair, ObstaclePair
-from spacerobot_ros.collision.nearest import (
-    Approach,
-    nearest_approach,
-    nearest_approaches,
-)
+from spacerobot_ros.collision.nearest import Approach, nearest_approach, nearest_approaches
 
 __all__ = [
     "Approach",

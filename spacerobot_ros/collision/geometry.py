@@ -25,14 +25,7 @@ from spacerobot_ros.collision.distances import (
 )
 from spacerobot_ros.collision.rounded_box import RoundedBox, nearest_points
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.model.description import (
-    Array,
-    Joint,
-    JointKind,
-    Pose,
-    RobotDescription,
-    Shape,
-)
+from spacerobot_ros.model.description import Array, Joint, JointKind, Pose, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.model.rotations import matrices_from_quaternions

@@ -22,11 +22,7 @@ from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Toler
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.goal_file import (
-    BASE_GOAL_KEY,
-    IdentifiedGoal,
-    PursuedGoals,
-)
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal, PursuedGoals
 from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
     ActiveGoal,
@@ -45,12 +41,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.planning.execution.teleoperation import Teleoperation, TwistCommand
 from spacerobot_ros.planning.execution.tracker import Setpoint, TakeOver, TrajectoryTracker
-from spacerobot_ros.planning.execution.worker import (
-    PlanJob,
-    PlanningTask,
-    PlanningWorker,
-    Refused,
-)
+from spacerobot_ros.planning.execution.worker import PlanJob, PlanningTask, PlanningWorker, Refused
 from spacerobot_ros.times import SECOND
 
 _MAX_IN_MOTION_ATTEMPTS = 2

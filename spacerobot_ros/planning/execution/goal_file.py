@@ -12,13 +12,7 @@ from typing import Any
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.planning.core.goal import (
-    NO_TOLERANCE,
-    POSE,
-    EndEffectorGoal,
-    Goal,
-    Tolerance,
-)
+from spacerobot_ros.planning.core.goal import NO_TOLERANCE, POSE, EndEffectorGoal, Goal, Tolerance
 
 BASE_GOAL_KEY = "base"
 """Key of the base goal in the file."""

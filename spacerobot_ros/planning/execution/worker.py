@@ -14,11 +14,7 @@ from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
-from spacerobot_ros.planning.core.cancellation import (
-    Cancellation,
-    PlanningCancelled,
-    PlanningJob,
-)
+from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled, PlanningJob
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled, PoseError, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
