@@ -663,16 +663,13 @@ class Tolerance:
 
     def admits(self, error: PoseError, controls: frozenset[Controlled] = POSE) -> bool:
         """Whether an error is within tolerance in all controlled goal components."""
+        hands = error.end_effectors
         return (
             ("position" not in controls or error.distance <= self.position)
             and ("attitude" not in controls or error.angle <= self.attitude)
             and ("shape" not in controls or error.max_joint_error <= self.shape)
             # Unknown errors do not count as small.
-            and ("end_effectors" not in controls or bool(error.end_effectors))
-            and (
-                "end_effectors" not in controls
-                or all(self.admits(each) for each in error.end_effectors)
-            )
+            and ("end_effectors" not in controls or (bool(hands) and all(map(self.admits, hands))))
         )
 
 

@@ -292,6 +292,68 @@ def _span(vectors: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class _InverseKinematics:
+    """Finds shapes and base rotations with the links of ``rows`` at their goals, ``parameters`` (7
+    k,), after a motion from the shape ``start`` (n,); ``fixed``: the base rotation is given.
+    """
+
+    rows: EndEffectorRows
+    start: Array
+    limits: MotionLimits
+    parameters: Array
+    fixed: bool
+
+    def solve(
+        self, shapes: Array, turns: Array | None, *, exact: bool = False
+    ) -> tuple[Array, Array, Array]:
+        """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from initial shapes (K, n).
+
+        The ``turns`` (K, 4) of the base are fixed, or initial values that are free along the axes;
+        None: they follow from the direct path. ``exact``: whether the ends must meet the goal
+        exactly.
+        """
+        damping = _DAMPING_OF_EXACT_ENDS if exact else _DAMPING
+        error = _GIVEN_SHAPE_ERROR if exact else _END_ERROR / 10
+        rows, limits, parameters = self.rows, self.limits, self.parameters
+        n, count = len(self.start), len(shapes)
+        connection = rows.robot.function("connection", compile=False)
+        X = rows.turns_along_direct_path(self.start, shapes) if turns is None else turns
+        free = turns is not None and not self.fixed
+        for _ in range(_ITERATIONS):
+            values, by_rotation, by_shape = rows.evaluate(X, shapes, parameters)
+            J = by_shape
+            if free:
+                J = np.concatenate([by_shape, by_rotation @ rows.axes.T], axis=2)
+            elif turns is None:
+                A = connection(shapes.T).full()[3:].reshape(3, count, n).transpose(1, 0, 2)
+                J = by_shape - by_rotation @ A
+            if np.abs(values).max() <= error:
+                break
+            # Joints at a limit that the step would exceed are excluded from the step.
+            for _ in range(2):
+                normal = J.transpose(0, 2, 1) @ J
+                largest = np.maximum(np.abs(normal).max(axis=(1, 2)), 1e-12)
+                normal = normal + damping * largest[:, np.newaxis, np.newaxis] * np.eye(J.shape[2])
+                slope = -(J.transpose(0, 2, 1) @ values[:, :, np.newaxis])
+                step = np.linalg.solve(normal, slope)[:, :, 0]
+                beyond = (shapes <= limits.lower) & (step[:, :n] < 0)
+                beyond |= (shapes >= limits.upper) & (step[:, :n] > 0)
+                if not beyond.any():
+                    break
+                J = J.copy()
+                J[:, :, :n] *= ~beyond[:, np.newaxis]
+            step *= np.minimum(1.0, _MAX_STEP / np.abs(step).max(axis=1, keepdims=True).clip(1e-9))
+            shapes = np.clip(shapes + step[:, :n], limits.lower, limits.upper)
+            if free:
+                turned = quaternions_from_rotvecs(step[:, n:] @ rows.axes)
+                X = quaternion_multiply(X, turned)
+            elif turns is None:
+                X = rows.turns_along_direct_path(self.start, shapes)
+        values, _, _ = rows.evaluate(X, shapes, parameters)
+        return shapes, X, np.abs(values).max(axis=1)
+
+
+@dataclass(frozen=True)
 class EndEffectorSpecification:
     """End-effector goal components reached by one robot's manoeuvres.
 
@@ -389,15 +451,16 @@ class EndEffectorSpecification:
             goals.append(EndEffectorGoal(robot.base_link, goal.position))
         rows = self.rows
         rows.require_directions(state, goals, (tolerance.position, tolerance.attitude))
-        _require_within_radius(robot, limits, state, goal)
+        self._require_within_radius(limits, state, goal)
         parameters = rows.pack(state, goals)
+        kinematics = _InverseKinematics(rows, state.q, limits, parameters, self.attitude)
         if shape is not None:
-            turn = self._turn_with_shape(request, shape, turn, limits, parameters)
+            turn = self._turn_with_shape(kinematics, shape, turn, tolerance.position)
             ends: list[PossibleEnd] = [PossibleEnd(shape, turn)]
         else:
-            ends = self._find_possible_ends(state.q, limits, parameters, turn)
+            ends = self._find_possible_ends(kinematics, turn)
         if shape is None and self.overdetermined:
-            ends = [self._exact_end(state.q, limits, parameters, ends, tolerance)]
+            ends = [self._exact_end(kinematics, ends, tolerance)]
             shape, turn = ends[0].shape, ends[0].base_rotation
         return BoundaryConditions(
             state.q,
@@ -409,38 +472,27 @@ class EndEffectorSpecification:
         )
 
     def _turn_with_shape(
-        self,
-        request: PlanRequest,
-        shape: Array,
-        turn: Array,
-        limits: MotionLimits,
-        parameters: Array,
+        self, kinematics: _InverseKinematics, shape: Array, turn: Array, tolerance: float
     ) -> Array:
         """Return the base rotation (4,) that puts the end-effectors at their goals in a shape.
 
         UnreachableError if there is none.
         """
-        tolerance = request.tolerance
         X = turn
         if not self.attitude:
-            X = self.rows.turns_along_direct_path(request.state.q, shape[np.newaxis])[0]
-        most = max(tolerance.position, _GIVEN_SHAPE_ERROR)
+            X = self.rows.turns_along_direct_path(kinematics.start, shape[np.newaxis])[0]
+        most = max(tolerance, _GIVEN_SHAPE_ERROR)
         if not self.attitude and len(self.rows.axes):
             # Joint loops rotate the base about the axes; the shape is given.
             candidates = quaternions_from_rotvecs(
                 np.vstack([np.zeros((1, 3)), *(np.pi * k / 2 * self.rows.axes for k in (1, 2, 3))])
             )
             shapes = np.tile(shape, (len(candidates), 1))
-            _, turns, miss = self._inverse_kinematics(
-                shapes,
-                shape,
-                replace(limits, lower=shape, upper=shape),
-                parameters,
-                candidates,
-                exact=True,
-            )
+            limits = replace(kinematics.limits, lower=shape, upper=shape)
+            given = replace(kinematics, start=shape, limits=limits)
+            _, turns, miss = given.solve(shapes, candidates, exact=True)
             X = turns[np.argmin(miss)]
-        values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], parameters)
+        values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], kinematics.parameters)
         if np.abs(values).max(initial=0.0) > most:
             raise UnreachableError(
                 f"With the goal's joint positions, no base attitude puts the end-effectors closer "
@@ -450,11 +502,9 @@ class EndEffectorSpecification:
             )
         return X
 
-    def _find_possible_ends(
-        self, start: Array, limits: MotionLimits, parameters: Array, turn: Array
-    ) -> list[PossibleEnd]:
+    def _find_possible_ends(self, kinematics: _InverseKinematics, turn: Array) -> list[PossibleEnd]:
         """Return ends for guesses, fastest to reach first, or raise NotFoundError."""
-        rng = np.random.default_rng(0)
+        rng, start, limits = np.random.default_rng(0), kinematics.start, kinematics.limits
         middle, half = limits.joint_ranges(start)
         nearest = np.inf
         for count, follows in ((_STARTS, True), (_STARTS, False), (_ADDITIONAL_STARTS, False)):
@@ -465,7 +515,7 @@ class EndEffectorSpecification:
             turns = None if follows else self.rows.turns_along_direct_path(start, shapes)
             if self.attitude:
                 turns = np.tile(turn, (count, 1))
-            shapes, X, miss = self._inverse_kinematics(shapes, start, limits, parameters, turns)
+            shapes, X, miss = kinematics.solve(shapes, turns)
             nearest = min(nearest, float(miss.min()))
             speeds = np.maximum(limits.speeds(start), 1e-9)
             times = np.abs((shapes - start) / speeds).max(axis=1)
@@ -480,21 +530,13 @@ class EndEffectorSpecification:
         raise self._not_found(nearest)
 
     def _exact_end(
-        self,
-        start: Array,
-        limits: MotionLimits,
-        parameters: Array,
-        ends: Sequence[PossibleEnd],
-        tolerance: Tolerance,
+        self, kinematics: _InverseKinematics, ends: Sequence[PossibleEnd], tolerance: Tolerance
     ) -> PossibleEnd:
         """Return the first end that meets an overdetermined goal within its tolerance, or raise
         NotFoundError."""
         turns = np.array([each.base_rotation for each in ends])
-        shapes, X, miss = self._inverse_kinematics(
+        shapes, X, miss = kinematics.solve(
             np.array([each.shape for each in ends]),
-            start,
-            limits,
-            parameters,
             turns if self.attitude or len(self.rows.axes) else None,
             exact=True,
         )
@@ -523,76 +565,18 @@ class EndEffectorSpecification:
             f"away. {remedy}"
         )
 
-    def _inverse_kinematics(
-        self,
-        shapes: Array,
-        start: Array,
-        limits: MotionLimits,
-        parameters: Array,
-        turns: Array | None,
-        *,
-        exact: bool = False,
-    ) -> tuple[Array, Array, Array]:
-        """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from initial shapes (K, n).
-
-        The ``turns`` (K, 4) of the base are fixed if the goal contains its attitude; otherwise,
-        they are initial values that are free along the axes; None: they follow from the direct
-        path. ``exact``: whether the ends must meet the goal exactly.
-        """
-        damping = _DAMPING_OF_EXACT_ENDS if exact else _DAMPING
-        error = _GIVEN_SHAPE_ERROR if exact else _END_ERROR / 10
-        rows, n, count = self.rows, len(start), len(shapes)
-        connection = rows.robot.function("connection", compile=False)
-        X = rows.turns_along_direct_path(start, shapes) if turns is None else turns
-        free = turns is not None and not self.attitude
-        for _ in range(_ITERATIONS):
-            values, by_rotation, by_shape = rows.evaluate(X, shapes, parameters)
-            J = by_shape
-            if free:
-                J = np.concatenate([by_shape, by_rotation @ rows.axes.T], axis=2)
-            elif turns is None:
-                A = connection(shapes.T).full()[3:].reshape(3, count, n).transpose(1, 0, 2)
-                J = by_shape - by_rotation @ A
-            if np.abs(values).max() <= error:
-                break
-            # Joints at a limit that the step would exceed are excluded from the step.
-            for _ in range(2):
-                normal = J.transpose(0, 2, 1) @ J
-                largest = np.maximum(np.abs(normal).max(axis=(1, 2)), 1e-12)
-                normal = normal + damping * largest[:, np.newaxis, np.newaxis] * np.eye(J.shape[2])
-                slope = -(J.transpose(0, 2, 1) @ values[:, :, np.newaxis])
-                step = np.linalg.solve(normal, slope)[:, :, 0]
-                beyond = (shapes <= limits.lower) & (step[:, :n] < 0)
-                beyond |= (shapes >= limits.upper) & (step[:, :n] > 0)
-                if not beyond.any():
-                    break
-                J = J.copy()
-                J[:, :, :n] *= ~beyond[:, np.newaxis]
-            step *= np.minimum(1.0, _MAX_STEP / np.abs(step).max(axis=1, keepdims=True).clip(1e-9))
-            shapes = np.clip(shapes + step[:, :n], limits.lower, limits.upper)
-            if free:
-                turned = quaternions_from_rotvecs(step[:, n:] @ rows.axes)
-                X = quaternion_multiply(X, turned)
-            elif turns is None:
-                X = rows.turns_along_direct_path(start, shapes)
-        values, _, _ = rows.evaluate(X, shapes, parameters)
-        return shapes, X, np.abs(values).max(axis=1)
-
-
-def _require_within_radius(
-    robot: SpaceRobot, limits: MotionLimits, state: RobotState, goal: Goal
-) -> None:
-    """Raise UnreachableError if a goal is farther from the centre of mass than shapes reach."""
-    R_WB = matrix_from_quaternion(state.quaternion)
-    r_WC = state.position + R_WB @ robot.center_of_mass(state.q)
-    for each in goal.end_effectors:
-        reach = reach_of_end_effector(robot, limits.lower, limits.upper, each.link)
-        distance = float(np.linalg.norm(each.position - r_WC))
-        if distance > reach * (1 + 1e-9):
-            raise UnreachableError(
-                f"The goal of '{each.link}' is out of reach: it is {distance:.4g} m from the "
-                "centre of mass, which stays where it is without thrust, and the joints of "
-                f"'{robot.description.name}' can move '{each.link}' no farther from it than "
-                f"{reach:.4g} m.",
-                Proof.LIMITS,
-            )
+    def _require_within_radius(self, limits: MotionLimits, state: RobotState, goal: Goal) -> None:
+        """Raise UnreachableError if a goal is farther from the centre of mass than shapes reach."""
+        robot, R_WB = self.base.robot, matrix_from_quaternion(state.quaternion)
+        r_WC = state.position + R_WB @ robot.center_of_mass(state.q)
+        for each in goal.end_effectors:
+            reach = reach_of_end_effector(robot, limits.lower, limits.upper, each.link)
+            distance = float(np.linalg.norm(each.position - r_WC))
+            if distance > reach * (1 + 1e-9):
+                raise UnreachableError(
+                    f"The goal of '{each.link}' is out of reach: it is {distance:.4g} m from the "
+                    "centre of mass, which stays where it is without thrust, and the joints of "
+                    f"'{robot.description.name}' can move '{each.link}' no farther from it than "
+                    f"{reach:.4g} m.",
+                    Proof.LIMITS,
+                )

@@ -155,9 +155,7 @@ class GoalSpecification:
             self.require_turning_with_drift(state)
             self.require_reachable_turn(turn, tolerance.attitude)
             if robot.n == 1 and len(self.base_rotations.axes):
-                _require_within_one_joint(
-                    robot, limits, state.q, self.base_rotations.axes[0], turn, tolerance.attitude
-                )
+                self._require_within_one_joint(limits, state.q, turn, tolerance.attitude)
             if shape is not None and len(self.axes) and not self.base_rotations.loops_turn_base:
                 turn = self._turn_on_way_to_shape(turn, state.q, shape, tolerance.attitude)
                 # With one joint, the goal attitude fixes the final shape.
@@ -259,6 +257,41 @@ class GoalSpecification:
             )
         return quaternion_from_rotvec(axis * angle)
 
+    def _require_within_one_joint(
+        self, limits: MotionLimits, q: Array, turn: Array, tolerance: float
+    ) -> None:
+        """Reject a rotation that the only joint, at ``q`` (1,), cannot cause within its limits.
+
+        The base rotates back and forth with the joint; the angle is an integral.
+        """
+        robot, axis = self.robot, self.base_rotations.axes[0]
+        ends = np.array([limits.lower[0], limits.upper[0]])
+        if not np.all(np.isfinite(ends)):
+            return
+        connection = robot.function("connection", compile=False)
+        angles = [0.0]
+        for end in ends:
+            step = (end - q[0]) / _INTEGRATION_STEPS
+            middle = q[0] + step * (np.arange(_INTEGRATION_STEPS) + 0.5)
+            rates = -axis @ connection(middle[np.newaxis]).full()[3:]
+            angles.extend(np.cumsum(rates) * step)
+        least, most = min(angles), max(angles)
+        wanted = 2 * np.arctan2(axis @ turn[:3], turn[3])
+        whole = 2 * np.pi
+        # The same attitude may also be reached by rotating the other way.
+        turns = np.arange(np.floor(least / whole) - 1, np.ceil(most / whole) + 2)
+        nearest = wanted + whole * turns
+        beyond = np.maximum(least - nearest, nearest - most)
+        if beyond.min() > max(tolerance, _INTEGRATION_ERROR):
+            joint = robot.description.movable_joints[0]
+            angle = (wanted + np.pi) % whole - np.pi
+            raise UnreachableError(
+                f"The goal attitude is beyond the joint limits: joint '{joint.name}', the only "
+                f"joint, can rotate the base by {least:.4g} to {most:.4g} rad from here, and the "
+                f"goal is rotated by {angle:.4g} rad.",
+                Proof.LIMITS,
+            )
+
 
 @dataclass(frozen=True)
 class BaseRotations:
@@ -301,41 +334,6 @@ class BaseRotations:
             axis = U[:, 0] * np.sign(U[np.argmax(np.abs(U[:, 0])), 0])
             return cls(axis[np.newaxis], turns_base=True, loops_turn_base=loops)
         return cls(np.eye(3) if loops else none, turns_base=True, loops_turn_base=loops)
-
-
-def _require_within_one_joint(
-    robot: SpaceRobot, limits: MotionLimits, q: Array, axis: Array, turn: Array, tolerance: float
-) -> None:
-    """Reject a rotation that the only joint, at ``q`` (1,), cannot cause within its limits.
-
-    The base rotates about ``axis`` (3,), back and forth with the joint; the angle is an integral.
-    """
-    ends = np.array([limits.lower[0], limits.upper[0]])
-    if not np.all(np.isfinite(ends)):
-        return
-    connection = robot.function("connection", compile=False)
-    angles = [0.0]
-    for end in ends:
-        step = (end - q[0]) / _INTEGRATION_STEPS
-        middle = q[0] + step * (np.arange(_INTEGRATION_STEPS) + 0.5)
-        rates = -axis @ connection(middle[np.newaxis]).full()[3:]
-        angles.extend(np.cumsum(rates) * step)
-    least, most = min(angles), max(angles)
-    wanted = 2 * np.arctan2(axis @ turn[:3], turn[3])
-    whole = 2 * np.pi
-    # The same attitude may also be reached by rotating the other way.
-    turns = np.arange(np.floor(least / whole) - 1, np.ceil(most / whole) + 2)
-    nearest = wanted + whole * turns
-    beyond = np.maximum(least - nearest, nearest - most)
-    if beyond.min() > max(tolerance, _INTEGRATION_ERROR):
-        joint = robot.description.movable_joints[0]
-        angle = (wanted + np.pi) % whole - np.pi
-        raise UnreachableError(
-            f"The goal attitude is beyond the joint limits: joint '{joint.name}', the only joint, "
-            f"can rotate the base by {least:.4g} to {most:.4g} rad from here, and the goal "
-            f"is rotated by {angle:.4g} rad.",
-            Proof.LIMITS,
-        )
 
 
 def _slides_anywhere(robot: SpaceRobot) -> bool:

@@ -30,18 +30,10 @@ from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import sliders_of
-from spacerobot_ros.planning.core.goal import (
-    Controlled,
-    Goal,
-    PoseError,
-    RobotState,
-    Tolerance,
-)
+from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule, HeldMotion, Notes
-from spacerobot_ros.planning.methods.optimal.end_effectors import (
-    EndEffectorSpecification,
-)
+from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorSpecification
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
