@@ -17,9 +17,7 @@ from spacerobot_ros.events import (
     choice_format,
     number_format,
 )
-from spacerobot_ros.events import (
-    Event as FlightEvent,
-)
+from spacerobot_ros.events import Event as FlightEvent
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import (
     Controlled,
@@ -480,20 +478,11 @@ def describe_remaining_error(
 
 
 def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
-    """Return the duration of the executed schedules for the last goal, s.
+    """Return the duration of the executed schedules for the last goal, s; None if there are none.
 
     This is the planner's value, minus the rest of the last schedule if the flight ended early. If
-    the planner has no value, for example after an abort, :func:`time_to_end` is returned.
-
-    Parameters
-    ----------
-    statuses, end_s
-        As in :func:`time_to_end`.
-
-    Returns
-    -------
-    float | None
-        None if no schedule was executed.
+    the planner has no value, for example after an abort, :func:`time_to_end` is returned, which has
+    the same arguments.
     """
     given = list(statuses)
     flown = [
@@ -512,21 +501,12 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
 
 
 def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
-    """Return the time, s, from the start of the first schedule for the last goal to the end.
+    """Return the time, s, from the start of the first schedule for the last goal to the end; None
+    if no schedule was executed.
 
-    Waiting times, such as for a restarted planner, are included.
-
-    Parameters
-    ----------
-    statuses
-        Times (s) and statuses, in order of time.
-    end_s
-        End time of the flight, s; used if no status reports that the goal has ended.
-
-    Returns
-    -------
-    float | None
-        None if no schedule was executed.
+    Waiting times, such as for a restarted planner, are included. ``statuses`` are times, s, and
+    statuses in order of time; ``end_s`` is the end time of the flight, s, which is used if no
+    status reports that the goal has ended.
     """
     given = list(statuses)
     executing = [each for each in given if each[1].state is PlannerState.EXECUTING]

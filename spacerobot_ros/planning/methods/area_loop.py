@@ -254,12 +254,17 @@ class AreaLoopGait(GaitMethod):
 
         Also returned are the paper's symbols and the expected duration of later cycles, s.
         """
+        options = self.options
         S, share = self._initial_loop_areas(left, nominal)
         missing = float(np.linalg.norm(left))
-        cycles = self._count_cycles_within_limits(missing, share, enough, flown)
         share, too_near = self._shrink_until_clear(gait, S, share, nominal)
-        if too_near:
-            cycles = self._count_cycles_within_limits(missing, share, enough, flown, too_near)
+        cycles, most = flown + self._count_cycles_left(missing, share, enough), options.most_cycles
+        if cycles > most:
+            why = f" In a loop twice as large, {too_near}." if too_near else ""
+            raise PlanningError(
+                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
+                f"{flown} have been flown.{why}"
+            )
         for _ in range(_MAX_CYCLE_TRIALS):
             after, path = self._add_loop(gait, share * S, nominal)
             if np.linalg.norm(attitude_error(after.attitudes[-1], target)) < missing:
@@ -272,10 +277,10 @@ class AreaLoopGait(GaitMethod):
                 f"brings the base closer to its goal than {missing:.3g} rad."
             )
         duration = (len(after.positions) - len(gait.positions)) * self.control_period
-        if cycles * duration > self.options.longest:
+        if cycles * duration > options.longest:
             raise PlanningError(
                 f"The manoeuvre would take about {cycles:.4g} cycles of {duration:.4g} s, more "
-                f"than longest = {self.options.longest:.6g} s."
+                f"than longest = {options.longest:.6g} s."
             )
         notes: Notes = {
             "joints": ", ".join(self.robot.joint_names[i] for i in nominal.joints),
@@ -287,20 +292,6 @@ class AreaLoopGait(GaitMethod):
             "expected_cycles": cycles,
         }
         return after, notes, max(0.0, cycles - flown - 1) * duration
-
-    def _count_cycles_within_limits(
-        self, missing: float, share: float, enough: float, flown: int, too_near: str = ""
-    ) -> float:
-        """Return the expected number of cycles for the goal, including those already ``flown``."""
-        cycles = flown + self._count_cycles_left(missing, share, enough)
-        most = self.options.most_cycles
-        if cycles > most:
-            why = f" In a loop twice as large, {too_near}." if too_near else ""
-            raise PlanningError(
-                f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
-                f"{flown} have been flown.{why}"
-            )
-        return cycles
 
     def _shrink_until_clear(
         self, gait: _PlannedMotion, S: Array, share: float, nominal: NominalShape
