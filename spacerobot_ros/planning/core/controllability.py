@@ -84,8 +84,10 @@ class Controllability:
 def sample_shapes(robot: SpaceRobot, count: int) -> Array:
     """Return shapes (count, n) spread evenly over the shape space, independent of any seed."""
     lower, upper = robot.description.shape_box
-    # Multiples of independent irrational numbers are evenly spread.
-    fractions = np.outer(np.arange(1, count + 1), np.sqrt(_first_primes(robot.n))) % 1.0
+    # Multiples of independent irrational numbers, such as roots of primes, are evenly spread.
+    primes = (k for k in itertools.count(2) if all(k % divisor for divisor in range(2, k)))
+    roots = np.sqrt(list(itertools.islice(primes, robot.n)))
+    fractions = np.outer(np.arange(1, count + 1), roots) % 1.0
     return np.asarray(lower + fractions * (upper - lower))
 
 
@@ -225,13 +227,3 @@ def _span_of_brackets(
 
 def _numerical_rank(values: Array) -> int:
     return int(np.sum(values > max(ZERO_TURN_PER_AREA, float(values[0]) / MAX_CONDITION)))
-
-
-def _first_primes(count: int) -> Array:
-    found: list[int] = []
-    candidate = 2
-    while len(found) < count:
-        if all(candidate % prime for prime in found):
-            found.append(candidate)
-        candidate += 1
-    return np.array(found, dtype=float)

@@ -43,7 +43,6 @@ from spacerobot_ros.planning.core.goal import (
     EndEffectorGoal,
     Goal,
     RobotState,
-    Tolerance,
     end_effector_pose,
 )
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
@@ -501,21 +500,18 @@ class ResolvedRateGait(GaitMethod):
         self.require_rest(request.state)
         self.require_suitable(self.robot)
         q = np.clip(request.state.q, self.robot.lower, self.robot.upper)
-        state = replace(request.state, q=q)
-        goal = request.goal.for_robot(self.robot.description)
-        self._require_goal_of_end_effectors(goal)
-        if goal.has_path:
-            return self._plan_along_path(replace(request, state=state, goal=goal), cancellation)
-        waypoints = self._waypoints(request, goal)
-        lines = self._link_paths(state, goal, request.tolerance, waypoints)
+        request = self._with_resolved_goal(replace(request, state=replace(request.state, q=q)))
+        if request.goal.has_path:
+            return self._plan_along_path(request, cancellation)
+        lines = self._link_paths(request, self._waypoints(request))
         if lines.length < _ZERO_DISTANCE:
-            return self._schedule(state, goal, q[np.newaxis], {})
-        positions, _, notes = self._trace_without_contact(lines, state, cancellation)
-        return self._schedule(state, goal, positions, notes)
+            return self._schedule(request, q[np.newaxis], {})
+        positions, _, notes = self._trace_without_contact(lines, request.state, cancellation)
+        return self._schedule(request, positions, notes)
 
     def _plan_along_path(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
         """Plan along the path of the goal, with a rest at each of its sharp corners."""
-        now, goal, tolerance = request.state, request.goal, self.options.corner_tolerance / 2
+        now, tolerance = request.state, self.options.corner_tolerance / 2
         route = self._route(request, tolerance)
         whole = float(np.linalg.norm(route.chords, axis=1).sum())
         positions, along, metres = [now.q[np.newaxis]], [np.zeros(1)], 0.0
@@ -523,7 +519,7 @@ class ResolvedRateGait(GaitMethod):
         least = math.inf
         for piece in route.split_at_reversals(tolerance) if len(route.positions) > 1 else ():
             way = (piece, metres, whole)
-            lines = self._link_paths(now, goal, request.tolerance, piece.positions[1:-1], way)
+            lines = self._link_paths(replace(request, state=now), piece.positions[1:-1], way)
             shapes, shares, found = self._trace_without_contact(lines, now, cancellation)
             least = min(least, float(str(found["least"])))
             notes = {**found, **notes, "least": least}
@@ -535,7 +531,7 @@ class ResolvedRateGait(GaitMethod):
             base = self._prediction.path(now, shapes)
             now = RobotState(base.position[-1], base.quaternion[-1], shapes[-1])
         progress = PathProgress(route, np.concatenate(along))
-        return self._schedule(request.state, goal, np.vstack(positions), notes, progress)
+        return self._schedule(request, np.vstack(positions), notes, progress)
 
     def _route(self, request: PlanRequest, tolerance: float) -> PosePath:
         """Return the path of a request in W, from the current end-effector pose."""
@@ -630,14 +626,13 @@ class ResolvedRateGait(GaitMethod):
         PlanningError
             The goal is of an unsupported kind, or requests too much; see :meth:`plan`.
         """
-        goal = request.goal.for_robot(self.robot.description)
-        self._require_goal_of_end_effectors(goal)
-        waypoints = self._waypoints(request, goal)
-        lines = self._link_paths(request.state, goal, request.tolerance, waypoints)
+        request = self._with_resolved_goal(request)
+        lines = self._link_paths(request, self._waypoints(request))
         return trace_joint_path(lines, request.state.q, cancellation)
 
-    def _waypoints(self, request: PlanRequest, goal: Goal) -> Array:
+    def _waypoints(self, request: PlanRequest) -> Array:
         """Return the waypoints (K, 3) of a request, in the world: none for a correction."""
+        goal = request.goal
         if request.correction or not self.options.waypoints:
             return np.zeros((0, 3))
         if len(goal.end_effectors) > 1:
@@ -648,7 +643,9 @@ class ResolvedRateGait(GaitMethod):
             )
         return np.reshape(self.options.waypoints, (-1, 3))
 
-    def _require_goal_of_end_effectors(self, goal: Goal) -> None:
+    def _with_resolved_goal(self, request: PlanRequest) -> PlanRequest:
+        """Return a request whose goal names links of the robot; reject goals for the base."""
+        goal = request.goal.for_robot(self.robot.description)
         if not goal.end_effectors:
             raise PlanningError(
                 f"{self.name} moves end-effectors along straight lines, but the goal is for the "
@@ -660,12 +657,11 @@ class ResolvedRateGait(GaitMethod):
                 f"{self.name} moves the joints along the line of the end-effector, but the goal "
                 f"also requests {part}: use optimal for both."
             )
+        return replace(request, goal=goal)
 
     def _link_paths(
         self,
-        state: RobotState,
-        goal: Goal,
-        tolerance: Tolerance,
+        request: PlanRequest,
         waypoints: Array,
         piece: tuple[PosePath, float, float] | None = None,
     ) -> _LinkPaths:
@@ -675,13 +671,13 @@ class ResolvedRateGait(GaitMethod):
         the whole path; None: it goes through the waypoints to the goal. PlanningError if
         the goal lies off these directions, or has more of them than the joints can follow.
         """
-        robot = self.robot
+        robot, state, goal = self.robot, request.state, request.goal
         goals = list(goal.end_effectors)
         if self.options.keep_attitude:
             goals.append(EndEffectorGoal(robot.base_link, state.position, state.quaternion))
         links = [(x.link, x.quaternion is not None) for x in goals]
         rows = EndEffectorRows(robot, links, BaseRotations.of(robot).loop_axes)
-        tolerances = tolerance.position, tolerance.attitude
+        tolerances = request.tolerance.position, request.tolerance.attitude
         rows.require_directions(state, goals, tolerances)
         for point in waypoints:
             rows.require_directions(
@@ -812,13 +808,12 @@ class ResolvedRateGait(GaitMethod):
 
     def _schedule(
         self,
-        state: RobotState,
-        goal: Goal,
+        request: PlanRequest,
         positions: Array,
         notes: Notes,
         progress: PathProgress | None = None,
     ) -> GaitSchedule:
-        path = self._prediction.path(state, positions)
+        goal, path = request.goal, self._prediction.path(request.state, positions)
         end = path.position[-1], path.quaternion[-1]
         notes = {**notes, **self._end_notes(goal, positions[-1], *end, self.controls)}
         return self.schedule_of(goal, positions, path, notes, progress=progress)

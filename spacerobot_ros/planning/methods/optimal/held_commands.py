@@ -155,7 +155,8 @@ class ManoeuvreModel:
         while ticks <= most:
             factor, too_fast = 1.0, True
             positions = trajectory.at_ticks(ticks)
-            held = self._adjust_to_goal(positions, boundary, final, limits, moves_end=moves_end)
+            positions = self._move_to_final(positions, boundary, final, limits)
+            held = self._adjust_to_goal(positions, boundary, limits, moves_end=moves_end)
             if held is not None:
                 motion = self._motion(held, boundary, before)
                 needed, overrun = limits.excess(motion)
@@ -165,9 +166,7 @@ class ManoeuvreModel:
                     return held
             if too_fast and programs < _MAX_PROGRAMS:
                 programs += 1
-                fitted = self._fit_to_limits(
-                    positions, boundary, final, limits, before, moves_end=free
-                )
+                fitted = self._fit_to_limits(positions, boundary, limits, before, moves_end=free)
                 if fitted is not None:
                     return fitted
                 if programs < _MAX_PROGRAMS:
@@ -200,7 +199,6 @@ class ManoeuvreModel:
         self,
         positions: Array,
         boundary: BoundaryConditions,
-        final: Array,
         limits: MotionLimits,
         before: Array | float,
         *,
@@ -209,7 +207,6 @@ class ManoeuvreModel:
         """Return commands close to shapes (N + 1, n) that end at the goal attitude and satisfy all
         limits, if there are any; every shape may change.
         """
-        positions = self._move_to_final(positions, boundary, final, limits)
         for _ in range(_MAX_PROGRAMS_IN_TURN):
             held = self._with_attitudes(positions, boundary)
             error, rows = self._end_error(held, boundary), self._end_rows(held, boundary)
@@ -222,9 +219,7 @@ class ManoeuvreModel:
                 break
         else:
             return None
-        found = self._adjust_to_goal(
-            positions, boundary, positions[-1], limits, moves_end=moves_end
-        )
+        found = self._adjust_to_goal(positions, boundary, limits, moves_end=moves_end)
         if found is None:
             return None
         motion = self._motion(found, boundary, before)
@@ -266,7 +261,6 @@ class ManoeuvreModel:
         self,
         positions: Array,
         boundary: BoundaryConditions,
-        final: Array,
         limits: MotionLimits,
         *,
         moves_end: bool,
@@ -275,7 +269,6 @@ class ManoeuvreModel:
 
         ``moves_end``: the last shape is changed, too.
         """
-        positions = self._move_to_final(positions, boundary, final, limits)
         s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
         waves, best = self._build_waves(positions, limits), math.inf
         if moves_end:
