@@ -49,11 +49,9 @@ class Approach:
     place_on_obstacle: Array | None = None
 
     def __str__(self) -> str:
-        where = (
-            ""
-            if self.place_on_obstacle is None
-            else f" near ({numbers(self.place_on_obstacle, 3)}) m"
-        )
+        where = ""
+        if self.place_on_obstacle is not None:
+            where = f" near ({numbers(self.place_on_obstacle, 3)}) m"
         if self.distance <= 0:
             return f"{self.links.subject} touch, {quantity(-self.distance, 'm')} deep{where}"
         return f"{self.links.subject} come within {quantity(self.distance, 'm')}{where}"

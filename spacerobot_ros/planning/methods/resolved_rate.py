@@ -677,12 +677,9 @@ class ResolvedRateGait(GaitMethod):
             goals.append(EndEffectorGoal(robot.base_link, state.position, state.quaternion))
         links = [(x.link, x.quaternion is not None) for x in goals]
         rows = EndEffectorRows(robot, links, BaseRotations.of(robot).loop_axes)
-        tolerances = request.tolerance.position, request.tolerance.attitude
-        rows.require_directions(state, goals, tolerances)
-        for point in waypoints:
-            rows.require_directions(
-                state, [replace(goals[0], position=point), *goals[1:]], tolerances
-            )
+        for point in (goals[0].position, *waypoints):
+            at_point = [replace(goals[0], position=point), *goals[1:]]
+            rows.require_directions(state, at_point, request.tolerance)
         from_start, r_BC = quaternion_inverse(state.quaternion), robot.center_of_mass(state.q)
         R_BW = matrix_from_quaternion(state.quaternion).T
         lines = []

@@ -214,11 +214,9 @@ class EndEffectorRows:
         return int(np.linalg.matrix_rank(J, tol=1e-6).max()), J.shape[1]
 
     def require_directions(
-        self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: tuple[float, float]
+        self, state: RobotState, goals: Sequence[EndEffectorGoal], tolerance: Tolerance
     ) -> None:
         """Reject goals outside the directions in which the links can move.
-
-        ``tolerance`` applies to positions, m, and attitudes, rad.
 
         Raises
         ------
@@ -233,7 +231,7 @@ class EndEffectorRows:
             )
             way = R_WB.T @ (goal.position - r_WE)
             beside = float(np.linalg.norm(way - each.displacements.T @ (each.displacements @ way)))
-            if beside > tolerance[0]:
+            if beside > tolerance.position:
                 where = {0: "does not move", 1: "moves along one line", 2: "moves in one plane"}
                 raise UnreachableError(
                     f"The end-effector '{each.link}' of robot '{name}' "
@@ -246,7 +244,7 @@ class EndEffectorRows:
             turn = quaternion_multiply(goal.quaternion, quaternion_inverse(now))
             turn = np.append(R_WB.T @ turn[:3], turn[3])
             swing = swing_angle(turn, each.rotations)
-            if swing > tolerance[1]:
+            if swing > tolerance.attitude:
                 where = {0: "does not rotate", 1: "rotates about one axis"}
                 raise UnreachableError(
                     f"The end-effector '{each.link}' of robot '{name}' "
@@ -450,7 +448,7 @@ class EndEffectorSpecification:
         if "position" in self.base_parts:
             goals.append(EndEffectorGoal(robot.base_link, goal.position))
         rows = self.rows
-        rows.require_directions(state, goals, (tolerance.position, tolerance.attitude))
+        rows.require_directions(state, goals, tolerance)
         self._require_within_radius(limits, state, goal)
         parameters = rows.pack(state, goals)
         kinematics = _InverseKinematics(rows, state.q, limits, parameters, self.attitude)

@@ -136,7 +136,8 @@ class ManoeuvreModel:
         ``before`` are the velocities (n,) held before the start; None: as in the boundary
         conditions.
         """
-        before = boundary.velocity if before is None else before
+        if before is not None:
+            boundary = replace(boundary, velocity=before)
         final = np.clip(trajectory.shapes[-1], limits.lower, limits.upper)
         if boundary.final is not None:
             final = np.where(np.isfinite(boundary.final), boundary.final, final)
@@ -158,7 +159,7 @@ class ManoeuvreModel:
             positions = self._move_to_final(positions, boundary, final, limits)
             held = self._adjust_to_goal(positions, boundary, limits, moves_end=moves_end)
             if held is not None:
-                motion = self._motion(held, boundary, before)
+                motion = self._motion(held, boundary)
                 needed, overrun = limits.excess(motion)
                 too_fast = max(needed - 1, overrun) > _LIMIT_ROUNDING
                 factor = max(needed, self._slowing_factor(held, motion))
@@ -166,7 +167,7 @@ class ManoeuvreModel:
                     return held
             if too_fast and programs < _MAX_PROGRAMS:
                 programs += 1
-                fitted = self._fit_to_limits(positions, boundary, limits, before, moves_end=free)
+                fitted = self._fit_to_limits(positions, boundary, limits, moves_end=free)
                 if fitted is not None:
                     return fitted
                 if programs < _MAX_PROGRAMS:
@@ -182,10 +183,9 @@ class ManoeuvreModel:
         guess = self.constraints.slowed(guess)
         return guess if self.efforts is None else self.efforts.slowed(guess, boundary)
 
-    def _motion(
-        self, held: HeldCommands, boundary: BoundaryConditions, before: Array | float
-    ) -> HeldMotion:
-        L_B, after = boundary.momenta_in_base(held.quaternions), boundary.final_velocity
+    def _motion(self, held: HeldCommands, boundary: BoundaryConditions) -> HeldMotion:
+        before, after = boundary.velocity, boundary.final_velocity
+        L_B = boundary.momenta_in_base(held.quaternions)
         return HeldMotion(held.positions, self.control_period, before, after, L_B)
 
     def _slowing_factor(self, held: HeldCommands, motion: HeldMotion) -> float:
@@ -200,7 +200,6 @@ class ManoeuvreModel:
         positions: Array,
         boundary: BoundaryConditions,
         limits: MotionLimits,
-        before: Array | float,
         *,
         moves_end: bool,
     ) -> HeldCommands | None:
@@ -210,7 +209,7 @@ class ManoeuvreModel:
         for _ in range(_MAX_PROGRAMS_IN_TURN):
             held = self._with_attitudes(positions, boundary)
             error, rows = self._end_error(held, boundary), self._end_rows(held, boundary)
-            motion = self._motion(held, boundary, before)
+            motion = self._motion(held, boundary)
             change = _least_change(motion, rows, error, limits, moves_end=moves_end)
             if change is None:
                 return None
@@ -222,7 +221,7 @@ class ManoeuvreModel:
         found = self._adjust_to_goal(positions, boundary, limits, moves_end=moves_end)
         if found is None:
             return None
-        motion = self._motion(found, boundary, before)
+        motion = self._motion(found, boundary)
         needed, overrun = limits.excess(motion)
         needed = max(needed, self._slowing_factor(found, motion))
         return found if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None

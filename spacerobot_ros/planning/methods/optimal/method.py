@@ -660,10 +660,7 @@ class OptimalGait(GaitMethod):
     ) -> _Plan:
         """Plan from the shape in which joints come to rest after braking as fast as allowed.
 
-        Raises
-        ------
-        NotFoundError
-            None was found; the ``refusal`` if braking itself is impossible.
+        NotFoundError if none was found; the ``refusal`` if braking itself is impossible.
         """
         state, limits, period = task.request.state, task.limits, self.control_period
         ticks = math.ceil(float((np.abs(motion.velocity) / limits.acceleration).max()) / period)

@@ -68,16 +68,11 @@ class OptimalOptions(MotionOptions):
     )
     base_attitude: int = nonnegative(1, "1: reached, 0: ignored", maximum=1)
     final_shape: int = nonnegative(
-        0,
-        "final joint positions if the goal has none: 0: any, 1: the current positions",
-        maximum=1,
+        0, "final joint positions if the goal has none: 0: any, 1: the current positions", maximum=1
     )
     max_base_rate: float = nonnegative(0.0, "largest base rate; 0: no limit", "rad/s", maximum=1e9)
     keep_axis: tuple[float, ...] = parameter(
-        (),
-        "base axis that stays away from keep_direction; []: none",
-        minimum=-1e9,
-        maximum=1e9,
+        (), "base axis that stays away from keep_direction; []: none", minimum=-1e9, maximum=1e9
     )
     keep_direction: tuple[float, ...] = parameter(
         (), "world direction from which keep_axis stays away", minimum=-1e9, maximum=1e9
