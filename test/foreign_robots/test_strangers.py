@@ -339,8 +339,7 @@ def test_a_robot_is_planned_for_in_time_and_ends_where_its_plan_says(
     def clear_shape() -> Array:
         while True:
             q = rng.uniform(-0.8, 0.8, robot.n)
-            nearest = geometry.nearest(q)
-            if nearest is None or nearest[0] >= 0.02:
+            if geometry.nearest_along(q[np.newaxis])[0] >= 0.02:
                 return q
 
     start, final, turn = clear_shape(), clear_shape(), Rotation.from_rotvec(TURN)
