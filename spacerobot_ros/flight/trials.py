@@ -102,7 +102,8 @@ class PlanningProblem:
     def plant(self) -> VelocityPlant:
         """Return the plant in the initial state."""
         step = self.config.integration_step
-        return VelocityPlant(self.robot, self.control_period, self.initial, step)
+        # A plan has too few ticks to be worth the compilation of the plant.
+        return VelocityPlant(self.robot.interpreted, self.control_period, self.initial, step)
 
 
 @dataclass(frozen=True)
@@ -202,8 +203,8 @@ def try_method(
         for rates in schedule.velocities:
             plant.step(rates)
         pieces.append(schedule)
-        pose, robot = plant.pose, problem.robot
-        error = PoseError.between(pose[:3], pose[3:], problem.goal, plant.q, robot)
+        pose = plant.pose
+        error = PoseError.between(pose[:3], pose[3:], problem.goal, plant.q, plant.robot)
         reached = tolerance.admits(error, schedule.controls)
         if reached:
             break

@@ -98,11 +98,13 @@ class ModelFunctions:
             return self._symbolic[name]
         return self.composed(name, lambda: self._symbolic[name])
 
-    def composed(self, key: Hashable, build: Callable[[], ca.Function]) -> ca.Function:
-        """Return a function composed of model functions, compiled once per key."""
-        place = (key, *compilation_settings())
+    def composed(
+        self, key: Hashable, build: Callable[[], ca.Function], *, compile: bool = True
+    ) -> ca.Function:
+        """Return a function composed of model functions, built and compiled once per key."""
+        place = (key, *compilation_settings()) if compile else (key,)
         if place not in self._compiled:
-            self._compiled[place] = compiled(build())
+            self._compiled[place] = compiled(build()) if compile else build()
         return self._compiled[place]
 
     @property

@@ -340,7 +340,9 @@ class SpaceRobot:
         for evaluation at every tick.
         """
         model = self._model
-        function = model.composed(name, lambda: build(Composition(model, ca.MX)))
+        function = model.composed(
+            name, lambda: build(Composition(model, ca.MX)), compile=self._compiles
+        )
         return BufferedFunction(function, self._p)
 
     def expressions(self) -> Composition:

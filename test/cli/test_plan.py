@@ -105,6 +105,22 @@ def test_a_robot_by_its_file_needs_no_scenario() -> None:
     assert "optimal" in result.output or "auto" in result.output
 
 
+def test_a_plan_is_flown_by_the_same_equations_without_a_compiler(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    target = tmp_path / "plan.json"
+    arguments = ("planar_chain", "--method", "optimal", *QUICK, "--json", str(target))
+    interpreted = plan(*arguments), json.loads(target.read_text())
+    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
+    enabled = plan(*arguments), json.loads(target.read_text())
+    assert not list((tmp_path / "cache").glob("*.so"))
+    assert interpreted[0].exit_code == enabled[0].exit_code == 0, enabled[0].output
+    for _, written in (interpreted, enabled):
+        for at in ("plan_time_s", "notes"):
+            del written[at]
+    assert interpreted[1] == enabled[1]
+
+
 @pytest.mark.parametrize("name", ["planar_chain", "faults/stuck_slider"])
 def test_the_method_is_the_scenarios_in_plan_and_run_and_python(name: str, tmp_path: Path) -> None:
     """Their methods are square_path and lie_bracket, that of a robot alone is auto."""
