@@ -15,7 +15,6 @@ import yaml
 
 from spacerobot_ros.control.config import ControllerConfig, waypoints_refusal
 from spacerobot_ros.control.laws.registry import LAWS
-from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
@@ -436,9 +435,9 @@ class Scenario:
                 f"'{self.name}' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
                 "write a scenario with a goal (`spacerobot new` writes one for a robot)."
             )
-        waypoints, planned = self.goal.waypoints, PlannedReference.name
+        waypoints = self.goal.waypoints
         controlled = "coordinated_control" in self.commanders
-        if waypoints is not None and controlled and self.controller.profile != planned:
+        if waypoints is not None and controlled and not self.controller.plans:
             raise ParameterError(waypoints_refusal(len(waypoints)))
 
 

@@ -41,7 +41,6 @@ from spacerobot_ros.control.controller import build_controller, controlled_outpu
 from spacerobot_ros.control.goals import decided_message
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.outputs import OutputDistance, controlled_parts
-from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Measures, Outcome, momentum_drift
@@ -378,7 +377,7 @@ class _ControlledLanes:
             return "it has obstacles, and lanes do not detect contacts"
         if robots.controller.description.wheel_names:
             return "the robot has reaction wheels; use engine 'flights'"
-        if scenario.controller.profile == PlannedReference.name:
+        if scenario.controller.plans:
             return "its controller tracks planned references; use engine 'flights'"
         if scenario.controller.tasks:
             return "its controller performs tasks before goals; use engine 'flights'"

@@ -148,10 +148,11 @@ def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) 
     def distances(ticks: Array) -> Array:
         return geometry.distances(pair, geometry.poses(*path.interpolated(ticks)))
 
-    starts = np.flatnonzero(path.lower_bounds[:, pair] < limit)
+    close = path.lower_bounds[:, pair] < limit
+    starts = np.flatnonzero(close)
     if not len(starts):
         return None
-    ticks = np.unique(np.concatenate([starts, starts + 1])).astype(float)
+    ticks = np.flatnonzero(np.append(close, False) | np.append(False, close)).astype(float)
     known = distances(ticks)
     least = int(np.argmin(known))
     best, at = float(known[least]), float(ticks[least])

@@ -13,8 +13,7 @@ from spacerobot_ros.control.laws.law import Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.control.planned_reference import PlannedReference
-from spacerobot_ros.control.reference import PROFILES
+from spacerobot_ros.control.reference import PLANNED_PROFILE, PROFILES
 from spacerobot_ros.control.wheels import WheelOptions
 from spacerobot_ros.errors import counted
 from spacerobot_ros.model.shared_parameters import CommanderConfig
@@ -66,7 +65,7 @@ class ControllerConfig(CommanderConfig):
     profile: str = parameter(
         "quintic",
         "profile of goal references; planned: within the available thrust, around obstacles",
-        choices=(*PROFILES, PlannedReference.name),
+        choices=(*PROFILES, PLANNED_PROFILE),
     )
     plan: ThrustOptions = group(ThrustOptions())
     motion: MotionLimits = group(MotionLimits())
@@ -112,6 +111,11 @@ class ControllerConfig(CommanderConfig):
     detumble: DetumbleOptions = group(DetumbleOptions())
     gains: Gains = group(Gains())
     options: Mapping[str, Any] = registered(LAWS)
+
+    @property
+    def plans(self) -> bool:
+        """Whether references to goals are planned within the available thrust."""
+        return self.profile == PLANNED_PROFILE
 
     @property
     def tolerances(self) -> OutputDistance:

@@ -576,7 +576,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
         ) from error
     limits = ActuatorLimits(force, torque, robot.effort_limit)
     planner = None
-    if config.profile == PlannedReference.name:
+    if config.plans:
         planner = ReferencePlanner(
             robot, outputs, limits, config.plan, in_background=config.plan_in_background
         )

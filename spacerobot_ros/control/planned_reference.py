@@ -12,7 +12,7 @@ import numpy as np
 from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.control.limits import ActuatorLimits
 from spacerobot_ros.control.outputs import OutputSelection
-from spacerobot_ros.control.reference import ReferenceProfile
+from spacerobot_ros.control.reference import PLANNED_PROFILE, ReferenceProfile
 from spacerobot_ros.control.state import (
     Actuation,
     ControlState,
@@ -49,7 +49,7 @@ class PlannedReference(ReferenceProfile):
         The plan: motions one after the other, all but the last to a waypoint.
     """
 
-    name: ClassVar[str] = "planned"
+    name: ClassVar[str] = PLANNED_PROFILE
 
     def __init__(
         self,

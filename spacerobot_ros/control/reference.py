@@ -249,6 +249,9 @@ PROFILES: dict[str, type[StepReference | QuinticReference]] = {
 }
 """The profiles by name; their arguments are start, goal and limits."""
 
+PLANNED_PROFILE = "planned"
+"""Name of the profile that is planned (:mod:`.planned_reference`), whose imports take time."""
+
 
 class _PoseInterpolation:
     """A straight line and a geodesic in W, from one pose to another, m and rad.

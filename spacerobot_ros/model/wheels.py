@@ -72,7 +72,7 @@ class ReactionWheels:
             description,
             description.wheel_names,
             index,
-            np.setdiff1d(np.arange(len(joints)), index),
+            np.delete(np.arange(len(joints)), index),
             np.array([body.origin.R @ joint.axis for body, joint in wheels]).reshape(-1, 3).T,
             np.array([_spin_inertia(body, joint.axis) for body, joint in wheels]),
             description.limits("velocity")[index],

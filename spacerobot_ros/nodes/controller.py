@@ -21,7 +21,6 @@ from spacerobot_ros.commanding.controller import (
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goals import END_EFFECTOR
-from spacerobot_ros.control.planned_reference import PlannedReference
 from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
@@ -91,7 +90,7 @@ class CoordinatedControlNode(CommanderNode):
             STREAM,
             raw=True,
         )
-        if self.config.profile == PlannedReference.name:
+        if self.config.plans:
             self.listen_to_obstacles()
             self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self.subscribe_to_goals("goal_pose")

@@ -134,7 +134,7 @@ class BasePrediction:
         if attitudes is None:
             attitudes = self.attitudes(positions, state.quaternion, state.angular_momentum)
         last = len(positions) - 1
-        chosen = np.unique(np.append(np.arange(0, last, max(1, last // _MIN_PATH_POSES)), last))
+        chosen = np.append(np.arange(0, last, max(1, last // _MIN_PATH_POSES)), last)
         time, quaternions = chosen * self._control_period, attitudes[chosen]
         positions_W = self.positions(state, time, positions[chosen], quaternions)
         return BasePath(time, positions_W, quaternions)
