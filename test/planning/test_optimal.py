@@ -50,6 +50,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.planning.methods.optimal.transcription import Stages
+from spacerobot_ros.resources import robot_file
 
 Array = npt.NDArray[np.float64]
 
@@ -503,12 +504,34 @@ def test_it_begins_as_fast_as_the_joints_move_and_not_faster_than_they_may() -> 
 def test_joints_brake_first_where_no_plan_in_motion_is_found() -> None:
     """So few steps of the solver are enough from rest alone."""
     _, state, motion = halfway(first())
-    method = planar(starts=2, intervals=20, iterations=12)
+    method = planar(starts=2, intervals=20, iterations=16)
     schedule = method.plan(PlanRequest(state, turned(-0.1), TOLERANCE, motion=motion))
     braking = round(float(str(schedule.notes["braking_time"])) / TICK)
     assert braking >= np.abs(motion.velocity / ACCELERATION).max() / TICK
     np.testing.assert_array_equal(schedule.positions[braking], schedule.positions[braking - 1])
     require_smooth(motion.velocity, schedule)
+    assert flown_angle(state, schedule) == pytest.approx(-0.1, abs=1e-6)
+
+
+def test_a_joint_beside_its_limit_brakes_before_it() -> None:
+    """The slower joint would pass its limit if it braked as long as the other one."""
+    _, state, motion = halfway(first())
+    # From rates v, held rates decrease by a T each tick T, to zero.
+    steps = ACCELERATION * TICK
+    left = np.abs(motion.velocity) - steps * np.arange(1, 11)[:, np.newaxis]
+    travel = TICK * np.maximum(left, 0.0).sum(axis=0)
+    lower = state.q[0] - 1.02 * travel[0]
+    text = robot_file("planar_chain").read_text().replace("continuous", "revolute")
+    for limit in (lower, -3.0):
+        text = text.replace("<limit velocity", f'<limit lower="{limit}" upper="3" velocity', 1)
+    few = {"starts": 2, "intervals": 20, "iterations": 16, "answers": 1, "cache": 0}
+    limits = {"max_velocity": SPEED.tolist(), "max_acceleration": ACCELERATION.tolist()}
+    chosen = {"optimal": method_options("optimal", {**limits, **few})}
+    method = build_method("optimal", SpaceRobot.from_urdf(text), TICK, STEP, chosen)
+    schedule = method.plan(PlanRequest(state, turned(-0.1), TOLERANCE, motion=motion))
+    assert "braking_time" in schedule.notes
+    require_smooth(motion.velocity, schedule)
+    assert lower <= schedule.positions[:, 0].min() < state.q[0] - 0.98 * travel[0]
     assert flown_angle(state, schedule) == pytest.approx(-0.1, abs=1e-6)
 
 

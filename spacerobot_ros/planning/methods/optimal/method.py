@@ -665,9 +665,9 @@ class OptimalGait(GaitMethod):
         state, limits, period = task.request.state, task.limits, self.control_period
         ticks = math.ceil(float((np.abs(motion.velocity) / limits.acceleration).max()) / period)
         # The joints rest in the last tick, so that the next command is within its limits.
-        shares = 1 - np.arange(1, ticks + 1) / ticks
-        travel = np.append(0.0, period * np.cumsum(shares))
-        braking = state.q + travel[:, np.newaxis] * motion.velocity
+        slowed = period * limits.acceleration * np.arange(1, ticks + 1)[:, np.newaxis]
+        rates = np.sign(motion.velocity) * np.maximum(np.abs(motion.velocity) - slowed, 0.0)
+        braking = state.q + np.vstack([np.zeros(self.robot.n), period * np.cumsum(rates, axis=0)])
         base = self._prediction.poses(state, braking)
         beyond = np.any(braking < limits.lower) or np.any(braking > limits.upper)
         if self._efforts is not None and self._efforts_are_strict:
