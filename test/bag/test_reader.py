@@ -196,6 +196,8 @@ def test_read_bag_is_there_at_once_and_costs_nothing_before() -> None:
 import sys
 import spacerobot_ros
 assert "numpy" not in sys.modules and "mcap" not in sys.modules
+import spacerobot_ros.flight.trials
+assert "mcap" not in sys.modules and "scipy" not in sys.modules, "planning reads no bag"
 from spacerobot_ros import read_bag
 print(read_bag.__module__)
 assert not hasattr(spacerobot_ros, "write_bag")
