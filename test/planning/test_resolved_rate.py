@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -257,6 +259,34 @@ def test_a_joint_at_its_limit_ends_the_line() -> None:
 
 
 @pytest.mark.parametrize(
+    ("way", "keep_attitude"),
+    [([10.0, 0.0, 0.0], 0), ([1.0, -9.0, 4.0], 0), ([0.085, 0.0, 0.0], 1)],
+)
+def test_a_line_is_not_traced_beyond_the_point_nearest_to_a_singularity(
+    way: list[float], keep_attitude: int
+) -> None:
+    q, link = np.array([0.5, 0.5, 0.5, -0.5, 0.5, 0.5, 0.5]), "link_7"
+    start = poses("seven_joint_arm", q[np.newaxis], link)[link][0]
+    robot, goal = robot_of("seven_joint_arm"), EndEffectorGoal(link, start + way)
+    options = method_options("resolved_rate", {"keep_attitude": keep_attitude})
+    method = build_method("resolved_rate", robot, PERIOD, 0.01, {"resolved_rate": options})
+    state, cancellation = RobotState(PLACE, ATTITUDE.as_quat(), q), Cancellation()
+    request = PlanRequest(state, Goal.of_end_effectors([goal]), Tolerance(1e-6, 1e-6))
+    # Beyond, the joints turn by hundreds of radians for little progress.
+    timer = Timer(60.0, cancellation.cancel)
+    timer.start()
+    try:
+        with pytest.raises(PlanningError, match="comes near to a dynamic singularity") as said:
+            method.plan(request, cancellation)
+    finally:
+        timer.cancel()
+    found = re.search(r"at the shape \((.*)\), where", str(said.value))
+    assert found
+    shape = np.array([float(x) for x in found[1].split(", ")])
+    assert np.all((robot.lower - 0.02 < shape) & (shape < robot.upper + 0.02))
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"rotvec": (0.1, 0.0, 0.0)}, "the goal is for the base: use optimal for it"),
@@ -348,7 +378,7 @@ def test_paper_4_the_straight_line_to_b_meets_a_dynamic_singularity(
     with pytest.raises(
         PlanningError,
         match=r"meets a dynamic singularity after 1\.19498 of 1\.5834\d m of the line of "
-        r"'end_effector': \|det J\*\| falls from 0\.373488 to zero at the shape "
+        r"'end_effector': \|det J\*\|, 0\.373488 at the start, is zero at the shape "
         r"\(1\.27635, 0\.198006\).*optimal may reach",
     ) as refusal:
         reach_b(manipulator, method="resolved_rate")
@@ -367,7 +397,7 @@ def test_paper_4_the_path_ends_at_the_singularity(
     method = build_method("resolved_rate", robot, 0.01, 0.01, {})
     assert isinstance(method, ResolvedRateGait)
     path = method.path(request_b(state))
-    assert not path.is_complete
+    assert path.progress_rate[-1] == pytest.approx(0.0, abs=1e-8)
     # Computed independently of this program, from the paper's Table I.
     assert 1.583415 * path.path_fractions[-1] == pytest.approx(1.194983, abs=2e-6)
     assert np.degrees(path.shapes[-1]) == pytest.approx([73.1295, 11.3449], abs=1e-4)

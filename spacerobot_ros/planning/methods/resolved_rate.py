@@ -190,7 +190,7 @@ class _LinkPaths:
     """
 
     def __init__(self, robot: SpaceRobot, lines: Sequence[_LinkPath], limits: MotionLimits) -> None:
-        self._robot, self._lines = robot, tuple(lines)
+        self._robot, self._lines, self._limits = robot, tuple(lines), limits
         fastest = float(limits.velocity.max())
         ones = np.ones(robot.n)
         self.joint_scales = limits.velocity / fastest if math.isfinite(fastest) else ones
@@ -230,6 +230,10 @@ class _LinkPaths:
     def scaled_jacobian(self, q: Array, X: Array) -> Array:
         """Return :meth:`jacobian` per radian of the fastest joint."""
         return np.asarray(self._row_scales[:, np.newaxis] * self.jacobian(q, X) * self.joint_scales)
+
+    def beyond_limits(self, q: Array) -> Array:
+        """Return how far joints (n,) are beyond their limits, m or rad; negative within them."""
+        return np.asarray(np.maximum(self._limits.lower - q, q - self._limits.upper))
 
     def least_correction(self, q: Array, X: Array, progress: float) -> tuple[Array, float]:
         """Return the smallest joint motion (n,) that brings the links onto their lines, and the
@@ -305,11 +309,6 @@ class JointPath:
     path_fractions: Array
     progress_rate: Array
 
-    @property
-    def is_complete(self) -> bool:
-        """Whether the path reaches the ends of the lines."""
-        return bool(self.path_fractions[-1] == 1.0)
-
     def truncated(self, last: int) -> JointPath:
         """Return the path up to and including one of its points."""
         parts = {each.name: getattr(self, each.name)[: last + 1] for each in fields(self)}
@@ -317,7 +316,11 @@ class JointPath:
 
 
 def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath:
-    """Follow lines from a shape (n,) to their ends, or to a singularity (Runge-Kutta 4)."""
+    """Follow lines from a shape (n,) to their ends, a singularity, the point nearest to one, or a
+    joint limit (Runge-Kutta 4).
+
+    Beyond these points, the joints may turn for long with hardly any progress along the lines.
+    """
     n, total = len(q), lines.length
     breaks = lines.curvature_breaks * total
     y = np.concatenate([q, [0.0, 0.0, 0.0, 1.0, 0.0]])
@@ -330,16 +333,21 @@ def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) ->
     k = rate(y)
     lengths, states, progress = [0.0], [y], [float(k[-1])]
     longest = min(_TRACE_STEP, total / _MIN_TRACE_STEPS / max(progress[0], _ZERO_PROGRESS_RATE))
-    step = longest
+    share = 1.0
     while progress[-1] > _ZERO_PROGRESS_RATE:
         cancellation.raise_if_requested()
+        falls = progress[-2] - progress[-1] if len(progress) > 1 else 0.0
+        rises_again = falls < 0 and progress[-2] < MIN_PROGRESS_RATE
+        if rises_again or lines.beyond_limits(y[:n]).max() > _LIMIT_ROUNDING:
+            break
         left = total - y[-1]
         ahead = breaks[breaks > y[-1] + _KNOT_TOLERANCE * total] - y[-1]
         # Steps end where the curvature of the path jumps.
         step = min(longest, left / progress[-1], *ahead[:1] / progress[-1])
-        if len(progress) > 1 and (falls := progress[-2] - progress[-1]) > 0:
+        if falls > 0:
             slope = falls / (lengths[-1] - lengths[-2])
             step = min(step, _SINGULARITY_STEP_SHARE * progress[-1] / slope)
+        step *= share
         k2 = rate(y + step / 2 * k)
         k3 = rate(y + step / 2 * k2)
         k4 = rate(y + step * k3)
@@ -349,11 +357,11 @@ def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) ->
         # A singularity is a turning point of the path, which no step may go beyond: there, the
         # tangent is reversed, as progress is never negative.
         if min(float(x[:n] @ (k[:n] / lines.joint_scales**2)) for x in (k2, k3, k4, at_end)) < 0:
-            longest = step / 4
-            if longest < _ZERO_PROGRESS_RATE**2:
+            share /= 4
+            if step < _ZERO_PROGRESS_RATE**2:
                 progress[-1] = 0.0
             continue
-        y, k = there, at_end
+        y, k, share = there, at_end, min(2 * share, 1.0)
         lengths.append(lengths[-1] + step)
         states.append(y)
         progress.append(float(k[-1]))
@@ -615,11 +623,9 @@ class ResolvedRateGait(GaitMethod):
         return free, f"On the way {found}."
 
     def path(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> JointPath:
-        """Return the path along the lines of a goal, to their ends or to a singularity.
+        """Return the path along the lines of a goal, to their ends, a singularity or a joint limit.
 
         A path in the goal is ignored: the lines lead straight to the end of that path.
-
-        The result does not depend on joint limits, which may end the motion earlier.
 
         Raises
         ------
@@ -730,16 +736,13 @@ class ResolvedRateGait(GaitMethod):
         """Return the last point of a path before joint limits are exceeded, or before a singularity
         is near, with the reason; None if the path is free.
         """
-        robot = self.robot
-        beyond = np.maximum(robot.lower - path.shapes, path.shapes - robot.upper)
-        outside = np.flatnonzero(beyond.max(axis=1) > _LIMIT_ROUNDING)
+        beyond = lines.beyond_limits(path.shapes[-1])
         slow = np.flatnonzero(path.progress_rate < MIN_PROGRESS_RATE)
-        if len(outside) and (not len(slow) or outside[0] < slow[0]):
-            k = int(outside[0])
-            joint = robot.description.movable_joints[int(np.argmax(beyond[k]))]
-            return k - 1, (
+        if not len(slow) and beyond.max() > _LIMIT_ROUNDING:
+            joint = self.robot.description.movable_joints[int(np.argmax(beyond))]
+            return len(path.shapes) - 2, (
                 f"Joint '{joint.name}' is at its limit "
-                f"{lines.position_text(path.path_fractions[k])}: optimal may reach the goal "
+                f"{lines.position_text(path.path_fractions[-1])}: optimal may reach the goal "
                 f"without following the line; so may a line from another shape."
             )
         if not len(slow):
@@ -749,15 +752,15 @@ class ResolvedRateGait(GaitMethod):
         first = lines.singularity_measure(path.shapes[0], path.turns[0])[1]
         shape = ", ".join(f"{x:.6g}" for x in path.shapes[nearest])
         meets, least, there = "meets", "zero", "no joint rates continue the motion along the line"
-        if path.is_complete:
+        if path.progress_rate[-1] > _ZERO_PROGRESS_RATE:
             meets, least = "comes near to", f"{value:.3g}"
             there = "the joints would have to move fast for little progress"
         line = "straight line" if lines.is_straight else "path through the waypoints"
         return int(slow[0]) - 1, (
             f"The {line} {meets} a dynamic singularity "
-            f"{lines.position_text(path.path_fractions[nearest])}: {name} falls from "
-            f"{first:.6g} to {least} at the shape ({shape}), where {there}. optimal may reach "
-            "the goal without following the line; so may a line from another shape."
+            f"{lines.position_text(path.path_fractions[nearest])}: {name}, "
+            f"{first:.6g} at the start, is {least} at the shape ({shape}), where {there}. optimal "
+            "may reach the goal without following the line; so may a line from another shape."
         )
 
     def _held_commands(
