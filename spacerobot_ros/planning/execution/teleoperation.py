@@ -27,12 +27,12 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.state_average import MeasuredState
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
-from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.resolved_rate import (
     MIN_PROGRESS_RATE,
     ResolvedRateGait,
     ResolvedRateOptions,
+    unit_of_motion,
 )
 from spacerobot_ros.times import SECOND
 
@@ -322,7 +322,7 @@ class TwistFollower:
             )
         self.turns = len(displacements) + len(rotations) + kept <= robot.n
         """Whether the rotation follows the twist."""
-        reach = reach_of_end_effector(robot, limits.lower, limits.upper, link)
+        reach = unit_of_motion(robot, limits, link)
         self._displacements = displacements
         self._rotations = rotations if self.turns else rotations[:0]
         self._scales = np.repeat([1 / reach, 1.0], [len(displacements), len(self._rotations)])

@@ -56,7 +56,8 @@ from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 _TRACE_STEP = 0.02
 """Longest step along a joint path, rad of the fastest joint."""
 
-_MIN_TRACE_STEPS = 20
+_MIN_TRACE_STEPS, _MAX_TRACE_STEPS = 20, 20_000
+"""Smallest and largest number of steps along a joint path."""
 
 MIN_PROGRESS_RATE = 0.01
 """Progress along the line below which a singularity is near, in end-effector reaches per radian of
@@ -79,6 +80,7 @@ examined."""
 _PATH_LENGTH_SAMPLES = 200
 _TIMING_INTERVALS = 160
 _MAX_TIMING_INTERVALS = 1600
+_MAX_TICKS = 100_000
 
 _USED_ACCELERATION_SHARE = 0.99
 """Fraction of the acceleration limits for the path; corrections at the ticks may use the rest."""
@@ -180,6 +182,12 @@ class _LinkPath:
     path_from_start: _SmoothPath | RoundedPath
 
 
+def unit_of_motion(robot: SpaceRobot, limits: MotionLimits, link: str) -> float:
+    """Return the reach of a link, m, with the ranges of long or unlimited sliders shortened."""
+    middle, half = limits.joint_ranges(np.clip(0.0, limits.lower, limits.upper))
+    return reach_of_end_effector(robot, middle - half, middle + half, link)
+
+
 class _LinkPaths:
     """The lines of all links of a goal, and how the joints move the links along them.
 
@@ -198,7 +206,7 @@ class _LinkPaths:
         for line in lines:
             reach = 1.0
             if len(line.displacements):
-                reach = reach_of_end_effector(robot, limits.lower, limits.upper, line.link)
+                reach = unit_of_motion(robot, limits, line.link)
             scales += [1 / reach] * len(line.displacements) + [1.0] * len(line.rotations)
         self._row_scales = np.array(scales)
         self.is_straight = all(line.path_from_start.is_straight for line in lines)
@@ -340,6 +348,11 @@ def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) ->
         rises_again = falls < 0 and progress[-2] < MIN_PROGRESS_RATE
         if rises_again or lines.beyond_limits(y[:n]).max() > _LIMIT_ROUNDING:
             break
+        if len(lengths) > _MAX_TRACE_STEPS:
+            raise PlanningError(
+                f"The line is too long: the joints move by {lengths[-1]:.4g} rad or m "
+                f"{lines.position_text(y[-1] / total)}; send nearer goals one after the other."
+            )
         left = total - y[-1]
         ahead = breaks[breaks > y[-1] + _KNOT_TOLERANCE * total] - y[-1]
         # Steps end where the curvature of the path jumps.
@@ -686,6 +699,8 @@ class ResolvedRateGait(GaitMethod):
         for point in (goals[0].position, *waypoints):
             at_point = [replace(goals[0], position=point), *goals[1:]]
             rows.require_directions(state, at_point, request.tolerance)
+        if piece is None and not self.options.as_far_as_possible:
+            rows.require_within_reach(self._limits, state, goal.end_effectors)
         from_start, r_BC = quaternion_inverse(state.quaternion), robot.center_of_mass(state.q)
         R_BW = matrix_from_quaternion(state.quaternion).T
         lines = []
@@ -769,8 +784,13 @@ class ResolvedRateGait(GaitMethod):
         """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each, and
         the shares of the lines (N + 1,).
         """
-        period = self.control_period
-        ticks = max(1, math.ceil(timed.time[-1] / period - 1e-9))
+        period, duration = self.control_period, float(timed.time[-1])
+        if duration > _MAX_TICKS * period:
+            raise PlanningError(
+                f"The motion along the line takes {duration:.4g} s, more than {_MAX_TICKS} ticks "
+                f"of {period:g} s: use a nearer goal, higher joint limits or a lower tick_rate."
+            )
+        ticks = max(1, math.ceil(duration / period - 1e-9))
         for _ in range(_MAX_CORRECTION_ITERATIONS):
             shapes, shares = timed.at_ticks(ticks)
             positions = self._shapes_on_lines(lines, state, shapes, shares)

@@ -253,6 +253,30 @@ class EndEffectorRows:
                     Proof.RANK,
                 )
 
+    def require_within_reach(
+        self, limits: MotionLimits, state: RobotState, goals: Sequence[EndEffectorGoal]
+    ) -> None:
+        """Reject goals that are farther from the centre of mass than shapes reach.
+
+        Raises
+        ------
+        UnreachableError
+            No shape within the limits brings a link so far.
+        """
+        robot, R_WB = self.robot, matrix_from_quaternion(state.quaternion)
+        r_WC = state.position + R_WB @ robot.center_of_mass(state.q)
+        for each in goals:
+            reach = reach_of_end_effector(robot, limits.lower, limits.upper, each.link)
+            distance = float(np.linalg.norm(each.position - r_WC))
+            if distance > reach * (1 + 1e-9):
+                raise UnreachableError(
+                    f"The goal of '{each.link}' is out of reach: it is {distance:.4g} m from the "
+                    "centre of mass, which stays where it is without thrust, and the joints of "
+                    f"'{robot.description.name}' can move '{each.link}' no farther from it than "
+                    f"{reach:.4g} m.",
+                    Proof.LIMITS,
+                )
+
     def _samples(self) -> tuple[Array, Array]:
         """Return shapes (K, n) in general position, and a base rotation (K, 4) for each."""
         shapes = sample_shapes(self.robot, _SAMPLED_SHAPES)
@@ -449,7 +473,7 @@ class EndEffectorSpecification:
             goals.append(EndEffectorGoal(robot.base_link, goal.position))
         rows = self.rows
         rows.require_directions(state, goals, tolerance)
-        self._require_within_radius(limits, state, goal)
+        rows.require_within_reach(limits, state, goal.end_effectors)
         parameters = rows.pack(state, goals)
         kinematics = _InverseKinematics(rows, state.q, limits, parameters, self.attitude)
         if shape is not None:
@@ -562,19 +586,3 @@ class EndEffectorSpecification:
             f"{2 * _STARTS + _ADDITIONAL_STARTS} shapes; the nearest is {nearest:.3g} m or rad "
             f"away. {remedy}"
         )
-
-    def _require_within_radius(self, limits: MotionLimits, state: RobotState, goal: Goal) -> None:
-        """Raise UnreachableError if a goal is farther from the centre of mass than shapes reach."""
-        robot, R_WB = self.base.robot, matrix_from_quaternion(state.quaternion)
-        r_WC = state.position + R_WB @ robot.center_of_mass(state.q)
-        for each in goal.end_effectors:
-            reach = reach_of_end_effector(robot, limits.lower, limits.upper, each.link)
-            distance = float(np.linalg.norm(each.position - r_WC))
-            if distance > reach * (1 + 1e-9):
-                raise UnreachableError(
-                    f"The goal of '{each.link}' is out of reach: it is {distance:.4g} m from the "
-                    "centre of mass, which stays where it is without thrust, and the joints of "
-                    f"'{robot.description.name}' can move '{each.link}' no farther from it than "
-                    f"{reach:.4g} m.",
-                    Proof.LIMITS,
-                )
