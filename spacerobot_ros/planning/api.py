@@ -189,4 +189,9 @@ def _start_state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) ->
             f"The start has {counted(q.size, 'joint position')}, but robot "
             f"'{robot.description.name}' has {counted(robot.n, 'joint')}."
         )
+    for k in np.flatnonzero(~((robot.lower - 1e-6 <= q) & (q <= robot.upper + 1e-6)))[:1]:
+        raise ParameterError(
+            f"The start of joint '{robot.joint_names[k]}', {q[k]:g}, is outside its limits "
+            f"[{robot.lower[k]:g}, {robot.upper[k]:g}]."
+        )
     return RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)

@@ -151,6 +151,9 @@ def test_a_call_without_ros_checks_its_options_too() -> None:
 def test_a_start_has_a_position_for_every_joint_and_a_method_is_one_of_the_registry() -> None:
     with pytest.raises(ParameterError, match=r"start has 2 joint positions, .* has 3 joints"):
         plan(robot_of(ARM), start=(0.1, 0.2))
+    for outside in (9.0, np.nan):
+        with pytest.raises(ParameterError, match=r"start of joint '\w+', (9|nan), is outside its"):
+            plan(robot_of(ARM), start=(0.1, outside, 0.2))
     with pytest.raises(
         ParameterError, match="no gait method 'magic'; the methods are: lie_bracket, "
     ):
