@@ -290,7 +290,7 @@ def test_goals_out_of_reach_and_long_slow_motions_are_refused() -> None:
     assert said.value.proof is Proof.LIMITS
     start, _ = poses("three_joint_arm", ARM[np.newaxis], "end_effector")["end_effector"]
     goal, slow = start + np.array([0.2, -0.25, 0.2]), (1e-9,) * 3
-    with pytest.raises(PlanningError, match=r"takes \S+ s, more than 100000 ticks of 0\.08 s"):
+    with pytest.raises(PlanningError, match=r"takes \S+ s, more than 500000 ticks of 0\.08 s"):
         planned("three_joint_arm", ARM, "end_effector", goal, max_velocity=slow)
 
 
@@ -321,7 +321,7 @@ def test_the_range_of_sliders_does_not_make_a_singularity(gantry: Path) -> None:
 
 @pytest.mark.slow
 def test_a_line_of_kilometres_is_too_long(gantry: Path) -> None:
-    with pytest.raises(PlanningError, match=r"too long: the joints move by 400 rad or m after \d"):
+    with pytest.raises(PlanningError, match=r"too long: the joints move by 600 rad or m after \d"):
         plan(gantry, end_effector_position=(3e4, 4e4, 0.0), method="resolved_rate")
 
 

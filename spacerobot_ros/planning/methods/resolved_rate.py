@@ -56,7 +56,7 @@ from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 _TRACE_STEP = 0.02
 """Longest step along a joint path, rad of the fastest joint."""
 
-_MIN_TRACE_STEPS, _MAX_TRACE_STEPS = 20, 20_000
+_MIN_TRACE_STEPS, _MAX_TRACE_STEPS = 20, 30_000
 """Smallest and largest number of steps along a joint path."""
 
 MIN_PROGRESS_RATE = 0.01
@@ -80,7 +80,7 @@ examined."""
 _PATH_LENGTH_SAMPLES = 200
 _TIMING_INTERVALS = 160
 _MAX_TIMING_INTERVALS = 1600
-_MAX_TICKS = 100_000
+_MAX_TICKS = 500_000
 
 _USED_ACCELERATION_SHARE = 0.99
 """Fraction of the acceleration limits for the path; corrections at the ticks may use the rest."""
