@@ -54,6 +54,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 from spacerobot_ros.planning.methods.optimal.search import (
     Manoeuvre,
     ManoeuvreSearch,
+    NoClearPathError,
     SearchClock,
     SearchProblem,
 )
@@ -425,7 +426,7 @@ class OptimalGait(GaitMethod):
         if timed or free:
             raise refusal
         if angle < _MIN_HALVED_ANGLE:
-            if self.clearance is None or task.boundary.final is not None:
+            if not isinstance(refusal, NoClearPathError) or task.boundary.final is not None:
                 raise refusal
             back = replace(request, goal=replace(goal, joint_positions=state.q))
             with suppress(PlanningError):
@@ -472,7 +473,7 @@ class OptimalGait(GaitMethod):
         except NotFoundError as refusal:
             if bound.seconds == 0:
                 raise
-            raise NotFoundError(f"{refusal} It is proved that {bound}.") from None
+            raise type(refusal)(f"{refusal} It is proved that {bound}.") from None
 
     def _boundary(self, request: PlanRequest, shape: Array | None) -> BoundaryConditions:
         """Return the boundary conditions of a request with this goal shape (n,); None: any."""

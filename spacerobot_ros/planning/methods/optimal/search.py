@@ -173,6 +173,10 @@ _REPORT_PERIOD = 1.0
 """Wall time, s, after which a solver reports that it is still busy."""
 
 
+class NoClearPathError(NotFoundError):
+    """Manoeuvres to the goal were found, but no clear one."""
+
+
 @dataclass(frozen=True)
 class Manoeuvre:
     """A manoeuvre that was found: held commands and search results.
@@ -337,7 +341,7 @@ class ManoeuvreSearch:
         Raises
         ------
         NotFoundError
-            None was found.
+            None was found; if others were found, but no clear one, a :class:`NoClearPathError`.
         PlanningError
             No manoeuvre is as short as requested, or links are too close at the start or the end.
         PlanningCancelled
@@ -356,16 +360,16 @@ class ManoeuvreSearch:
         if model.distances is not None:
             kept = model.distances.begin(problem.boundary, turn_is_known=knows_turn)
         search = _Search(model, problem, self._solver)
-        found = search.search_from_guesses()
+        found, refusal = search.search_from_guesses(), NotFoundError
         if found is not None and kept is not None:
-            found = search.keep_clear(kept, found)
+            found, refusal = search.keep_clear(kept, found), NoClearPathError
         cut_short = problem.clock.is_over(found=found is not None)
         if found is None:
             within = f" within optimal.time_budget {options.time_budget:g} s" if cut_short else ""
             in_motion = "" if problem.motion is None else " that begins in motion"
             limit = "duration" if options.duration > 0 else "longest"
             longer = "A longer optimal.time_budget, more" if cut_short else "More"
-            raise NotFoundError(
+            raise refusal(
                 f"No manoeuvre to the goal{in_motion} was found from "
                 f"{counted(search.starts, 'start')}{within}: {search.rejection}. {longer} "
                 "optimal.starts, optimal.iterations or optimal.intervals, "
