@@ -364,7 +364,7 @@ def goal_of(robot: SpaceRobot, start: Array, number: int, rng: np.random.Generat
 
 @pytest.mark.study
 def test_plans_are_as_short_as_those_of_long_searches() -> None:
-    """At least 90 % of the durations are within 2 % of those by a search from sixty guesses."""
+    """At least 97 % of the durations are within 2 % of those by a search from sixty guesses."""
     ratios: list[float] = []
     for name in SEARCHED_ROBOTS:
         robot = SpaceRobot.from_file(robot_file(name))
@@ -393,7 +393,7 @@ def test_plans_are_as_short_as_those_of_long_searches() -> None:
         print(f"{name}: the slowest plan takes {slowest:.1f} times the median", flush=True)
     within = np.mean(np.array(ratios) <= 1.02)
     print(f"{len(ratios)} goals: {within:.1%} within 2 %, the worst {max(ratios):.3f} times")
-    assert within >= 0.9
+    assert within >= 0.97
 
 
 # -- held commands take hardly longer than the continuous solutions that they are made of --------
