@@ -44,6 +44,9 @@ _MAX_EVENT_ROWS, _MAX_UNFOLDED_ROWS = 200, 20
 """Largest number of events in the table, and the largest number for which the table is not
 collapsed."""
 
+_BREAK_SHARE = 0.005
+"""Fraction of the time axis for which a trace pauses after a break."""
+
 _CHART_SLICES = 500
 """Number of time slices in a chart of a dense trace."""
 
@@ -281,6 +284,11 @@ def _chart_data(group: TraceGroup, labels: Sequence[str]) -> dict[str, Any]:
         time = np.unique(np.concatenate([each.time for each in signals]))
         values = np.hstack([each.at(time) for each in signals])
         names = [f"{name}, {label}" for label in labels for name in group.names]
+    for row in np.flatnonzero(np.isnan(values).all(axis=1))[::-1]:
+        # uPlot shows a break only if it is some pixels wide.
+        end = np.searchsorted(time, time[row] + _BREAK_SHARE * np.ptp(time))
+        time = np.delete(time, slice(row + 1, end))
+        values = np.delete(values, slice(row + 1, end), axis=0)
     if group.decades:
         # uPlot's own logarithmic axes fail with numbers as small as rounding errors.
         floor, _ = log_range(values, group.decades)

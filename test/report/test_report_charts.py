@@ -8,6 +8,7 @@ import json
 import re
 import unicodedata
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from support.html_page import leave_blank
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report import write_report
+from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import charts_of
@@ -356,6 +358,22 @@ def test_every_licence_is_there_once_with_its_words() -> None:
     (isarray,) = (licence for name, licence in found if name.startswith("isarray"))
     assert "Julian Gruber" in isarray
     assert "Permission is hereby granted" in isarray
+
+
+def test_a_break_is_wide_enough_to_be_seen(flight: FlightReport) -> None:
+    """uPlot draws a line across a break between samples of one time."""
+    figure = shape_figure(flight)
+    assert isinstance(figure, ReportFigure)
+    group = figure.groups[0]
+    at = float(group.signal.time[len(group.signal) // 3])
+    broken = replace(group, signal=group.signal.broken_at([at]))
+    part = charts_of(flight, [replace(figure, groups=[broken])])
+    (chart,) = part.data["charts"]["charts"]
+    time = np.frombuffer(base64.b64decode(chart["time"]), "<f8")
+    for column in chart["values"]:
+        values = np.frombuffer(base64.b64decode(column), "<f4")
+        (gap,) = np.flatnonzero(np.isnan(values))
+        assert time[gap + 1] - time[gap - 1] >= 0.004 * (time[-1] - time[0])
 
 
 def test_fewer_samples_look_alike() -> None:
