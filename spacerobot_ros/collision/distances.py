@@ -143,9 +143,7 @@ class ExactDistances:
     def _results(
         self, first: int, second: int, R_1: Array, r_1: Array, R_2: Array, r_2: Array
     ) -> Iterator[tuple[float, Any, Array, Array]]:
-        """Yield the distance between two solids, coal's result in the frame of the first, and the
-        pose of the second in that frame.
-        """
+        """Yield distances, coal's results in the frame of the first, poses of the second there."""
         coal = self._coal
         (one, R_a, r_a), (other, R_b, r_b) = self._geometries[first], self._geometries[second]
         if (first, second) not in self._computers:

@@ -79,8 +79,7 @@ class BasePoses(NamedTuple):
         return BasePoses(self.position[rows], self.quaternion[rows])
 
     def between(self, before: npt.NDArray[np.int64], share: Array) -> BasePoses:
-        """Return poses (K,) at fractions ``share`` (K, 1) of the way from the poses ``before`` to
-        the next poses."""
+        """Return poses (K,) at shares (K, 1) of the way from poses ``before`` to the next ones."""
         r, x = self
         position = (1 - share) * r[before] + share * r[before + 1]
         next_ = (
@@ -340,9 +339,7 @@ class CollisionGeometry:
     # -- pairs --------------------------------------------------------------------------------
 
     def _distinct_pairs(self) -> npt.NDArray[np.int64]:
-        """Return the pairs of solids on different bodies that no joint connects and no SRDF
-        disables.
-        """
+        """Return pairs of solids on different bodies, not connected by a joint or disabled."""
         disabled = self.robot.disabled_collisions
         parents = [body.parent for body in self.robot.bodies]
         found = []
@@ -383,8 +380,7 @@ class CollisionGeometry:
     # -- motion -------------------------------------------------------------------------------
 
     def largest_lever_arms(self, shapes: Array) -> tuple[Array, Array]:
-        """Return lever arms: the solids in a pair move relative to each other by at most
-        ``reaches @ |dtheta|`` (P,), m.
+        """Return lever arms: pairs move relative to each other by up to ``reaches @ |dtheta|``, m.
 
         ``reaches`` (P, m) is the largest distance of any point of the pair from each moving joint
         between the two solids, over all configurations (N, n). It is zero for other joints,
@@ -508,8 +504,7 @@ def _convex_hull(points: Array) -> Any:
 def collision_visuals(
     robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[Visual, ...]:
-    """Return the solids used for distances; meshes are replaced by their convex hulls, or omitted
-    if they cannot be read.
+    """Return the solids used for distances: hulls of meshes, except for unreadable ones.
 
     See :class:`~spacerobot_ros.collision.geometry.CollisionGeometry` for ``mesh_of``.
     """

@@ -126,8 +126,7 @@ def _between_links(tree: TreeKinematics, first: Solid, second: Solid, plane: ca.
 
 
 _EDGE_ROUNDING = 0.03
-"""Length, m, over which projection corners are smoothed; smoothing makes the distance slightly
-smaller."""
+"""Length, m, over which projection corners are smoothed; distances become slightly smaller."""
 
 
 def support_distance(

@@ -133,8 +133,7 @@ def widest_gaps(
     axes = np.concatenate([A, B, edges], axis=2)
 
     def gaps(directions: Array) -> Array:
-        """Return the gaps (N, k) between the projections of the boxes onto unit vectors (N, 3,
-        k)."""
+        """Return the gaps (N, k) of the boxes projected onto unit vectors (N, 3, k)."""
         apart = np.abs(np.einsum("na,nak->nk", between, directions))
         for R, half in ((A, first.half), (B, second.half)):
             apart = apart - np.einsum("a,nak->nk", half, np.abs(np.swapaxes(R, 1, 2) @ directions))

@@ -145,8 +145,7 @@ def end_effector_goals(
     *,
     path: EndEffectorValues | None = None,
 ) -> tuple[EndEffectorGoal, ...]:
-    """Return end-effector goals from positions, poses and paths, either for one ``link`` or by link
-    name.
+    """Return end-effector goals from positions, poses and paths, of one ``link`` or by link name.
 
     Raises
     ------

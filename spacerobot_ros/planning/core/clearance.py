@@ -1,5 +1,4 @@
-"""Plan clearance: smallest distances between the bodies of a robot, and from these bodies to
-obstacles."""
+"""Plan clearance: smallest distances between the bodies of a robot, and to obstacles."""
 
 from __future__ import annotations
 
@@ -49,8 +48,7 @@ they are that close: fingers, for instance, are by design."""
 
 
 class Clearance:
-    """Smallest distance that planned motions of a robot keep between its links, and from its links
-    to obstacles.
+    """Smallest distance that plans keep between links of a robot, and from its links to obstacles.
 
     Parameters
     ----------

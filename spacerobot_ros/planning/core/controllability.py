@@ -21,8 +21,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, JointKind
 
 MAX_CONDITION = 1e6
-"""Condition number above which brackets are considered linearly dependent, because their directions
-result from rounding errors."""
+"""Condition number above which brackets count as linearly dependent, by rounding errors."""
 
 ZERO_TURN_PER_AREA = 1e-12
 """Threshold, rad per unit area, below which singular values of the brackets are treated as zero."""
@@ -75,8 +74,7 @@ class Controllability:
 
     @property
     def condition(self) -> float:
-        """Condition number of the best three brackets; infinite if the brackets are linearly
-        dependent."""
+        """Condition number of the best three brackets; infinite if they are linearly dependent."""
         largest, _, smallest = self.singular_values
         return float(largest / smallest) if smallest > ZERO_TURN_PER_AREA else np.inf
 
@@ -110,8 +108,7 @@ def curvature_matrices(K: Array, joints: Sequence[int]) -> Array:
 
 
 def best_triple(K: Array, among: Sequence[int]) -> tuple[tuple[int, int, int], Array]:
-    """Return the three joints with the best-conditioned ``M`` (3, 3), from the curvature (3, n,
-    n)."""
+    """Return the joints with the best-conditioned ``M`` (3, 3) of the curvature (3, n, n)."""
     triples = list(itertools.combinations(among, 3))
     matrices = np.array([curvature_matrices(K, triple) for triple in triples])
     values = np.linalg.svd(matrices, compute_uv=False)
@@ -163,8 +160,7 @@ def independent_slots(robot: SpaceRobot, shape: Array | None = None) -> Array:
 
 
 def tilted_goal_error(robot: SpaceRobot, axis: Array, tilt: float) -> UnreachableError:
-    """Return the error to raise for a goal attitude tilted by ``tilt`` (rad) from the ``axis``
-    (3,)."""
+    """Return the error for a goal attitude tilted by ``tilt`` (rad) from the ``axis`` (3,)."""
     return UnreachableError(
         f"The goal attitude is {tilt:.4g} rad away from any rotation about the axis "
         f"{(np.round(axis, 6) + 0.0).tolist()} of {robot.base_link}: planar robot "

@@ -26,8 +26,7 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.parameters import as_numbers
 
 Controlled = Literal["position", "attitude", "shape", "end_effectors"]
-"""A goal component: base position, base attitude, joint positions, or end-effector poses.
-"""
+"""A goal component: base position, base attitude, joint positions, or end-effector poses."""
 
 POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 """The goal components that form the base pose."""
@@ -140,8 +139,7 @@ class EndEffectorGoal:
 
     @classmethod
     def of_numbers(cls, link: str, numbers: npt.ArrayLike) -> EndEffectorGoal:
-        """Return the goal from its representation in files: a position or a pose, or a list of
-        these for a path.
+        """Return the goal in a file: a position or a pose, or a list of these for a path.
 
         Raises
         ------
@@ -173,9 +171,7 @@ class EndEffectorGoal:
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Position (3,), or position and quaternion (7,), of the goal without waypoints, as
-        accepted by :meth:`checked`.
-        """
+        """Position (3,), or position and quaternion (7,), as accepted by :meth:`checked`."""
         attitude = [] if self.quaternion is None else self.quaternion.tolist()
         return (*self.position.tolist(), *attitude)
 
@@ -236,8 +232,7 @@ class Goal:
         quaternion: npt.ArrayLike | None = None,
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return an end-effector goal; the base is free except for the given components of its
-        pose.
+        """Return an end-effector goal; the base is free except for the given pose components.
 
         Raises
         ------
@@ -308,8 +303,7 @@ class Goal:
         quaternion: Sequence[float],
         joint_positions: npt.ArrayLike | None = None,
     ) -> Goal:
-        """Return the goal in a message, checked as by :meth:`checked`; NaN components are not
-        requested.
+        """Return the goal in a message; NaN components are not requested.
 
         Raises
         ------
@@ -360,8 +354,7 @@ class Goal:
         return cls.checked(position, quaternion_from_matrix(matrix_from_rpy(np.radians(angles))))
 
     def for_robot(self, robot: RobotDescription) -> Goal:
-        """Return the goal with end-effector names resolved; an empty name means the default
-        end-effector.
+        """Return the goal with link names resolved; an empty name means the default end-effector.
 
         Raises
         ------
@@ -603,9 +596,7 @@ def uncontrolled_parts(goal: Goal, controls: frozenset[Controlled]) -> tuple[Con
 def missed_parts(
     goal: Goal, error: PoseError, controls: frozenset[Controlled], tolerance: Tolerance
 ) -> dict[str, str]:
-    """Return the requested base components that are out of tolerance and not controlled, each with
-    its error and unit.
-    """
+    """Return requested base components out of tolerance and not controlled, with their errors."""
     errors: dict[Controlled, tuple[float, float, str]] = {
         "position": (error.distance, tolerance.position, "m"),
         "attitude": (error.angle, tolerance.attitude, "rad"),
@@ -631,8 +622,7 @@ def reached_message(remaining: str, missed: Mapping[str, str]) -> str:
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Largest errors at which a goal is considered reached: ``position`` m, ``attitude`` rad,
-    joints m or rad.
+    """Largest errors at a reached goal: ``position`` m, ``attitude`` rad, joints m or rad.
 
     Pose tolerances apply to the base and to end-effectors.
     """
@@ -642,8 +632,7 @@ class Tolerance:
     shape: float = 1e-3
 
     def require_control(self, goal: Goal, controls: frozenset[Controlled], who: str) -> None:
-        """Reject a goal if ``who`` does not control one of its components that has a tolerance here
-        (0: none).
+        """Reject a goal with a tolerance here (0: none) for a component not controlled by ``who``.
 
         ``controls`` are the goal components controlled by ``who``, a method or a law.
 

@@ -43,15 +43,12 @@ class JointEfforts:
         self._robot = robot
 
     def shares(self, motion: HeldMotion) -> Array:
-        """Return the efforts (N + 1, n) at the ticks under held commands, as fractions of their
-        limits.
-        """
+        """Return the efforts (N + 1, n) at the ticks, as fractions of their limits."""
         state = motion.positions, motion.rates, motion.accelerations
         return self._effort_shares(*state, motion.L_B)
 
     def excess(self, motion: HeldMotion) -> float:
-        """Return the factor by which held commands must be slowed down; at most 1 if no slowdown is
-        needed.
+        """Return the factor by which commands must be slowed down; at most 1 if they need not be.
 
         For a drifting robot this is an estimate, as the efforts are not quadratic in the speed.
         """

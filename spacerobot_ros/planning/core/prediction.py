@@ -75,8 +75,7 @@ class BasePrediction:
         return self._integrate(positions, quaternion, L_W, self._control_period)
 
     def true_end(self, positions: Array, attitudes: Array, L_W: Array) -> Array:
-        """Return the attitude (4,) after a motion through the shapes (N + 1, n); it does not depend
-        on the speed.
+        """Return the attitude (4,) after motion at any speed through the shapes (N + 1, n).
 
         ``attitudes`` (N + 1, 4) are computed with the plant's integration steps. Their fourth-order
         error is estimated with halved steps (Richardson extrapolation); while the error is large,

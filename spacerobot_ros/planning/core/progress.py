@@ -17,9 +17,7 @@ from spacerobot_ros.model.compilation import announcement_listeners
 
 
 class SearchPhase(Enum):
-    """Phase of a search: finding solutions, refining them, removing contacts, and shortening the
-    result.
-    """
+    """Phase of a search: find and refine solutions, remove contacts, shorten the result."""
 
     SEARCHING = "searching"
     REFINING = "refining"

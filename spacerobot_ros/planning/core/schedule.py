@@ -27,22 +27,27 @@ class BasePath:
     quaternion: Array
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions (N, 3) and quaternions (N, 4) at times (N,), s, interpolated
-        linearly."""
+        """Return positions (N, 3) and quaternions (N, 4) at times (N,), s, interpolated."""
         signs = np.cumprod(
             np.sign((self.quaternion[1:] * self.quaternion[:-1]).sum(axis=1) + 1e-300)
         )
         quaternions = self.quaternion * np.append(1.0, signs)[:, np.newaxis]
-        rows = np.hstack([self.position, quaternions])
-        found = np.column_stack([np.interp(times, self.time, each) for each in rows.T])
-        sizes = np.linalg.norm(found[:, 3:], axis=1, keepdims=True)
-        return found[:, :3], found[:, 3:] / sizes
+        position, quaternion = (
+            interpolated(times, self.time, each) for each in (self.position, quaternions)
+        )
+        return position, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+
+
+def interpolated(at: Array, known: Array, values: Array) -> Array:
+    """Interpolate ``values`` (M, ...) at ascending ``known`` (M,) linearly to ``at`` (N,)."""
+    columns = values.reshape(len(known), -1).T
+    found = np.column_stack([np.interp(at, known, each) for each in columns])
+    return found.reshape(len(at), *values.shape[1:])
 
 
 @dataclass(frozen=True, repr=False)
 class GaitSchedule:
-    """A gait as held commands: the shape at each tick, with constant joint velocities between
-    ticks.
+    """A gait as held commands: shapes at the ticks, with constant joint velocities in between.
 
     Attributes
     ----------
@@ -115,8 +120,7 @@ class GaitSchedule:
 
     @property
     def expected_duration(self) -> float:
-        """Expected time until the goal is reached, including all later schedules for this goal,
-        s."""
+        """Expected time until the goal is reached, s, including later schedules for this goal."""
         return self.duration + self.remaining
 
     @cached_property
@@ -176,14 +180,16 @@ def straight_motion(
     ends: Sequence[tuple[Array, float]],
     control_period: float,
     longest: float,
+    swings: int = 1,
 ) -> Array:
     """Return the shapes (N + 1, n) at the ticks of a path from ``start`` (n,) through ``ends``.
 
     Every leg is a straight line in shape space, from rest to rest (paper 3, section III): under
     ``u = (2 pi D / T^2) sin(2 pi t / T)``, eqs (12) to (18), a displacement D is traversed as
-    ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. ``ends`` are shapes
-    (n,), each with the duration, s, of the leg that leads to it. A leg takes a whole number of
-    ticks: more if a joint is slow, none if no joint moves.
+    ``D (t/T - sin(2 pi t/T) / (2 pi))``, whose peak speed is twice the mean. With k ``swings``, the
+    joints also rest k - 1 times on the way: ``2 pi`` becomes ``2 pi k``. ``ends`` are shapes (n,),
+    each with the duration, s, of the leg that leads to it. A leg takes a whole number of ticks:
+    more if a joint is slow, none if no joint moves.
 
     Raises
     ------
@@ -200,14 +206,15 @@ def straight_motion(
         slowest = int(np.argmin(robot.velocity_limit))
         joint = robot.description.movable_joints[slowest]
         raise PlanningError(
-            f"A motion of {len(legs)} straight legs would take {total:.4g} s, more than longest = "
-            f"{longest:.6g} s; the slowest joint is '{joint.name}', whose velocity limit is "
-            f"{robot.velocity_limit[slowest]:.3g} {joint.unit}/s."
+            f"A motion of {counted(len(legs), 'straight leg')} would take {total:.4g} s, more than "
+            f"longest = {longest:.6g} s; the slowest joint is '{joint.name}', whose velocity limit "
+            f"is {robot.velocity_limit[slowest]:.3g} {joint.unit}/s."
         )
     pieces = [start[np.newaxis]]
     for before, end, duration in legs:
         tau = np.linspace(0.0, 1.0, 1 + math.ceil(duration / control_period - 1e-9))[1:]
-        progress = tau - np.sin(2 * math.pi * tau) / (2 * math.pi)
+        whole = 2 * math.pi * swings
+        progress = tau - np.sin(whole * tau) / whole
         pieces.append(before + progress[:, np.newaxis] * (end - before))
         pieces[-1][-1:] = end
     return np.vstack(pieces)

@@ -148,8 +148,7 @@ def _bounds(robot: SpaceRobot, within_limits: bool) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Equations:
-    """Equations of a link's singular configurations, ``J*^T u = 0``, ``|u|^2 = 1``, in units of the
-    reach.
+    """Equations of singular configurations, ``J*^T u = 0``, ``|u|^2 = 1``, in units of the reach.
 
     ``jacobian`` is ``q -> J*`` (m, n), rows along the directions in which the joints move the link;
     ``function`` is ``(q, u) -> equations (n + 1,), derivatives (n + 1, n + m), distance, its
@@ -210,8 +209,7 @@ class _Equations:
         return np.hstack([shapes, np.linalg.svd(J)[0][:, :, -1]])
 
     def reach(self, lower: Array, upper: Array) -> tuple[Interval, Array]:
-        """Return the smallest and the largest distance within bounds, and their configurations (2,
-        n)."""
+        """Return the extreme distances within bounds, and their configurations (2, n)."""
         from scipy.optimize import minimize
 
         m = self.dimensions
@@ -252,9 +250,7 @@ class _Search:
         self._lower, self._upper = np.append(lower, -m), np.append(upper, m)
 
     def intervals(self, shapes: Array) -> tuple[list[Interval], int]:
-        """Return the distance intervals of the singular configurations found from configurations
-        (K, n), and their number.
-        """
+        """Return the intervals of curves from configurations (K, n), and the number of curves."""
         z = self._project_to_singular_shapes(self._equations.starts(shapes), _NEWTON_STEPS)
         g, _, _, _ = self._equations.evaluate(z)
         z = z[np.linalg.norm(g, axis=1) < _ZERO_RESIDUAL]
@@ -267,8 +263,7 @@ class _Search:
         return _union(radii, _MAX_CLOSED_GAP * largest), len(z)
 
     def _project_to_singular_shapes(self, z: Array, steps: int) -> Array:
-        """Return the singular configurations nearest to z (K, n + m), by Gauss-Newton within
-        bounds."""
+        """Return the singular configurations nearest to z (K, n + m) within bounds."""
         z = z.copy()
         moving = np.arange(len(z))
         for _ in range(steps):
@@ -293,9 +288,7 @@ class _Search:
         return np.asarray(1.0 - ((low & (step < 0)) | (high & (step > 0))))
 
     def _follow_singular_curve(self, z: Array, sign: float) -> Array:
-        """Return the ends of curves of singular configurations from z to larger (1) or smaller (-1)
-        distances.
-        """
+        """Return the ends of singular curves from z to larger (1) or smaller (-1) distances."""
         z, length = z.copy(), np.full(len(z), _LONGEST_STEP / 2)
         for _ in range(_WALK_STEPS):
             walking = np.flatnonzero(length > _SHORTEST_STEP)

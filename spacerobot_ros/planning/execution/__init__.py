@@ -1,2 +1,1 @@
-"""From goals to setpoints, without ROS: the executive, its planning worker and its trajectory
-tracker."""
+"""From goals to setpoints, without ROS: the executive, its planning worker and its tracker."""

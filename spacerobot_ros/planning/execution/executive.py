@@ -143,8 +143,7 @@ class Executive:
         return frozenset(goal.goal_id for goal in self._goals[:2] if goal is not None)
 
     def progress(self, goal_id: str) -> tuple[str, float | None]:
-        """Return the current activity for a goal, and the expected time, s, until the goal is
-        reached.
+        """Return the activity for a goal, and the expected time, s, until the goal is reached.
 
         None if no schedule leads to the goal yet.
         """
@@ -342,8 +341,7 @@ class Executive:
     # -- measured states ----------------------------------------------------------------------
 
     def add_base_measurement(self, measured: MeasuredState) -> None:
-        """Use a base measurement that arrived after the state with the same stamp had been
-        processed."""
+        """Use a base measurement that arrived after its state had been processed."""
         if self.phase is Phase.TELEOPERATING:
             self._teleoperation.keep_base_pose(measured)
         elif self.measuring:
@@ -610,9 +608,7 @@ class Executive:
             self._request_plan(PlanJob(waiting, reason, take_over=take_over), state)
 
     def _request_plan(self, job: PlanJob, state: RobotState, aim: Goal | None = None) -> None:
-        """Request a plan from a measured state to the goal, or to another ``aim``; unless it is to
-        take over, the joints brake.
-        """
+        """Request a plan to the goal or another ``aim``; joints brake unless it is to take over."""
         active = None if job.reason.is_for_new_goal else self._active_goal
         if active is not None and len(active.stuck_positions) != len(self._tracker.stuck):
             names = self._robot.joint_names

@@ -175,8 +175,7 @@ class GoalFile:
 
 
 def decode_goal(entry: Mapping[str, Any]) -> Goal:
-    """Return the goal from an entry made by :func:`encode_goal`; raises `KeyError` or `TypeError`
-    if it is invalid."""
+    """Return the goal of :func:`encode_goal`; raises `KeyError` or `TypeError` if invalid."""
     goal = Goal.checked(entry["position"], entry["quaternion"], entry["joint_positions"])
     asked = entry.get("asked", POSE)
     goal = replace(goal, asked=frozenset(part for part in POSE if part in asked))

@@ -33,7 +33,7 @@ from spacerobot_ros.planning.core.goal import (
     Tolerance,
     end_effector_pose,
 )
-from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.core.schedule import GaitSchedule, interpolated
 from spacerobot_ros.planning.execution.config import PlannerConfig
 
 _MAX_EVALUATED_SHAPES = 48
@@ -289,24 +289,15 @@ class PathSensitivity:
         instants: Array = np.arange(knots, dtype=float)
         called = np.unique(np.linspace(0, knots - 1, _MAX_EVALUATED_SHAPES).round().astype(int))
         turns, centers = self._derivatives(shapes[called])
-        by_joint = _interpolate(instants[:-1] + 0.5, called, turns)
+        by_joint = interpolated(instants[:-1] + 0.5, called, turns)
         in_base = np.einsum("kjap,kj->kap", by_joint, np.diff(shapes, axis=0))
         steps = (R_WB[:-1] + R_WB[1:]) / 2 @ in_base
         turned = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
         # The system's centre of mass C is at rest: r_WB = r_WC - R_WB r_BC_B.
         r_BC_W = [R @ self._robot.center_of_mass(q) for R, q in zip(R_WB, shapes, strict=True)]
         arms = np.array([hat(each) for each in r_BC_W])
-        moved = arms @ turned - R_WB @ _interpolate(instants, called, centers)
+        moved = arms @ turned - R_WB @ interpolated(instants, called, centers)
         return np.concatenate([moved - moved[0], turned], axis=1)
-
-
-def _interpolate(at: Array, known: Array, values: Array) -> Array:
-    """Interpolate the values (M, ...) at M known instants linearly to other instants."""
-    place = np.interp(at, known, np.arange(len(known)))
-    before = np.clip(place.astype(int), 0, max(len(known) - 2, 0))
-    share = (place - before).reshape(-1, *[1] * (values.ndim - 1))
-    after = np.minimum(before + 1, len(known) - 1)
-    return np.asarray((1 - share) * values[before] + share * values[after])
 
 
 class MassEstimate:

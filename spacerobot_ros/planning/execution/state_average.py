@@ -88,8 +88,7 @@ class StateAverage:
         self._states.append((pose.copy(), np.concatenate([twist, qdot]), q.copy()))
 
     def take(self, measured: MeasuredState, *, alone: bool = False) -> bool:
-        """Add a state if its base was measured, and return whether it was added; if ``alone``, it
-        replaces the other states."""
+        """Add a state, or use it alone; return false if its base is not measured."""
         base = measured.base
         if base is None:
             return False

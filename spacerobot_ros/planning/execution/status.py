@@ -172,8 +172,7 @@ class PlannerStatus:
         )
 
     def to_values(self) -> dict[str, str]:
-        """Return the status as the key-value pairs of a DiagnosticStatus; numbers have nine
-        digits."""
+        """Return the status as key-value pairs of a DiagnosticStatus; numbers have nine digits."""
         return _FORMAT.to_values(self)
 
     @classmethod
@@ -373,8 +372,7 @@ class ActiveGoal:
     """Reason why schedules are no longer executed, as a clause; empty: schedules are executed."""
 
     def begin(self, schedule: GaitSchedule, stamp_ns: int) -> None:
-        """Pursue the goal with another schedule, starting at the stamp of that schedule's first
-        tick."""
+        """Pursue the goal with a schedule whose first tick has this stamp."""
         self.cut_off(stamp_ns)
         self.schedule = schedule
         self.manoeuvre_time += schedule.duration

@@ -141,8 +141,7 @@ class _Following:
 
 
 class Teleoperation:
-    """End-effectors that follow twists, one at a time, until no twist has arrived for
-    ``twist_timeout``.
+    """End-effectors that follow twists, one at a time, until none arrives for ``twist_timeout``.
 
     After a refusal or an abort, twists are rejected until none has arrived for this long, so that
     an operator who keeps sending twists does not cause unexpected motion.
@@ -253,9 +252,7 @@ class Teleoperation:
         return TwistStep(rates, self._news(following, reason or limited, stamp))
 
     def _news(self, following: _Following, reason: str, stamp: int) -> str:
-        """Return the message about a reason that is new, or has been over for a while; its numbers
-        may change.
-        """
+        """Return the message about a new reason, or one that has been over for a while."""
         beginning = reason.split(":")[0].split(" come within ")[0].split(" touch,")[0]
         if reason:
             following.limited_ns = stamp

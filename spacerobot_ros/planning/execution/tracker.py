@@ -61,8 +61,7 @@ class TakeOver:
 
 
 class ScheduleFollower:
-    """Follows one schedule according to time stamps, so that a missed tick does not delay later
-    ticks.
+    """Follows a schedule by time stamps, so that a missed tick does not delay later ticks.
 
     Parameters
     ----------
@@ -106,8 +105,7 @@ class ScheduleFollower:
         self._velocities, self._deadband = velocities, deadband
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
-        """Whether the schedule is over and the shape ``q`` (n,) has reached the final shape of the
-        schedule."""
+        """Whether the schedule is over and the shape ``q`` (n,) has reached its final shape."""
         late = stamp_ns - self._end_ns
         if late < 0:
             return False
@@ -310,8 +308,7 @@ class TrajectoryTracker:
         return follower is not None and follower.has_ended(stamp_ns, q)
 
     def end_by_result(self) -> None:
-        """End the schedule at the next state, because the controller that executes it has ended
-        it."""
+        """End the schedule at the next state: the controller that executes it has ended it."""
         self._has_result = True
 
     def stop(self, *, at_last_shape: bool = False) -> None:
@@ -394,8 +391,7 @@ _MAX_STANDSTILL_WINDOWS = 8
 """Number of windows without any joint motion after which joints are considered stuck."""
 
 _CHECK_PERIOD = 16
-"""Number of ticks between checks while all joints follow their commands (to save computing
-time)."""
+"""Number of ticks between checks while all joints follow their commands, to save time."""
 
 _MIN_JOINT_ERROR = 1e-6  # m or rad
 

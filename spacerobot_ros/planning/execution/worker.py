@@ -156,8 +156,7 @@ class PlanningWorker:
             self.clearance,
         )
         self._remaining_joints: tuple[object, GaitMethod] | None = None
-        """The stuck joints and required goal components of the latest task with stuck joints, and
-        the method for its other joints."""
+        """The stuck joints and required goal components of a task, and the method used for it."""
         self._job: PlanningJob[GaitSchedule] | None = None
         self._time = 0.0
         """Wall time of the work on the requested plan so far, s."""
@@ -238,8 +237,7 @@ class PlanningWorker:
         return None
 
     def take_result(self) -> Planned | Refused | None:
-        """Return the planning result, which can be retrieved only once; None until planning has
-        ended, or if it was cancelled."""
+        """Return the result, once; None until planning has ended, or if it was cancelled."""
         job = self._job
         if job is None or not job.done:
             return None
@@ -263,8 +261,7 @@ class PlanningWorker:
             self._job.close()
 
     def approach_ahead(self, schedule: GaitSchedule, begins: float, now: float) -> str:
-        """Return a clause that states where the rest of a schedule comes too close to
-        obstacles.
+        """Return a clause that states where the rest of a schedule comes too close to obstacles.
 
         ``begins`` and ``now`` are times, s. Empty if the schedule stays clear, or if there are no
         obstacles.

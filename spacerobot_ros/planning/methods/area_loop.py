@@ -41,20 +41,16 @@ from spacerobot_ros.planning.methods.nominal_shape import (
 )
 
 _MAX_SHRINKS = 14
-"""Number of attempts for a cycle in which links come too close to each other; each attempt uses a
-cycle half as large as the previous one.
-"""
+"""Number of attempts for a cycle in which links come too close, each half as large."""
 
 _MAX_CYCLE_TRIALS = 6
-"""Number of attempts for a cycle that would not bring the base closer; each attempt uses a cycle
-half as large as the previous one."""
+"""Number of attempts for a cycle that would not bring the base closer, each half as large."""
 
 _MAX_CYCLE_SHARE = 1.0 - 1e-9
 """Fraction k of the remaining rotation above which one cycle corrects all of it."""
 
 _NEGLIGIBLE_AREA_SHARE = 1e-3
-"""Fraction of the largest area below which an area is treated as zero; a later cycle corrects the
-remaining error."""
+"""Fraction of the largest area treated as zero; a later cycle corrects the remaining error."""
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 

@@ -158,8 +158,7 @@ class AutoGait(GaitMethod):
 
 @dataclass(frozen=True)
 class _MethodResult:
-    """A schedule, the controlled parts of the goal, and whether it is predicted to end on the goal,
-    by itself or with the subsequent schedules."""
+    """A schedule, its goal components, and whether it or its successors reach the goal."""
 
     schedule: GaitSchedule
     parts: frozenset[Controlled]

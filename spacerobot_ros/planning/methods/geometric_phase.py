@@ -1,5 +1,4 @@
-"""Planar robots, and their base rotation along a path in shape space (the geometric phase of paper
-3).
+"""Planar robots, and their base rotation along shape paths (the geometric phase of paper 3).
 
 All joints of a planar robot rotate about parallel axes, and nothing tilts its base. The attitude is
 a single angle theta about the robot axis. At zero angular momentum, ``theta_dot = -s(psi)'
@@ -159,8 +158,7 @@ class PlanarPhase:
         """The model, not compiled: that would take longer than planning."""
 
     def turns_by_legs(self, starts: Array, ends: Array) -> Array:
-        """Return the rotations (L,) along straight legs in shape space, from starts to ends (L,
-        n)."""
+        """Return the rotations (L,) along straight legs in shape space, starts to ends (L, n)."""
         moves = ends - starts
         count = max(1, math.ceil(np.abs(moves).max(initial=0.0) / _MAX_PANEL_ANGLE))
         along = ((np.arange(count)[:, np.newaxis] + _GAUSS_NODES) / count).ravel()
@@ -198,8 +196,7 @@ class PhasePlane:
         return np.asarray(K @ self._phase.axis).reshape(points.shape[:-1])
 
     def turns_by_squares(self, centres: Array, sides: Array) -> Array:
-        """Return the base rotations (R,) caused by counter-clockwise squares with centres (R,
-        2)."""
+        """Return the rotations (R,) by counter-clockwise squares around centres (R, 2)."""
         corners = square_corners(centres, sides)
         ends = self._shapes(np.roll(corners, -1, axis=1))
         return self._phase.turns_by_legs(self._shapes(corners), ends).reshape(-1, 4).sum(axis=1)

@@ -39,7 +39,7 @@ from spacerobot_ros.planning.core.controllability import (
 )
 from spacerobot_ros.planning.core.goal import POSITION_SLACK, Goal, RobotState
 from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
-from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes
+from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, Notes, straight_motion
 
 _MIN_CYCLE_TICKS = 12
 _MAX_REFINEMENTS = 20
@@ -50,7 +50,6 @@ _PATH_POSES_PER_STEP = 100
 """Smallest number of predicted path poses in a step; a step has at most twice as many."""
 
 _ZERO_ROTATION_ANGLE = 1e-9
-_ZERO_MOTION = 1e-9
 
 
 @dataclass(frozen=True)
@@ -84,8 +83,7 @@ class LieBracketOptions:
 
 
 class LieBracketGait(GaitMethod):
-    """Controls the position and attitude of a base with three or more sliders; slots may be
-    offset."""
+    """Controls the pose of a base with three or more sliders; slots may be offset."""
 
     name: ClassVar[str] = "lie_bracket"
     repeats_cycles: ClassVar[bool] = True
@@ -115,8 +113,11 @@ class LieBracketGait(GaitMethod):
         self.require_rest(state)
         self.require_goal_of_base(goal)
         z_f = self.final_shape(state, goal, POSITION_SLACK * request.tolerance.position)
-        slide = self._slide_shapes(state.q, z_f)
-        t1 = (len(slide) - 1) * self.control_period or self.options.t1
+        # Step 2, ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10), with four or more ticks a period.
+        n1, period = self.options.n1, self.control_period
+        ends = [(z_f, max(self.options.t1, 4 * n1 * period))]
+        slide = straight_motion(self.robot, state.q, ends, period, self.options.longest, 2 * n1)
+        t1 = (len(slide) - 1) * period or self.options.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
         self._require_clear(slide)
         cycle, n, notes = self._plan_turn(attitudes[-1], z_f, request)
@@ -187,33 +188,6 @@ class LieBracketGait(GaitMethod):
         if len(self.sliders) < self.robot.n or self.robot.description.has_mimic_joints:
             raise PlanningError(message)
         raise UnreachableError(message, Proof.LIMITS)
-
-    def _slide_shapes(self, z0: Array, z_f: Array) -> Array:
-        """Step 2: shapes (N + 1, n) under ``v_i = c_i sin^2(2 pi n1 t / t1)``, eq. (10).
-
-        t1 is longer for slow servos: the peak speed is twice the mean.
-        """
-        displacement, t1, longest = z_f - z0, self.options.t1, self.options.longest
-        if np.abs(displacement).max() <= _ZERO_MOTION:
-            return z_f[np.newaxis].copy()
-        for name, distance, rate in zip(
-            self.robot.joint_names, np.abs(displacement), self.robot.velocity_limit, strict=True
-        ):
-            if distance <= _ZERO_MOTION:
-                continue
-            if 2 * distance > rate * longest:
-                raise PlanningError(
-                    f"The slide would take more than {longest:.6g} s: joint '{name}' must move "
-                    f"{distance:.4g} m at no more than {rate:.4g} m/s."
-                )
-            t1 = max(t1, float(2 * distance / rate))
-        n1 = self.options.n1
-        ticks = max(math.ceil(t1 / self.control_period - 1e-9), 4 * n1)
-        phase = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
-        progress = phase - np.sin(4 * np.pi * n1 * phase) / (4 * np.pi * n1)
-        shapes = z0 + progress * displacement
-        shapes[-1] = z_f
-        return shapes
 
     def _plan_turn(
         self, quaternion: Array, z_f: Array, request: PlanRequest
@@ -340,8 +314,7 @@ class LieBracketGait(GaitMethod):
     def _cycle_shapes(
         self, amplitudes: Array, n: int, triple: tuple[int, int, int], z_f: Array
     ) -> Array:
-        """Return the shapes of one cycle at its ticks: the integrals of v1, v2, v3 of step 3, from
-        ``zf`` back to it."""
+        """Return the shapes of a cycle from ``zf`` back to it: the integrals of v1, v2, v3."""
         b11, b12, b21, a22, a31 = amplitudes / math.sqrt(n)
         phi = np.linspace(0.0, 2 * np.pi, self.ticks_a_cycle + 1)
         z1 = b11 * (1 - np.cos(phi)) + b12 * (1 - np.cos(2 * phi)) / 2

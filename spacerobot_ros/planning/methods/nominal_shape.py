@@ -38,8 +38,7 @@ _MAX_TRIPLES, _SAMPLED_SHAPE_COUNT = 8, 48
 
 _GRID_REFINEMENTS = 10
 _EQUAL_MEASURE_TOLERANCE = 1e-6
-"""Relative difference below which shapes are considered equally good; the most central shape is
-chosen."""
+"""Relative difference between equally good shapes; the most central one is chosen."""
 
 _MIN_EDGE = 1e-4  # m or rad
 
@@ -180,8 +179,7 @@ class NominalShapeChooser:
         return chosen
 
     def move_to_nearest_turn(self, nominal: NominalShape, q: Array) -> NominalShape:
-        """Return the nominal shape with unlimited joints moved close to ``q`` by whole
-        revolutions."""
+        """Return the nominal shape with unlimited joints moved close to ``q``, by whole turns."""
         turns = np.where(self._repeating, np.round((q - nominal.shape) / (2 * math.pi)), 0.0)
         return replace(nominal, shape=nominal.shape + 2 * math.pi * turns)
 
@@ -285,8 +283,7 @@ class NominalShapeChooser:
         return lower[list(triple)], upper[list(triple)]
 
     def _loops_at(self, held: Array, triple: Triple, at: Array) -> tuple[Array, Array, Array]:
-        """Return shapes (N, n) with three joints at (N, 3), M (N, 3, 3) and longest edges (N, 3)
-        there."""
+        """Return shapes (N, n) with joints ``at`` (N, 3), M (N, 3, 3) and longest edges (N, 3)."""
         shapes = np.tile(held, (len(at), 1))
         shapes[:, list(triple)] = at
         M = curvature_matrices(curvatures(self._robot, shapes), triple)

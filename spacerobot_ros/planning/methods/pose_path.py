@@ -67,8 +67,7 @@ class PosePath:
 
     @cached_property
     def turns(self) -> Array:
-        """Rotation vectors (K - 1, 3) from attitude to attitude, rad, in the frame of the
-        positions."""
+        """Rotation vectors (K - 1, 3) between attitudes, rad, in the frame of the positions."""
         between = quaternion_multiply(
             self.quaternions[1:], quaternion_inverse(self.quaternions[:-1])
         )
@@ -105,8 +104,7 @@ class PosePath:
         )
 
     def simplified(self, tolerance: float) -> PosePath:
-        """Return a path through fewer poses that deviates from the omitted poses by at most a
-        tolerance.
+        """Return a path through fewer poses that deviates from the others by at most a tolerance.
 
         ``tolerance`` is in m and rad. (Douglas and Peucker; positions are compared at equal
         fractions of the length, so that an out-and-back path is preserved.)
@@ -156,8 +154,7 @@ class PosePath:
         return np.asarray(np.maximum(off, np.linalg.norm(left, axis=1)))
 
     def split_at_reversals(self, tolerance: float) -> Iterator[PosePath]:
-        """Yield the parts between stops, which are at sharp corners, or at every corner if there is
-        no tolerance."""
+        """Yield the parts between sharp corners, or between all corners without a tolerance."""
         directions = np.hstack([self.chords, self.turns])
         size = np.linalg.norm(directions, axis=1)
         cosines = (directions[1:] * directions[:-1]).sum(axis=1) / (size[1:] * size[:-1])
@@ -205,8 +202,7 @@ class RoundedPath:
         self.curvature_breaks = np.unique(marks) / self._total
 
     def pose(self, share: float) -> tuple[Array, Array]:
-        """Return the displacement (3,), m, and the rotation (4,) since the start at a fraction of
-        the way."""
+        """Return displacement (3,), m, and rotation (4,) from the start at a share of the way."""
         base, before, after, a, b, _, _ = self._blend_at(share)
         path, start = self._path, quaternion_inverse(self._path.quaternions[0])
         place = path.positions[base] - path.positions[0]
@@ -216,8 +212,7 @@ class RoundedPath:
         return np.asarray(place - a * path.chords[before] + b * path.chords[after]), turned
 
     def derivative(self, share: float) -> tuple[Array, Array]:
-        """Return their derivatives with respect to the fraction: velocity (3,), m, and angular
-        velocity (3,), rad."""
+        """Return their derivatives by the share: velocity (3,), m, angular velocity (3,), rad."""
         _, before, after, _, b, a_rate, b_rate = self._blend_at(share)
         chords, turns = self._path.chords, self._path.turns
         carried = matrix_from_quaternion(quaternion_from_rotvec(b * turns[after]))

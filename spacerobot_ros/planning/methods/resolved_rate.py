@@ -74,8 +74,7 @@ _KNOT_TOLERANCE = 1e-6
 _ZERO_DISTANCE = 1e-10  # m or rad
 
 _SAMPLED_SHAPES = 8
-"""Number of shapes in general position at which the degrees of freedom of the joints are
-examined."""
+"""Number of shapes at which the degrees of freedom of the joints are examined."""
 
 _PATH_LENGTH_SAMPLES = 200
 _TIMING_INTERVALS = 160
@@ -151,13 +150,11 @@ class _SmoothPath:
         self._rate = self._place.derivative()
 
     def pose(self, share: float) -> tuple[Array, Array]:
-        """Return the displacement (3,), m, and the rotation (4,) since the start at a fraction of
-        the way."""
+        """Return displacement (3,), m, and rotation (4,) from the start at a share of the way."""
         return np.asarray(self._place(share)), quaternion_from_rotvec(share * self._turn)
 
     def derivative(self, share: float) -> tuple[Array, Array]:
-        """Return their derivatives with respect to the fraction: velocity (3,), m, and angular
-        velocity (3,), rad."""
+        """Return their derivatives by the share: velocity (3,), m, angular velocity (3,), rad."""
         return np.asarray(self._rate(share)), self._turn
 
     def travelled_length(self, share: float) -> float:
@@ -244,8 +241,7 @@ class _LinkPaths:
         return np.asarray(np.maximum(self._limits.lower - q, q - self._limits.upper))
 
     def least_correction(self, q: Array, X: Array, progress: float) -> tuple[Array, float]:
-        """Return the smallest joint motion (n,) that brings the links onto their lines, and the
-        scaled error."""
+        """Return the least joint motion (n,) that puts links on their lines, and scaled error."""
         R_X, missing = matrix_from_quaternion(X), list[Array]()
         r_BC = self._robot.center_of_mass(q)
         for line in self._lines:
@@ -324,8 +320,7 @@ class JointPath:
 
 
 def trace_joint_path(lines: _LinkPaths, q: Array, cancellation: Cancellation) -> JointPath:
-    """Follow lines from a shape (n,) to their ends, a singularity, the point nearest to one, or a
-    joint limit (Runge-Kutta 4).
+    """Follow lines to their ends, a singularity or the nearest point, or a joint limit (RK4).
 
     Beyond these points, the joints may turn for long with hardly any progress along the lines.
     """
@@ -396,7 +391,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
     the largest sum is the largest speed everywhere.
     """
     from scipy.optimize import linprog
-    from scipy.sparse import coo_matrix, vstack
+    from scipy.sparse import csr_array, vstack
 
     K, n = len(slopes) - 1, slopes.shape[1]
     with np.errstate(divide="ignore"):
@@ -406,20 +401,15 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
     unit = float(by_acceleration) * K
     fastest = np.minimum(fastest / unit, 1e6)
     fastest[[0, -1]] = 0.0
-    rows, columns, values = [], [], []
     bound = np.tile(_USED_ACCELERATION_SHARE * limits.acceleration / unit, 2 * K)
-    intervals, joints = np.arange(K)[:, np.newaxis], np.arange(n)
-    for end in (0, 1):  # At both ends of each interval, in which x' is constant.
-        at = slopes[end : K + end] / (2 * interval), bends[end : K + end]
-        row = (end * K + intervals) * n + joints
-        before, after = -at[0] + (1 - end) * at[1], at[0] + end * at[1]
-        rows += [row, row]
-        columns += [np.broadcast_to(intervals + k, row.shape) for k in (0, 1)]
-        values += [before, after]
-    A = coo_matrix(
-        (np.ravel(values), (np.ravel(rows), np.ravel(columns))), shape=(2 * K * n, K + 1)
-    )
-
+    # Rows for both ends of each interval, in which x' is constant, depend on x at these ends.
+    values = []
+    for end in (0, 1):
+        slope, bend = slopes[end : K + end] / (2 * interval), bends[end : K + end]
+        values.append(np.stack([(1 - end) * bend - slope, slope + end * bend], axis=-1))
+    columns = np.tile(np.repeat(np.arange(K)[:, np.newaxis] + [0, 1], n, axis=0), (2, 1))
+    entries = np.ravel(values), columns.ravel(), 2 * np.arange(len(columns) + 1)
+    A = csr_array(entries, shape=(len(columns), K + 1))
     found = linprog(
         -np.ones(K + 1),
         A_ub=vstack([A, -A]).tocsr(),
@@ -435,9 +425,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
 class _TimedPath:
     """A path in time, as fast as velocities and accelerations allow."""
 
-    def __init__(
-        self, path: JointPath, limits: MotionLimits, intervals: int = _TIMING_INTERVALS
-    ) -> None:
+    def __init__(self, path: JointPath, limits: MotionLimits, intervals: int) -> None:
         from scipy.interpolate import CubicSpline
 
         self._end, self._length = path.path_fractions[-1], path.arc_length[-1]
@@ -613,9 +601,7 @@ class ResolvedRateGait(GaitMethod):
     def _find_contact(
         self, state: RobotState, path: JointPath, obstacle: tuple[int, str] | None
     ) -> tuple[int, str] | None:
-        """Return the last point of a path before links come too close, with the reason; else an
-        ``obstacle`` that has been found.
-        """
+        """Return the last point before links come too close, with the reason; or ``obstacle``."""
         last = len(path.shapes) - 1 if obstacle is None else obstacle[0]
         attitudes = quaternion_multiply(state.quaternion, path.turns)
 
@@ -781,9 +767,7 @@ class ResolvedRateGait(GaitMethod):
     def _held_commands(
         self, lines: _LinkPaths, state: RobotState, timed: _TimedPath
     ) -> tuple[Array, Array]:
-        """Return the shapes (N + 1, n) at ticks, with the end-effectors on their lines at each, and
-        the shares of the lines (N + 1,).
-        """
+        """Return shapes (N + 1, n) with links on their lines at ticks, and shares (N + 1,)."""
         period, duration = self.control_period, float(timed.time[-1])
         if duration > _MAX_TICKS * period:
             raise PlanningError(

@@ -55,8 +55,7 @@ _SIDE_SAMPLES = 8
 """Number of side lengths tried between zero and the largest length that fits."""
 
 _USED_RANGE_SHARE = 1.0 - 1e-9
-"""Fraction of the free range used by the largest square: rounding must not put a corner beyond the
-range."""
+"""Fraction of the free range used by the largest square, so that rounding does not exceed it."""
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,7 @@ class SquarePathOptions:
 
 @dataclass(frozen=True)
 class _SquareFamily:
-    """Squares of increasing side for one pair of joints: centres (R, 2), sides (R,), phases (R,)
-    counter-clockwise."""
+    """Squares for a pair of joints by side: centres (R, 2), sides (R,), ccw phases (R,)."""
 
     pair: tuple[int, int]
     plane: PhasePlane

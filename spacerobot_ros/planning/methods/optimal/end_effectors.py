@@ -68,8 +68,7 @@ _PARAMETERS_PER_LINK = 7
 """Number of values of a link's goal: r_CE and a quaternion."""
 
 _STARTS, _ADDITIONAL_STARTS = 16, 96
-"""Number of start shapes for inverse kinematics, and of additional start shapes if none
-succeeds."""
+"""Number of start shapes for inverse kinematics, and of further ones if none succeeds."""
 
 _ITERATIONS = 40
 """Steps of inverse kinematics."""
@@ -81,8 +80,7 @@ _DAMPING_OF_EXACT_ENDS = 1e-9
 """The same if end shapes must meet the goal exactly."""
 
 _END_ERROR = 2e-3
-"""Largest error, m or rad, of a shape at which an initial guess ends; the solver removes the
-error."""
+"""Largest error, m or rad, of the end of an initial guess; the solver removes it."""
 
 _DIRECT_PATH_STEPS = 12
 
@@ -135,8 +133,7 @@ class EndEffectorRows:
 
     @cached_property
     def function(self) -> ca.Function:
-        """The rows as a function of the SX base rotation (4,), shape (n,) and parameters
-        (:meth:`pack`)."""
+        """The rows by base rotation (4,), shape (n,) and parameters (:meth:`pack`), in SX."""
         X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
         parameters = ca.SX.sym("p", self.parameters)
         center = self.robot.function("center_of_mass", compile=False)(q)
@@ -401,9 +398,7 @@ class EndEffectorSpecification:
 
     @classmethod
     def of(cls, base: GoalSpecification, goal: Goal) -> EndEffectorSpecification:
-        """Return the specification for goals with the components of this goal, whose links are
-        resolved (:meth:`.Goal.for_robot`).
-        """
+        """Return the specification for goals with the components of this goal for links."""
         robot = base.robot
         links = [(each.link, each.quaternion is not None) for each in goal.end_effectors]
         if "position" in goal.base:
@@ -444,8 +439,7 @@ class EndEffectorSpecification:
     def boundary_conditions(
         self, request: PlanRequest, shape: Array | None, limits: MotionLimits
     ) -> BoundaryConditions:
-        """Return the boundary conditions for a request, and possible end states for the initial
-        guesses.
+        """Return the boundary conditions for a request, with possible ends for the guesses.
 
         The arguments are as in :meth:`GoalSpecification.boundary_conditions`.
 
@@ -554,8 +548,7 @@ class EndEffectorSpecification:
     def _exact_end(
         self, kinematics: _InverseKinematics, ends: Sequence[PossibleEnd], tolerance: Tolerance
     ) -> PossibleEnd:
-        """Return the first end that meets an overdetermined goal within its tolerance, or raise
-        NotFoundError."""
+        """Return the first end that meets an overdetermined goal, or raise NotFoundError."""
         turns = np.array([each.base_rotation for each in ends])
         shapes, X, miss = kinematics.solve(
             np.array([each.shape for each in ends]),

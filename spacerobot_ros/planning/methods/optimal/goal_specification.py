@@ -49,8 +49,7 @@ _MIN_BASE_TURN = 1e-12
 _MAX_SHAPE_GUESSES = 8
 
 _INTEGRATION_STEPS, _INTEGRATION_ERROR = 1000, 1e-5
-"""Number of integration steps for the base rotation caused by one joint, and the largest
-integration error, rad."""
+"""Number of integration steps for a base rotation by one joint, and their largest error, rad."""
 
 _JOINT_LIMIT_ROUNDING = 1e-9  # m or rad
 
@@ -192,8 +191,7 @@ class GoalSpecification:
         return BoundaryConditions(state.q, turn, likely, center=center)
 
     def require_turning_with_drift(self, state: RobotState) -> None:
-        """Reject drifting robots whose joints do not rotate the base, or rotate it about another
-        axis.
+        """Reject drifting robots whose joints cannot rotate the base about the axis of the drift.
 
         Raises
         ------

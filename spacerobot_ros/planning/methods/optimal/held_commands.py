@@ -57,20 +57,17 @@ _WAVES_PER_JOINT = 6
 _ATTITUDE_TOLERANCE = 1e-11  # rad
 _MAX_NEWTON_STEPS = 25
 _MAX_STRETCH_FACTOR = 1.25
-"""Largest factor by which a manoeuvre is stretched to meet its limits; beyond it, other initial
-guesses are better."""
+"""Largest factor by which a manoeuvre is stretched; beyond it, other guesses are better."""
 
 _MAX_PROGRAMS = 4
-"""Number of durations, in ticks, that are tried in turn when all shapes are changed to meet the
-limits."""
+"""Number of durations, in ticks, tried if all shapes are changed to meet the limits."""
 
 _PROGRAM_STRETCH = 1.01
 """Factor between these durations, rounded up to a tick."""
 
 _MAX_PROGRAMS_IN_TURN = 6
 _FIT_TOLERANCE = 1e-5
-"""Error up to which one more program suffices, rad, m or m/s; the remaining error is far
-smaller."""
+"""Error, rad, m or m/s, up to which one more program suffices; it leaves far less."""
 
 _MIN_SMOOTH_TICKS = 20
 """Smallest number of ticks in a smooth manoeuvre; shorter manoeuvres are polygons."""
@@ -86,9 +83,7 @@ _FADING_ZONE = 0.02
 
 @dataclass(frozen=True)
 class HeldCommands:
-    """Shapes ``positions`` (N + 1, n) at the ticks, and the resulting attitudes ``quaternions`` (N
-    + 1, 4), relative to the initial attitude.
-    """
+    """Shapes ``positions`` (N + 1, n) at ticks, and ``quaternions`` (N + 1, 4) since the start."""
 
     positions: Array
     quaternions: Array
@@ -189,9 +184,7 @@ class ManoeuvreModel:
         return HeldMotion(held.positions, self.control_period, before, after, L_B)
 
     def _slowing_factor(self, held: HeldCommands, motion: HeldMotion) -> float:
-        """Return the factor by which commands must be slowed down to satisfy the limits on joint
-        efforts and base rate.
-        """
+        """Return the factor of slowdown needed by the limits on joint efforts and base rate."""
         rate = self.constraints.excess_rate(held.quaternions, self.control_period)
         return rate if self.efforts is None else max(rate, self.efforts.excess(motion))
 
@@ -246,8 +239,7 @@ class ManoeuvreModel:
     def corrected_end(
         self, trajectory: Trajectory, boundary: BoundaryConditions, ticks: int
     ) -> BoundaryConditions:
-        """Return boundary conditions whose solution ends at the goal when converted to ``ticks``
-        commands.
+        """Return boundary conditions whose solution, in ``ticks`` commands, ends at the goal.
 
         The goal attitude is rotated by the difference between the end attitudes of a trajectory and
         of its commands. If the robot drifts, the solver's attitude is only second-order accurate.
@@ -376,8 +368,7 @@ class DriftVariation:
         self._n = robot.n
 
     def carried(self, shapes: Array, L_B: Array, R: Array, turned: Array, duration: float) -> Array:
-        """Return xi (K, 3, n) at the end of K steps of equal ``duration``, due to the change dq in
-        each step.
+        """Return xi (K, 3, n) after K steps of equal ``duration``, by the change dq in each step.
 
         ``shapes`` (K, n), ``L_B`` (K, 3) and ``R`` (K, 3, 3) are the values at the steps, and
         ``turned`` (K, 3, n) the contribution of curvature to xi in each step.

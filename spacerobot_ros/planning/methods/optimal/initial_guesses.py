@@ -26,6 +26,7 @@ from spacerobot_ros.model.rotations import (
     rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.wheels import ReactionWheels
+from spacerobot_ros.planning.core.schedule import interpolated
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -49,8 +50,7 @@ _LEAST_TURN_TIME, _TURN_STRETCHES = 0.5, tuple(1.15**k for k in range(16))
 _TURNED_GUESSES = 3
 
 _BRAKING_TIME_FACTOR = 4.0
-"""A joint that moves at the start is back on the path of its guess after this multiple of its
-braking time."""
+"""Multiple of a joint's braking time after which it is back on the path of its guess."""
 
 
 class InitialGuesses:
@@ -192,9 +192,7 @@ class InitialGuesses:
         step: float,
         turns: int,
     ) -> Array:
-        """Return attitudes (N + 1, 4) blended between those of a motion integrated forwards from
-        the start, and backwards from the goal.
-        """
+        """Return attitudes (N + 1, 4) blended from motions forwards from start, back from goal."""
         forwards = np.tile([0.0, 0.0, 0.0, 1.0], (len(shapes), 1))
         backwards = forwards.copy()
         if self._angular_momentum is not None:
@@ -292,7 +290,7 @@ class InitialGuesses:
         intervals = len(self._instants) - 1
         coarse = np.linspace(0.0, 1.0, len(solution.shapes))
         shapes = solution.at_ticks(intervals)
-        velocities = _interpolate(self._instants, coarse, solution.velocities)
+        velocities = interpolated(self._instants, coarse, solution.velocities)
         return self._trajectory(solution.duration / intervals, shapes, velocities)
 
     def _trajectory(self, step: float, shapes: Array, velocities: Array) -> Trajectory:
@@ -306,7 +304,7 @@ class InitialGuesses:
         rates = np.gradient(positions, period, axis=0)
         rates[0], rates[-1] = velocity, 0.0
         shapes, velocities = (
-            _interpolate(self._instants, ticks, values) for values in (positions, rates)
+            interpolated(self._instants, ticks, values) for values in (positions, rates)
         )
         return self._trajectory(step, shapes, velocities)
 
@@ -341,19 +339,12 @@ def attitudes_along(turn: ca.Function, q: Array, u: Array, u_next: Array) -> Arr
 
 
 def rates_between(quaternions: Array, step: float) -> Array:
-    """Return the angular velocities (N + 1, 3), in base components, at attitudes (N + 1, 4) that
-    are ``step`` seconds apart.
-    """
+    """Return the base rates (N + 1, 3), in B, at attitudes (N + 1, 4) ``step`` seconds apart."""
     turns = rotvecs_from_quaternions(
         quaternion_multiply(quaternion_inverse(quaternions[:-1]), quaternions[1:])
     )
     rates = np.vstack([turns[:1], (turns[:-1] + turns[1:]) / 2, turns[-1:]]) / step
     return np.asarray(rates)
-
-
-def _interpolate(instants: Array, known: Array, values: Array) -> Array:
-    """Return values (N, n) at the instants (N,), interpolated from (M, n) at ``known`` (M,)."""
-    return np.column_stack([np.interp(instants, known, column) for column in values.T])
 
 
 def _loop(rng: np.random.Generator, s: Array, n: int) -> Array:

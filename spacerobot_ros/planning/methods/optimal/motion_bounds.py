@@ -140,8 +140,7 @@ class _FrameBounds:
     radius: float
 
     def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
-        """Return the bounds for a body outboard of this one, carried by a joint with these
-        limits."""
+        """Return the bounds for a child body, carried by a joint with these limits."""
         assert body.joint is not None
         slides = body.joint.kind is JointKind.PRISMATIC
         if self.R is None:
@@ -451,8 +450,7 @@ def link_demands(
     boundary: BoundaryConditions,
     connection: ConnectionBounds,
 ) -> Iterator[Demand]:
-    """Yield the end-effector motions that the goals in a request require; each is reduced by the
-    tolerances."""
+    """Yield the end-effector motions that goals require, reduced by the tolerances."""
     state, tolerance, drift = request.state, request.tolerance, connection.drift(boundary)
     tree = _Tree.of(robot, robot.lower, robot.upper)
     for goal in request.goal.end_effectors:

@@ -193,14 +193,11 @@ class BoundaryConditions:
 
     @property
     def is_timed(self) -> bool:
-        """Whether the end depends on the duration, because the robot drifts or because joints move
-        at the start or the end."""
+        """Whether the end depends on the duration: the robot drifts, or joints move at an end."""
         return self.drifts or bool(np.any(self.velocity) or np.any(self.final_velocity))
 
     def momenta_in_base(self, quaternions: Array) -> Array | None:
-        """Return the angular momentum (..., 3), base components, at rotations (..., 4) since the
-        start; None: it is zero.
-        """
+        """Return the momentum (..., 3) in B at rotations (..., 4) since the start; None: zero."""
         if not self.drifts:
             return None
         # R_0B' multiplied from the left.
@@ -336,9 +333,7 @@ class Trajectory:
         return np.asarray(q + self.step * (v0 * tau + (v1 - v0) * tau**2 / 2))
 
     def within_intervals(self, instants: int) -> tuple[Array, Array]:
-        """Return shapes (N K, n) and attitudes (N K, 4) at K instants in each step, the last one at
-        its end.
-        """
+        """Return shapes (N K, n) and attitudes (N K, 4) at K instants in each step, and its end."""
         X, tau = self.quaternions[:, np.newaxis], np.arange(1, instants + 1)[:, np.newaxis]
         attitudes = (1 - tau / instants) * X[:-1] + tau / instants * X[1:]
         attitudes /= np.linalg.norm(attitudes, axis=2, keepdims=True)
@@ -489,8 +484,7 @@ class PathConstraints:
         return self.base_rate_limit * (1 - _CONSTRAINT_RESERVE)
 
     def excess_rate(self, quaternions: Array, period: float) -> float:
-        """Return the ratio of the largest base rate between attitudes (N + 1, 4) to the bound; 0:
-        no bound."""
+        """Return the largest base rate at attitudes (N + 1, 4) over its bound; 0: no bound."""
         if self.base_rate_limit == 0:
             return 0.0
         return _largest_base_rate(quaternions, period) / self.base_rate_limit

@@ -121,9 +121,7 @@ class ConstraintBlock:
         *,
         repetitive: bool = True,
     ) -> ConstraintBlock:
-        """Set the expressions for rows, Jacobian and Hessian; find common subexpressions if they
-        are ``repetitive``.
-        """
+        """Set the rows and derivatives; if ``repetitive``, find common subexpressions."""
         g, H = ca.densify(g), ca.triu(H)
         of_values, of_jacobian, of_hessian = (
             ca.cse(each) if repetitive else each for each in ([g], [g, J], [H])
@@ -218,9 +216,7 @@ class Stages:
         return cls(n, beginning_block(n), interval, ends, path, turn)
 
     def with_distances(self, rows: PlaneDistances, instants: int) -> Stages:
-        """Return the problem that also keeps link pairs apart, at a number of instants per
-        interval.
-        """
+        """Return the problem that also keeps link pairs apart, at several instants per interval."""
         return replace(self, distances=_distance_block(self.joints, rows, instants))
 
 
@@ -486,28 +482,28 @@ def _rotation(robot: SpaceRobot, *, drifting: bool) -> ca.Function:
 
     Drifting, it is ``D^-1 (l - D_q u)`` of ``[q; u; l]``, with the angular impulse l (3,).
     """
-    q, u, impulse = (ca.SX.sym(name, k) for name, k in _rotation_symbols(robot, drifting))
-    D, D_q = robot.function("locked_inertia", compile=False)(q)
-    of_joints = D_q @ u - impulse if drifting else D_q @ u
+    q, u, impulse, D, _, of_joints = _momentum_symbols(robot, drifting)
     point = ca.vertcat(q, u, impulse)
     return ca.Function("rotation", [point], [-solve_positive_definite(D, of_joints)])
 
 
-def _rotation_symbols(robot: SpaceRobot, drifting: bool) -> list[tuple[str, int]]:
-    return [("q", robot.n), ("u", robot.n), ("l", 3 if drifting else 0)]
+def _momentum_symbols(robot: SpaceRobot, drifting: bool) -> tuple[ca.SX, ...]:
+    """Return q, u and l, which is empty at zero momentum, D and D_q, and ``D_q u - l``."""
+    q, u, impulse = (
+        ca.SX.sym(name, k) for name, k in zip("qul", (robot.n, robot.n, 3 * drifting), strict=True)
+    )
+    D, D_q = robot.function("locked_inertia", compile=False)(q)
+    return q, u, impulse, D, D_q, D_q @ u - impulse if drifting else D_q @ u
 
 
 def rotation_with_derivatives(robot: SpaceRobot, *, drifting: bool) -> ca.Function:
-    """Return the rotation w, its Jacobian, and the Hessian of ``mu' w``, as functions of the point
-    and mu.
+    """Return ``(point, mu) -> w, Jacobian, Hessian of mu' w``, of the rotation w.
 
     The derivatives follow from differentiating ``D w + D_q u = 0`` (or ``= l``) once and twice.
     """
-    q, u, impulse = (ca.SX.sym(name, k) for name, k in _rotation_symbols(robot, drifting))
+    q, u, impulse, D, D_q, of_joints = _momentum_symbols(robot, drifting)
     w, mu, eta = (ca.SX.sym(name, 3) for name in ("w", "mu", "eta"))
     point = ca.vertcat(q, u, impulse)
-    D, D_q = robot.function("locked_inertia", compile=False)(q)
-    of_joints = D_q @ u - impulse if drifting else D_q @ u
     derivatives = robot.function("momentum_derivatives", compile=False)
     by_q, by_q_q, by_q_u, by_q_w = derivatives(q, w, u, eta)
     of_impulse = -ca.SX.eye(3)[:, : impulse.numel()]
@@ -545,8 +541,7 @@ def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
 
 @dataclass(frozen=True)
 class Layout:
-    """Indices of the variables for N intervals: the step, then the states and controls knot by
-    knot; the last knot has no controls.
+    """Indices of variables of N intervals: the step, then states and controls knot by knot.
 
     If pairs are kept apart, the last variable is the distance by which they are closer than
     required, m (``has_lack``). ``states`` and ``controls`` are the sizes of the knot components.
@@ -729,48 +724,35 @@ def _gather_rows(rows: int, parts: Sequence[tuple[Indices, ca.MX]]) -> ca.MX:
 
 
 def _jacobian(placed: Sequence[PlacedBlock], x: ca.MX, rows: int) -> tuple[ca.MX, ca.MX]:
-    values, nonzeros, at_row, at_column = [], [], [], []
+    values, entries = [], []
     for each in placed:
         g, J = each.called(each.block.jacobian, x)
         values.append((each.rows, g))
-        nonzeros.append(J)
-        i, j = _nonzero_indices(each.block.jacobian.sparsity_out(1))
-        at_row.append(each.rows[:, i].ravel())
-        at_column.append(each.variables[:, j].ravel())
-    return _gather_rows(rows, values), _scatter_nonzeros(
-        (rows, x.numel()), np.concatenate(at_row), np.concatenate(at_column), nonzeros
-    )
+        i, j = each.block.jacobian.sparsity_out(1).get_triplet()
+        entries.append((each.rows[:, i], each.variables[:, j], J))
+    return _gather_rows(rows, values), _scatter_nonzeros((rows, x.numel()), entries)
 
 
 def _hessian(placed: Sequence[PlacedBlock], x: ca.MX, lam_g: ca.MX) -> ca.MX:
     """Return the upper triangle of the Hessian of ``lambda' g``."""
-    nonzeros, at_row, at_column = [], [], []
+    entries = []
     for each in placed:
         (H,) = each.called(each.block.hessian, x, each.multipliers(lam_g))
-        nonzeros.append(H)
-        i, j = _nonzero_indices(each.block.hessian.sparsity_out(0))
-        places = np.sort([each.variables[:, i].ravel(), each.variables[:, j].ravel()], axis=0)
-        at_row.append(places[0])
-        at_column.append(places[1])
-    size = x.numel()
-    return _scatter_nonzeros(
-        (size, size), np.concatenate(at_row), np.concatenate(at_column), nonzeros
-    )
-
-
-def _nonzero_indices(sparsity: ca.Sparsity) -> tuple[Indices, Indices]:
-    rows, columns = (np.array(each, dtype=np.int64) for each in sparsity.get_triplet())
-    return rows, columns
+        i, j = each.block.hessian.sparsity_out(0).get_triplet()
+        row, column = np.sort([each.variables[:, i], each.variables[:, j]], axis=0)
+        entries.append((row, column, H))
+    return _scatter_nonzeros((x.numel(), x.numel()), entries)
 
 
 def _scatter_nonzeros(
-    shape: tuple[int, int], rows: Indices, columns: Indices, nonzeros: Sequence[ca.MX]
+    shape: tuple[int, int], entries: Sequence[tuple[Indices, Indices, ca.MX]]
 ) -> ca.MX:
-    """Return the sparse matrix of nonzeros; nonzeros with equal indices are added."""
+    """Return the sparse matrix of rows, columns and nonzeros; nonzeros of one entry are added."""
+    rows, columns = (np.concatenate([each[k].ravel() for each in entries]) for k in (0, 1))
     places, number = np.unique(columns * shape[0] + rows, return_inverse=True)
     at_row, at_column = (each.tolist() for each in (places % shape[0], places // shape[0]))
     sparsity = ca.Sparsity.triplet(*shape, at_row, at_column)
-    every = ca.vertcat(*nonzeros)
+    every = ca.vertcat(*(nonzeros for _, _, nonzeros in entries))
     add = ca.DM.triplet(
         number.tolist(), list(range(len(number))), ca.DM.ones(len(number)), len(places), len(number)
     )
