@@ -35,8 +35,7 @@ class Solid:
     link
         Name of its link.
     body
-        Index of the rigid body that contains the link; 0: the base, -1: an obstacle, given in the
-        world frame.
+        Index of the rigid body of the link; 0: the base, -1: an obstacle, in the world frame.
     shape
         URDF description of the solid.
     enclosure
@@ -127,8 +126,7 @@ class ExactDistances:
 
         A plane touches the first solid at its point nearest to the second. The plane is given by
         its unit normal (3,) toward the second solid and its distance from the origin, m, in the
-        first link frame. The point (3,) is the nearest point on the second solid in its link frame,
-        m.
+        first link frame. The point (3,) is the nearest point on the second solid, in its frame, m.
         """
         (_, R_a, r_a), (_, R_b, r_b) = self._geometries[first], self._geometries[second]
         distances, planes = np.empty(len(R_1)), np.empty((len(R_1), 7))

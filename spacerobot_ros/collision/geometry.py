@@ -144,8 +144,7 @@ class CollisionGeometry:
     pairs
         (P, 2) indices of the solids in each checked pair.
     ignored_pairs
-        Reason why a pair of links is ignored; pairs on the same body or on neighbouring bodies are
-        not listed.
+        Reason why a pair of links is ignored, unless on the same body or on neighbouring bodies.
     notes
         Notes on links whose geometry may be unexpected, one sentence each.
     unread_meshes
@@ -273,8 +272,7 @@ class CollisionGeometry:
         """Return the distances (N,) of a pair, m, with planes and points (N, 7).
 
         Planes are in the first link frame, points in the second link frame
-        (:meth:`.ExactDistances.planes`). For a link and an obstacle, planes belong to the obstacle
-        and are in W.
+        (:meth:`.ExactDistances.planes`). For an obstacle, planes belong to it and are in W.
         """
         R, r = poses
         i, j = self.pairs[pair]
@@ -293,8 +291,7 @@ class CollisionGeometry:
         """Return the smallest distances (N,) for configurations (N, n), m, and their pairs (N,).
 
         ``required`` (P,), m, is subtracted from the distances of the pairs; a pair with minus
-        infinity is ignored. Results that are not below ``most``, m, are equal to it; without base
-        poses, obstacles are ignored.
+        infinity is ignored. ``most``, m, limits results; without base poses, obstacles are ignored.
         """
         return self.nearest_at(self.poses(shapes, base), required, most)
 
@@ -348,10 +345,8 @@ class CollisionGeometry:
                 if second.is_obstacle:
                     found += [] if first.is_obstacle else [(i, j)]
                     continue
-                bodies = first.body, second.body
-                if bodies[0] == bodies[1] or parents[bodies[0]] == bodies[1]:
-                    continue
-                if parents[bodies[1]] == bodies[0]:
+                a, b = first.body, second.body
+                if a == b or parents[a] == b or parents[b] == a:
                     continue
                 if frozenset({first.link, second.link}) in disabled:
                     self.ignored_pairs[LinkPair(first.link, second.link)] = "disabled by the SRDF"
@@ -385,8 +380,7 @@ class CollisionGeometry:
         ``reaches`` (P, m) is the largest distance of any point of the pair from each moving joint
         between the two solids, over all configurations (N, n). It is zero for other joints,
         and for joints that rotate a body of revolution, such as a reaction wheel, about its axis.
-        Also return, for pairs with obstacles, the largest distances (P,) from the base (zero for
-        other pairs).
+        Also return the largest distances (P,) from the base, zero for pairs without obstacles.
         """
         bodies = self.robot.bodies
         travel = np.abs(self.moving_positions(shapes)).max(axis=0)
@@ -426,18 +420,13 @@ def _spins_in_place(solid: Solid, link_pose: Pose, joint: Joint) -> bool:
 
     ``link_pose`` is the pose of its link in the frame of the joint's body.
     """
-    if joint.kind is JointKind.PRISMATIC or solid.shape.kind not in (
-        "cylinder",
-        "capsule",
-        "sphere",
-    ):
+    kind = solid.shape.kind
+    if joint.kind is JointKind.PRISMATIC or kind not in ("cylinder", "capsule", "sphere"):
         return False
     placed = link_pose @ solid.shape.pose
     beside = float(np.linalg.norm(np.cross(joint.axis, placed.r)))
     tilted = float(np.linalg.norm(np.cross(joint.axis, placed.R[:, 2])))
-    return beside < _COAXIAL_TOLERANCE and (
-        solid.shape.kind == "sphere" or tilted < _COAXIAL_TOLERANCE
-    )
+    return max(beside, 0.0 if kind == "sphere" else tilted) < _COAXIAL_TOLERANCE
 
 
 def _solid_in_world(obstacle: Solid, pose: Pose) -> Solid:
@@ -515,9 +504,7 @@ def collision_visuals(
 def obstacle_visuals(
     world: RobotDescription | None, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
 ) -> tuple[tuple[Visual, Pose], ...]:
-    """Return the obstacle solids used for distances, each with its link pose in the world. See
-    :func:`collision_visuals` for ``mesh_of``.
-    """
+    """Return solids of obstacles, each with its link pose in W; see :func:`collision_visuals`."""
     if world is None:
         return ()
     return tuple((each, world.frames[each.link][1]) for each in collision_visuals(world, mesh_of))

@@ -59,8 +59,7 @@ class PlaneDistances:
     def of(cls, geometry: CollisionGeometry, pairs: Sequence[int]) -> PlaneDistances:
         """Derive the distances of pairs, given by index.
 
-        They are derived together, because all share the kinematics, and because the call overhead
-        equals the cost of one distance.
+        They are derived together: they share kinematics, and a call costs as much as a distance.
         """
         tree, count = tree_kinematics(geometry.robot), len(pairs)
         size, X = tree.n + 4, ca.SX.sym("X", 4)

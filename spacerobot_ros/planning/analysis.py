@@ -44,16 +44,14 @@ class Analysis:
     robot
         The model.
     shape
-        (n,) examined configuration: as given, the best nominal one, or the middle of the joint
-        ranges.
+        (n,) examined configuration: as given, the best nominal one, or the middle of the ranges.
     nominal
         The three nominal joints and their matrix M at this configuration; None if there are fewer
         than three joints, or if no loops rotate the base about three axes.
     at_shape, anywhere
         The span of first-order brackets at ``shape``, and at the best of many configurations.
     conditions
-        (300,) condition numbers of the best three brackets, at configurations spread over the shape
-        space.
+        (300,) condition numbers of the best three brackets, at configurations spread evenly.
     planar, sliding
         Results of the tests in papers 3 and 1.
     objections

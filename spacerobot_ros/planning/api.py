@@ -76,17 +76,14 @@ def plan(
         (3,) each in W, kg m/s and kg m^2/s; angular momentum is about the centre of mass; None: the
         momenta of the start state. Only ``optimal`` plans for drifting robots.
     method
-        Name of a gait method; ``options`` are its own. None: ``resolved_rate`` for a goal with a
-        path, otherwise ``optimal``.
+        Name of a gait method with ``options``. None: ``resolved_rate`` for paths, else ``optimal``.
     control_period, tolerance, integration_step
         Command duration (s), largest error at the goal, and longest prediction step (s). Use the
         plant's values so that the flight ends where planned.
     clearance
-        Smallest distance between links during the motion, m; 0 disables collision checks. If there
-        are obstacles, 0 means 0.01 m.
+        Smallest distance between links, m; 0: none is checked, but 0.01 m if there are obstacles.
     world
-        Obstacles fixed in the world (:func:`.load_world`), or their URDF file; None: the
-        obstacles in the robot description.
+        Obstacles in the world (:func:`.load_world`), or their URDF; None: those of the robot.
 
     Raises
     ------

@@ -21,27 +21,16 @@ class PlanningCancelled(PlanningError):  # noqa: N818 - a request, not a failure
 class Cancellation:
     """A request to stop planning, made in one thread and polled in another."""
 
-    def __init__(self) -> None:
-        self._requested = False
-
-    @property
-    def requested(self) -> bool:
-        """Whether planning was cancelled."""
-        return self._requested
+    requested = False
+    """Whether planning was cancelled."""
 
     def cancel(self) -> None:
         """Request that planning stops."""
-        self._requested = True
+        self.requested = True
 
     def raise_if_requested(self) -> None:
-        """Raise an error if planning was cancelled.
-
-        Raises
-        ------
-        PlanningCancelled
-            It is.
-        """
-        if self._requested:
+        """Raise :class:`PlanningCancelled` if planning was cancelled."""
+        if self.requested:
             raise PlanningCancelled("Planning was cancelled.")
 
 
@@ -60,8 +49,7 @@ class PlanningJob(Generic[_Plan]):
     work
         Returns the plan, or raises an error.
     begins
-        Time at which the plan starts, s, if it is ready by then; minus infinity: it starts as soon
-        as it is ready.
+        Time at which the plan starts, s, if it is ready by then; minus infinity: when it is ready.
     """
 
     def __init__(self, work: Callable[[Cancellation], _Plan], begins: float = -math.inf) -> None:

@@ -55,8 +55,7 @@ class Clearance:
     robot
         The robot, with its world.
     distance
-        Smallest distance between links not connected by a joint, and between links and obstacles,
-        m.
+        Smallest distance between unconnected links, and between links and obstacles, m.
     parameter
         Parameter name, for messages.
     obstacles_alone
@@ -245,8 +244,7 @@ class Clearance:
     def require_shape(self, shape: Array, required: Array, base: BasePoses | None = None) -> None:
         """Check that links are not too close in the shape (n,) of a goal.
 
-        ``required`` (P,) are the required distances of all pairs, m; ``base`` is the base pose in
-        this shape, if known.
+        ``required`` (P,) are the distances that pairs must keep, m; ``base`` the pose, if known.
 
         Raises
         ------

@@ -39,8 +39,7 @@ class Controllability:
     rank, required_rank
         Number of rotation axes spanned by the brackets, and the required number.
     singular_values
-        (3,) singular values of the best three brackets, rad per unit area (rad^2, rad m or m^2),
-        descending.
+        (3,) singular values, descending, of the best brackets, rad per area (rad^2, rad m or m^2).
     joints
         The joints of these brackets.
     shape

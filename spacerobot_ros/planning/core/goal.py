@@ -192,8 +192,7 @@ class Goal:
         End-effector goals, at most one per link.
     base
         Requested components of the base pose. If there are end-effector goals, any of these
-        components may be requested, or none of them; the motion determines the components that are
-        not requested.
+        components may be requested, or none; the motion determines the other components.
     asked
         Base pose components that the sender has specified explicitly. Other components keep their
         values at the start (:meth:`kept_at`), and the goal can be reached without them.
@@ -328,8 +327,7 @@ class Goal:
         Raises
         ------
         GoalError
-            The goal is invalid, or the rotation vector does not consist of three numbers of at most
-            a million revolutions.
+            The goal is invalid, or the vector does not have three numbers of at most 1e6 turns.
         """
         vector = as_numbers(rotvec, "The goal rotation vector", GoalError)
         if vector.shape != (3,) or not np.all(np.abs(vector) <= _MAX_ANGLE):
@@ -496,8 +494,7 @@ class PoseError:
     rotvec
         (3,) rotation vector from the attitude to the goal attitude, in B, rad.
     shape
-        (n,) differences from the joint positions to the goal positions, m or rad; empty if the goal
-        has none.
+        (n,) differences from joint positions to goal positions, m or rad; empty if there are none.
     end_effectors
         The same errors for each end-effector in the goal: position in W, rotation in the
         end-effector frame (zero for a position-only goal).

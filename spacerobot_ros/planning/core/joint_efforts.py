@@ -57,8 +57,7 @@ class JointEfforts:
     def beyond_limits(self, motion: HeldMotion) -> str:
         """Return a clause that names the joints exceeding their effort limits; empty if none do.
 
-        If there are many ticks, only the ticks with the largest accelerations and some in between
-        are checked.
+        If there are many ticks, those with the largest accelerations and some others are checked.
         """
         positions, L_B = motion.positions, motion.L_B
         rates, changes = motion.rates, motion.accelerations

@@ -50,8 +50,7 @@ class InitialMotion:
     velocity
         (n,) joint velocities held until the gait begins, m/s or rad/s.
     remaining
-        (M + 1, n) shapes at the remaining ticks of the current plan, until rest; the gait begins at
-        the first of these ticks.
+        (M + 1, n) shapes at the remaining ticks of the current plan; the gait begins at the first.
     """
 
     velocity: Array
@@ -75,11 +74,9 @@ class PlanRequest:
         small, and options that fix the size of the first manoeuvre do not apply.
     previous
         The last executed schedule for the same goal; None for the first. ``auto`` continues with
-        the method of this schedule, and methods that plan step by step continue from its
-        ``progress``.
+        this method, and methods that plan step by step continue from its ``progress``.
     motion
-        Joint motion at the start of the gait; None: they rest. Only methods that
-        declare ``starts_in_motion`` receive it.
+        Joint motion at the start, only for methods that declare ``starts_in_motion``; None: rest.
     """
 
     state: RobotState
@@ -108,8 +105,7 @@ NO_JOINTS = (
 class GaitMethod(ABC):
     """An algorithm that turns a goal pose into a gait.
 
-    A method is built once per robot and used for many plans. Between calls to :meth:`plan`, it
-    keeps only compiled functions.
+    A method is built once per robot for many plans, between which it keeps compiled functions.
 
     Parameters
     ----------
@@ -118,8 +114,7 @@ class GaitMethod(ABC):
     control_period
         Command duration, s.
     integration_step
-        Longest Runge-Kutta step for the predicted attitude, s; use the plant's value to obtain the
-        same results.
+        Longest Runge-Kutta step for the attitude, s; the plant's value gives the same results.
     options
         An instance of the method's ``Options``; None: the defaults.
     clearance
@@ -241,8 +236,7 @@ class GaitMethod(ABC):
         Raises
         ------
         PlanningError
-            Links come too close to each other or to obstacles; ``is_clear``: whether this has
-            already been checked.
+            Links come too close to each other or to obstacles; not checked again if ``is_clear``.
         """
         if not self.plans_for_end_effectors:
             self.require_goal_of_base(goal)

@@ -55,8 +55,7 @@ class BasePrediction:
     control_period
         Command duration, s.
     integration_step
-        Longest Runge-Kutta step for the attitude, s; use the plant's value to obtain the same
-        results.
+        Longest Runge-Kutta step for the attitude, s; the plant's value gives the same results.
 
     Raises
     ------

@@ -1,7 +1,6 @@
 """Search progress, and announcements of other long-running work.
 
-Listeners receive the progress of all searches in the process. So methods need not pass progress on,
-and it also arrives from planning threads.
+Listeners receive the progress of all searches in the process, also from planning threads.
 """
 
 from __future__ import annotations

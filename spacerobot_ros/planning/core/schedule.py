@@ -60,8 +60,7 @@ class GaitSchedule:
     positions
         (N + 1, n) shapes at ticks 0..N, m or rad.
     end_velocities
-        (n,) joint velocities held after the end, m/s or rad/s: reaction wheels that have absorbed
-        momentum keep spinning. None: all joints rest.
+        (n,) joint velocities held after the end, m/s or rad/s, of reaction wheels; None: all rest.
     path
         Predicted base path at instants chosen by the method, including the first and the last.
     goal
@@ -69,16 +68,13 @@ class GaitSchedule:
     notes
         Named results of the method, for reports (with its paper's symbols).
     partial
-        Whether the gait intentionally ends short of the goal, so that the next gait is planned from
-        the pose measured at the end of this one.
+        Whether the gait ends short of the goal, so that the next one begins from a measured pose.
     remaining
-        Expected duration, s, of the schedules that follow a partial schedule until the goal is
-        reached.
+        Expected duration, s, of the schedules that follow a partial one until the goal is reached.
     controls
         Goal components controlled by the gait; only these are evaluated at its end.
     progress
-        State of the method for the next schedule to the same goal, of a method-specific type; see
-        ``PlanRequest.previous``.
+        Method-specific state for the next schedule to the same goal; see ``PlanRequest.previous``.
     """
 
     method: str
@@ -142,8 +138,7 @@ class HeldMotion:
     before, after
         (n,) velocities held before the first tick and after the last, m/s or rad/s.
     L_B
-        (N + 1, 3) angular momentum about the centre of mass in the base frame, kg m^2/s; None: it
-        is zero.
+        (N + 1, 3) angular momentum about the centre of mass in B, kg m^2/s; None: it is zero.
     """
 
     positions: Array

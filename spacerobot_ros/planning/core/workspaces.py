@@ -29,14 +29,12 @@ from spacerobot_ros.planning.core.controllability import sample_shapes
 
 _SEED = 20
 _SAMPLED_SHAPES = 48
-"""Number of initial configurations in the search for singular configurations, and of configurations
-examined for the reach."""
+"""Number of start configurations of searches for singular shapes, and of samples for the reach."""
 
 _EXTREME_STARTS = 3
 _NEWTON_STEPS, _LONGEST_NEWTON_STEP = 40, 0.5
 _WALK_STEPS, _LONGEST_STEP, _SHORTEST_STEP = 60, 0.25, 1e-4
-"""Number of steps along a curve of singular configurations, and longest and shortest step, rad (or
-m) of the fastest joint."""
+"""Number of steps along a curve; longest and shortest step, rad or m of the fastest joint."""
 
 _ZERO_RESIDUAL = 1e-9
 """Largest residual of the dimensionless singularity equations that is treated as zero."""
@@ -89,8 +87,7 @@ class Workspaces:
 
 
 def workspaces(robot: SpaceRobot, link: str) -> tuple[Workspaces, ...]:
-    """Return the workspaces of a link's origin at zero momentum: without revolute joint limits and,
-    if there are limits, also within them.
+    """Return the workspaces of a link's origin at zero momentum, without and within joint limits.
 
     Except for gaps of less than 0.2 % of the reach, all distances in an interval are attained by
     singular configurations that were found. The intervals are complete only if the seeded
@@ -152,8 +149,7 @@ class _Equations:
 
     ``jacobian`` is ``q -> J*`` (m, n), rows along the directions in which the joints move the link;
     ``function`` is ``(q, u) -> equations (n + 1,), derivatives (n + 1, n + m), distance, its
-    gradient``. ``samples`` (K, n) are shapes across the shape space, ``rank`` is the largest rank
-    of J* there.
+    gradient``. ``samples`` (K, n) cover the shape space, ``rank`` is the largest rank of J*.
     """
 
     jacobian: ca.Function
@@ -165,13 +161,11 @@ class _Equations:
     @classmethod
     def of(cls, robot: SpaceRobot, link: str) -> _Equations:
         n, q = robot.n, ca.SX.sym("q", robot.n)
-        index = robot.link_names.index(link) if link in robot.link_names else None
-        if index is None:
-            raise KeyError(link)
         J = robot.function(f"jacobian:{link}", compile=False)(q)
         A = ca.reshape(robot.function("connection", compile=False)(q), 6, n)
         _, r = robot.function("link_poses", compile=False)(q)
-        r_CE = r[:, index] - robot.function("center_of_mass", compile=False)(q)
+        center = robot.function("center_of_mass", compile=False)(q)
+        r_CE = r[:, robot.link_names.index(link)] - center
         J = (J[:, 6:] - J[:, 3:6] @ A[3:, :])[:3, :]
         of_samples = ca.Function("samples", [q], [ca.densify(J), ca.densify(r_CE)])
         samples = sample_shapes(robot, _SAMPLED_SHAPES)

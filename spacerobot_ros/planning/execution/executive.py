@@ -45,8 +45,7 @@ from spacerobot_ros.planning.execution.worker import PlanJob, PlanningTask, Plan
 from spacerobot_ros.times import SECOND
 
 _MAX_IN_MOTION_ATTEMPTS = 2
-"""Largest number of plans per goal that take over in motion; each plan takes over after twice the
-delay of the previous one."""
+"""Largest number of plans per goal that take over in motion, each after twice the delay."""
 
 
 class Executive:
@@ -274,8 +273,7 @@ class Executive:
 
         A plan in progress is restarted. If the rest of the current schedule comes too close to
         obstacles, the joints brake, and the remaining motion is planned again. ``make_worker``
-        returns the worker that avoids these obstacles; the function is called when no plan is in
-        progress.
+        returns the worker that avoids these obstacles, and is called when no plan is in progress.
         """
         self._drop_plan()
         self._worker.close()

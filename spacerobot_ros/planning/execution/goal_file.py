@@ -77,8 +77,7 @@ class GoalIds:
 class GoalFile:
     """A file with a commander's current goals; reached and abandoned goals are removed.
 
-    A restarted commander loads and resumes them. An executive's reports update the file:
-    :meth:`pursue` and :meth:`end`.
+    A restarted commander resumes them. Reports update the file: :meth:`pursue` and :meth:`end`.
 
     Parameters
     ----------
@@ -95,8 +94,7 @@ class GoalFile:
         """Goal ids in the file."""
 
     def pursue(self, pursued: PursuedGoals) -> str:
-        """Atomically replace the file content with the goals to resume; return a message if the
-        file cannot be written, else an empty string."""
+        """Atomically write the goals to resume; return a message if that fails, else empty text."""
         kept = {key: goal for key, goal in pursued.goals.items() if goal.resumes}
         self._ids = frozenset(goal.goal_id for goal in kept.values())
         if not kept:

@@ -46,8 +46,7 @@ _POSE_NOISE = 1e-3
 """Standard deviation of each component of a measured pose, m or rad."""
 
 _MAX_PLAUSIBLE_ERROR = 6 * _PRIOR_DEVIATION
-"""Largest plausible relative mass or inertia error; if the estimate is larger, the deviation has
-another cause, such as a jump in the measurements."""
+"""Largest plausible relative error; beyond it, another cause is likely, such as a sensor jump."""
 
 _NEAR_SHARES, _AIM_SHARES = (0.6, 0.8), (0.4, 0.6)
 """Fractions of the tolerances, with one value each for the early and the late phase of a motion:
@@ -76,8 +75,7 @@ class PathCheck:
     config
         Planner parameters: tracking error bounds, and the shape deadband.
     average
-        Number of measured poses whose mean deviation from the path is used for plans that begin in
-        motion; 0: none.
+        Number of poses whose mean deviation is used for plans that begin in motion; 0: none.
     sensitivity
         (K, 6, P) derivatives of the path with respect to mass and inertia errors, as returned by
         :class:`PathSensitivity`; None if these errors are not estimated.
@@ -228,11 +226,6 @@ class PathSensitivity:
     """Derivatives of a base path with respect to P parameters: relative mass and inertia errors.
 
     The first P / 2 are errors in the body masses, the others in the inertia tensors.
-
-    Parameters
-    ----------
-    robot
-        The model used to predict the path.
     """
 
     def __init__(self, robot: SpaceRobot) -> None:
@@ -244,8 +237,7 @@ class PathSensitivity:
         """A function of shape and inertial parameters, and the parameters (k, 1 + P) of variants.
 
         The function returns the angular velocity of the base per joint rate (3 n,) and the centre
-        of mass (3,), both in the base frame. The variants are the model itself, then the model
-        with each parameter changed by a small step.
+        of mass (3,), in the base frame. Variants: the model, then each parameter changed by a step.
         """
         robot, bodies = self._robot, self.count // 2
         factors = 1 + np.vstack([np.zeros(self.count), _DIFFERENCE_STEP * np.eye(self.count)])
@@ -305,8 +297,7 @@ class MassEstimate:
 
     The first pose of each path has a measurement error. So each path has an unknown constant
     offset, which is eliminated from the normal equations. Deviations that only implausible errors
-    would explain (such as those from a failing sensor) are ignored: the estimate is zero, and the
-    path is discarded.
+    would explain (of a failing sensor) are ignored: the estimate is zero, the path is discarded.
 
     Parameters
     ----------

@@ -21,8 +21,7 @@ _REST_RATE = 1e-9  # m/s or rad/s
 
 
 class BaseMeasurement(NamedTuple):
-    """Components of a measured state, except for its stamp and shape: ``pose`` (7,), ``twist`` (6,)
-    of the base, ``qdot`` (n,)."""
+    """A measured base: ``pose`` (7,), ``twist`` (6,), and the joint rates ``qdot`` (n,)."""
 
     pose: Array
     twist: Array
@@ -30,8 +29,7 @@ class BaseMeasurement(NamedTuple):
 
 
 class MeasuredState(NamedTuple):
-    """A measured state: its stamp, the shape ``q`` (n,), m or rad, and the base, if it was measured
-    at the same time."""
+    """A measured state: stamp, shape ``q`` (n,), m or rad, and base, if measured at this time."""
 
     stamp_ns: int
     q: Array

@@ -99,18 +99,15 @@ class PlannerStatus:
     end_effector_waypoints
         Number of waypoints on the given paths to these goals, by link.
     end_effector_position_error_m, end_effector_attitude_error_rad
-        Largest remaining end-effector errors; None if there are no end-effector goals, or if they
-        were not evaluated.
+        Largest remaining end-effector errors; None if they were not evaluated, or have no goals.
     position_error_m, attitude_error_rad
         Remaining error of the measured base pose; None if it was not evaluated.
     manoeuvre_time_s
-        Duration of all schedules for the goal so far, without parts replaced by later ones; 0:
-        none.
+        Duration of all schedules for the goal so far, without replaced parts; 0: none.
     ends_at_s
         Simulated time at which the latest schedule ends; 0: none.
     remaining_s
-        Expected duration of later schedules until the goal is reached; 0: no further schedule is
-        needed.
+        Expected duration of later schedules until the goal is reached; 0: none is needed.
     method
         Gait method of the schedule that starts; empty if no schedule starts.
     duration_s
@@ -441,8 +438,7 @@ def describe_remaining_error(
 ) -> str:
     """Return a clause with the remaining error in the controlled goal components.
 
-    If tolerances are given, the clause includes them; if a goal is given, the clause also names the
-    uncontrolled components.
+    Given tolerances are included, and the uncontrolled components of a given goal are named.
     """
     parts: dict[Controlled, str] = {
         "position": quantity(error.distance, "m"),
@@ -479,8 +475,7 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
     """Return the duration of the executed schedules for the last goal, s; None if there are none.
 
     This is the planner's value, minus the rest of the last schedule if the flight ended early. If
-    the planner has no value, for example after an abort, :func:`time_to_end` is returned, which has
-    the same arguments.
+    the planner has no value, for example after an abort, :func:`time_to_end` is returned.
     """
     given = list(statuses)
     flown = [
@@ -499,12 +494,10 @@ def manoeuvre_time(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float
 
 
 def time_to_end(statuses: Iterable[tuple[float, PlannerStatus]], end_s: float) -> float | None:
-    """Return the time, s, from the start of the first schedule for the last goal to the end; None
-    if no schedule was executed.
+    """Return the time, s, from the first schedule for the last goal to the end; None: no schedule.
 
     Waiting times, such as for a restarted planner, are included. ``statuses`` are times, s, and
-    statuses in order of time; ``end_s`` is the end time of the flight, s, which is used if no
-    status reports that the goal has ended.
+    statuses in order of time; ``end_s``, s, ends the flight if no status has ended the goal.
     """
     given = list(statuses)
     executing = [each for each in given if each[1].state is PlannerState.EXECUTING]

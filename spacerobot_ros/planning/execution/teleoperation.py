@@ -112,8 +112,7 @@ class TwistStep(NamedTuple):
     """Result for one state while an end-effector follows twists.
 
     ``rates`` (n,) are the joint rates; None if the joints hold their shape. ``message`` is reported
-    in the status; empty if there is nothing new. ``ended``: whether the joints are at rest and no
-    more twists arrive.
+    in the status, if new. ``ended``: whether the joints are at rest and no more twists arrive.
     """
 
     rates: Array | None

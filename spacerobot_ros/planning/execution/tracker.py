@@ -16,7 +16,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.method import InitialMotion
-from spacerobot_ros.planning.core.schedule import GaitSchedule
+from spacerobot_ros.planning.core.schedule import GaitSchedule, interpolated
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.path_deviation import (
     MassEstimate,
@@ -90,8 +90,7 @@ class ScheduleFollower:
         self._settling_ns = 0 if brakes else round(_MAX_SETTLING_TIME * SECOND)
         self.start_ns = start_ns
         self._period_ns = round(schedule.control_period * SECOND)
-        self._last_tick = schedule.ticks
-        self._end_ns = start_ns + self._last_tick * self._period_ns
+        self._end_ns = start_ns + schedule.ticks * self._period_ns
         self.gain = min(shape_gain, 1.0 / schedule.control_period)
         self._positions = schedule.positions
         # The joints rest after the last tick, and wheels keep their rates. The part of the
@@ -122,20 +121,39 @@ class ScheduleFollower:
         return self.start_ns <= stamp_ns <= self._end_ns + self._settling_ns
 
     def braking(self, stamp_ns: int, duration: float) -> ScheduleFollower:
-        """Return the follower that brakes along the schedule from a time on."""
-        braking = _braking_schedule(self.schedule, (stamp_ns - self.start_ns) / SECOND, duration)
-        return ScheduleFollower(braking, stamp_ns, self.gain, brakes=True)
+        """Return the follower that brakes along the schedule from a time on, within T seconds.
+
+        Gait time runs at the rate ``1 - t/T``: the shape stays on the path of the gait. At zero
+        momentum, the base path does not depend on speed, so the base also stays on its path. Wheels
+        that keep spinning are brought to their final rates, at which the base rests at its goal.
+        """
+        schedule, last = self.schedule, self.schedule.ticks
+        period, begins = schedule.control_period, (stamp_ns - self.start_ns) / SECOND
+        since = period * np.arange(max(1, math.ceil(duration / period - 1e-9)) + 1, dtype=float)
+        tau = np.minimum(since / duration, 1.0)
+        ticks = (begins + duration * (tau - tau**2 / 2)) / period
+        shapes = interpolated(ticks, np.arange(last + 1.0), schedule.positions)
+        end = schedule.end_velocities
+        if end is not None:
+            # From the initial to the final rate, linearly.
+            first = schedule.velocities[np.clip(int(ticks[0]), 0, last - 1)]
+            t = np.minimum(since, duration)[:, np.newaxis]
+            turned = shapes[0] + t * first + t**2 / (2 * duration) * (end - first)
+            turned += (since[:, np.newaxis] - t) * end
+            shapes = np.where(end != 0, turned, shapes)
+        along = replace(schedule, positions=shapes)
+        return ScheduleFollower(along, stamp_ns, self.gain, brakes=True)
 
     def shapes_from(self, stamp_ns: int) -> Array:
         """Return the shapes at the ticks from a time to the end, at least two."""
         tick = (stamp_ns - self.start_ns) // self._period_ns
-        return self._positions[min(max(tick, 0), self._last_tick - 1) :].copy()
+        return self._positions[min(max(tick, 0), self.schedule.ticks - 1) :].copy()
 
     def take_over(self, stamp_ns: int, after: float) -> TakeOver | None:
         """Return the first tick at least ``after`` s from now; None if no tick is left."""
         now = max((stamp_ns - self.start_ns) // self._period_ns, 0)
         tick = now + max(1, math.ceil(after / self.schedule.control_period - 1e-9))
-        if tick >= self._last_tick:
+        if tick >= self.schedule.ticks:
             return None
         positions = self._positions
         motion = InitialMotion(self.schedule.velocities[tick - 1], positions[tick:])
@@ -145,7 +163,7 @@ class ScheduleFollower:
     def command(self, stamp_ns: int, q: Array, position: Array, velocity: Array) -> None:
         """Write the current desired shape (n,) and the velocities to hold from now on (n,)."""
         k = (stamp_ns - self.start_ns) // self._period_ns
-        k = 0 if k < 0 else min(k, self._last_tick)
+        k = 0 if k < 0 else min(k, self.schedule.ticks)
         position[:] = self._positions[k]
         late = stamp_ns - self._end_ns
         if late > 0:
@@ -161,43 +179,8 @@ class ScheduleFollower:
             velocity += self.gain * (late / SECOND) * self._after
 
 
-def _braking_schedule(schedule: GaitSchedule, begins: float, duration: float) -> GaitSchedule:
-    """Return a schedule that slows down along another one, from ``begins`` s after its start, and
-    comes to rest on its path after ``duration`` T, s.
-
-    Gait time runs at the rate ``1 - t/T``: the shape stays on the path of the gait. At zero
-    momentum, the base path does not depend on speed, so the base also stays on its path. Wheels
-    that keep spinning after the end of the schedule are brought to their final rates, at which the
-    base comes to rest at its goal.
-    """
-    period, positions, last = schedule.control_period, schedule.positions, schedule.ticks
-    since: Array = period * np.arange(max(1, math.ceil(duration / period - 1e-9)) + 1, dtype=float)
-    tau = np.minimum(since / duration, 1.0)
-    ticks = (begins + duration * (tau - tau**2 / 2)) / period
-    k = np.clip(ticks.astype(int), 0, last)
-    ahead = positions[np.minimum(k + 1, last)] - positions[k]
-    shapes = positions[k] + (ticks - k)[:, np.newaxis] * ahead
-    end = schedule.end_velocities
-    if end is not None:
-        # From the initial to the final rate, linearly.
-        first = schedule.velocities[min(k[0], last - 1)]
-        t = np.minimum(since, duration)[:, np.newaxis]
-        turned = shapes[0] + t * first + t**2 / (2 * duration) * (end - first)
-        turned += (since[:, np.newaxis] - t) * end
-        shapes = np.where(end != 0, turned, shapes)
-    return replace(schedule, positions=shapes)
-
-
 class TrajectoryTracker:
-    """Tracks successive schedules, and holds the shape between them.
-
-    Parameters
-    ----------
-    robot
-        The robot whose joints are commanded.
-    config
-        The planner configuration.
-    """
+    """Tracks successive schedules, and holds the shape between them."""
 
     def __init__(self, robot: SpaceRobot, config: PlannerConfig) -> None:
         self.setpoint = Setpoint(np.zeros(robot.n), np.zeros(robot.n))
@@ -285,8 +268,7 @@ class TrajectoryTracker:
         """Return the earliest tick, at least ``after`` s from now, at which a plan may take over.
 
         The first shape is the desired shape, except for joints whose measured position in ``q``
-        (n,) deviates by more than the noise. None if no schedule is tracked, or if the schedule is
-        over by then.
+        (n,) deviates by more than the noise. None if no schedule is tracked by then.
         """
         if self._follower is None or self._follower.brakes:
             return None
@@ -435,8 +417,7 @@ class StuckJointWatch:
     def find_stuck(self, q: Array, wanted: Array, velocity: Array) -> list[int]:
         """Return the indices of joints considered stuck from this tick on, usually none.
 
-        ``q`` and ``wanted`` (n,) are the current measured and desired shapes, ``velocity`` (n,) the
-        command until the next tick.
+        ``q`` and ``wanted`` (n,) are measured and desired shapes, ``velocity`` (n,) the command.
         """
         if not self._suspicious:
             self._ticks_without_check += 1

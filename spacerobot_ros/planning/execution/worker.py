@@ -30,8 +30,7 @@ from spacerobot_ros.times import SECOND
 
 _COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0
 """Rest period, s, at the start of a background plan for a drifting robot, and, if this period was
-too short, the factor by which the time from the start of the period to the end of planning is
-multiplied."""
+too short, the factor by which the time from then to the end of planning is multiplied."""
 
 _MAX_COASTING_TIME = 600.0
 """Longest such time, s."""
@@ -263,8 +262,7 @@ class PlanningWorker:
     def approach_ahead(self, schedule: GaitSchedule, begins: float, now: float) -> str:
         """Return a clause that states where the rest of a schedule comes too close to obstacles.
 
-        ``begins`` and ``now`` are times, s. Empty if the schedule stays clear, or if there are no
-        obstacles.
+        ``begins`` and ``now`` are times, s. Empty if the schedule stays clear of obstacles.
         """
         if self.clearance is None or not self.clearance.has_obstacles:
             return ""

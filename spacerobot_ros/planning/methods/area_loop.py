@@ -97,8 +97,7 @@ class AreaLoopOptions:
 class AreaLoopProgress:
     """Progress towards a goal; the next schedule continues from there.
 
-    ``nominal`` is the chosen nominal shape, ``cycles`` the number of cycles flown by the end of the
-    schedule.
+    ``nominal`` is the chosen nominal shape, ``cycles`` the number of cycles flown at the end.
     """
 
     nominal: NominalShape
@@ -431,8 +430,7 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
     """Return the path around ``areas`` (3,), with edges of at most ``longest`` (3,) if possible.
 
     The cube-like path is used if its edges are short enough, or shorter than those of the
-    rectangles. If the areas are too large, ``edge_ratio`` is greater than 1; edges scale with the
-    square root of the areas.
+    rectangles. If the areas are too large, ``edge_ratio`` exceeds 1: edges scale as their root.
     """
     areas = np.where(np.abs(areas) > _NEGLIGIBLE_AREA_SHARE * np.abs(areas).max(), areas, 0.0)
     rectangles = _rectangle_path(areas, longest)

@@ -32,8 +32,7 @@ class AutoGait(GaitMethod):
     If a method that suits the robot controls the position, methods that do not control it are
     omitted. A manoeuvre that misses the goal, or controls fewer goal components than another, is
     selected only if there is no better one. The method of the last schedule flown for a goal is
-    kept for that goal as long as it finds a plan. The result is the schedule of the chosen method,
-    with additional notes.
+    kept for that goal as long as it finds a plan. Notes are added to the chosen schedule.
 
     Parameters
     ----------
@@ -68,8 +67,7 @@ class AutoGait(GaitMethod):
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:
         """Plan with all suitable methods, and return the best plan; see :meth:`GaitMethod.plan`.
 
-        ``notes`` name the selected method (``chosen``), the reason (``because``), and the
-        results of all methods (``compared``).
+        ``notes`` name the method (``chosen``), the reason (``because``), and all (``compared``).
 
         Raises
         ------

@@ -142,8 +142,7 @@ class LieBracketGait(GaitMethod):
         UnreachableError
             ``zf`` exceeds a stroke, and the robot has only sliders.
         PlanningError
-            ``zf`` exceeds a stroke, and the robot has other joints, too; or there are no three
-            independent slots.
+            ``zf`` exceeds a stroke, and the robot has other joints; or slots are dependent.
         """
         robot = self.robot
         R0, Rf = matrix_from_quaternion(state.quaternion), matrix_from_quaternion(goal.quaternion)
@@ -206,19 +205,15 @@ class LieBracketGait(GaitMethod):
         ):
             # The error of the first-order theory decreases as 1/sqrt(n).
             best = self._refine_turn(wanted, brackets, triple, z_f, 2 * best.cycles, enough)
-        names = [self.robot.joint_names[i] for i in triple]
-        return (
-            best.shapes,
-            best.cycles,
-            {
-                "sliders": ", ".join(names),
-                "omega_d": [float(x) for x in wanted],
-                "alpha": [float(x) for x in best.alpha],
-                "cycles": float(best.cycles),
-                "amplitudes": [float(x) for x in best.amplitudes],
-                "predicted_attitude_error": best.rotation_error,
-            },
-        )
+        notes: Notes = {
+            "sliders": ", ".join(self.robot.joint_names[i] for i in triple),
+            "omega_d": wanted.tolist(),
+            "alpha": best.alpha.tolist(),
+            "cycles": float(best.cycles),
+            "amplitudes": best.amplitudes.tolist(),
+            "predicted_attitude_error": best.rotation_error,
+        }
+        return best.shapes, best.cycles, notes
 
     def _refine_turn(
         self,

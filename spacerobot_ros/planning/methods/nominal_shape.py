@@ -140,14 +140,12 @@ class NominalShapeChooser:
     def at(self, q: Array, kept: NominalShape | None = None) -> NominalShape:
         """Return the nominal shape to use when starting from shape ``q`` (n,).
 
-        The other joints rest; ``kept``, an earlier choice, is returned if the other joints have not
-        moved.
+        The other joints rest; ``kept``, an earlier choice, is returned unless they have moved.
 
         Raises
         ------
         PlanningError
-            Joint limits leave no room for loops, or loops at this shape do not rotate the base
-            about all axes.
+            Joint limits leave no room for loops, or loops do not rotate the base about all axes.
         """
         if kept is not None:
             moved = np.abs(np.delete(q - kept.shape, kept.joints)).max(initial=0.0)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from typing_extensions import override
 
 from spacerobot_ros.errors import (
@@ -50,11 +49,9 @@ class RemainingJointsGait(GaitMethod):
     robot, control_period, integration_step
         As for any :class:`GaitMethod`.
     stuck
-        Positions of the stuck joints, m or rad, by name: the model is the robot with these joints
-        fixed at these positions.
+        Positions of the stuck joints, m or rad, by name, at which the model holds them fixed.
     method, options
-        The method for the remaining joints, as for :func:`build_method`; if it rejects the robot,
-        ``auto`` is tried.
+        Method for the other joints, as for :func:`build_method`, or ``auto`` if it rejects them.
     required
         Goal components that a schedule must control.
     clearance
@@ -81,7 +78,7 @@ class RemainingJointsGait(GaitMethod):
         self._names = list(dict.fromkeys((method, "auto")))
         self._required = required
         self._options = {
-            name: _options_of_remaining(chosen, self._is_stuck, robot.joint_names)
+            name: _options_of_remaining(chosen, stuck.keys(), robot.joint_names)
             for name, chosen in options.items()
         }
         self._remaining: SpaceRobot | None = None
@@ -150,17 +147,16 @@ class RemainingJointsGait(GaitMethod):
         self, previous: GaitSchedule | None
     ) -> tuple[list[str], GaitSchedule | None]:
         """Return the names of the methods to try, and the previous schedule for these methods."""
-        progress = None if previous is None else previous.progress
-        if isinstance(progress, _RemainingProgress) and isinstance(progress.inner, PathProgress):
-            progress = progress.inner
-        if previous is not None and isinstance(progress, PathProgress):
+        if previous is None:
+            return self._names, None
+        progress = previous.progress
+        inner = progress.inner if isinstance(progress, _RemainingProgress) else progress
+        if isinstance(inner, PathProgress):
             moving = previous.positions[:, ~self._is_stuck]
-            return self._names, replace(previous, positions=moving, progress=progress)
-        if previous is None or not isinstance(progress, _RemainingProgress):
-            return self._names, None
-        if progress.stuck != self._stuck.keys():
-            return self._names, None
-        return [progress.planner], replace(previous, progress=progress.inner)
+            return self._names, replace(previous, positions=moving, progress=inner)
+        if isinstance(progress, _RemainingProgress) and progress.stuck == self._stuck.keys():
+            return [progress.planner], replace(previous, progress=inner)
+        return self._names, None
 
     def _get_method(self, name: str) -> GaitMethod:
         if self._remaining is None:
@@ -193,11 +189,10 @@ class RemainingJointsGait(GaitMethod):
         )
 
 
-def _options_of_remaining(options: Any, stuck: npt.NDArray[np.bool_], names: Sequence[str]) -> Any:
+def _options_of_remaining(options: Any, gone: Set[str], names: Sequence[str]) -> Any:
     """Return options for the joints that are not stuck: lists with one number per joint lose those
     of the stuck ones, and joint names are left to the method if one of them is stuck.
     """
-    gone = {name for name, is_stuck in zip(names, stuck, strict=True) if is_stuck}
     kept: dict[str, Any] = {}
     for option in declared(options):
         value = option.default
@@ -210,7 +205,6 @@ def _options_of_remaining(options: Any, stuck: npt.NDArray[np.bool_], names: Seq
                 each for each in value if str(each).rpartition(":")[0] not in gone
             )
         elif isinstance(value, tuple) and len(value) == len(names):
-            kept[option.name] = tuple(
-                x for x, is_stuck in zip(value, stuck, strict=True) if not is_stuck
-            )
+            left = (x for x, name in zip(value, names, strict=True) if name not in gone)
+            kept[option.name] = tuple(left)
     return replace(options, **kept)

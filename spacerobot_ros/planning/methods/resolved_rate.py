@@ -60,8 +60,7 @@ _MIN_TRACE_STEPS, _MAX_TRACE_STEPS = 20, 30_000
 """Smallest and largest number of steps along a joint path."""
 
 MIN_PROGRESS_RATE = 0.01
-"""Progress along the line below which a singularity is near, in end-effector reaches per radian of
-the fastest joint."""
+"""Progress below which a singularity is near, in reaches per radian of the fastest joint."""
 
 _ZERO_PROGRESS_RATE = 1e-8
 """Progress below which the path has reached the singularity."""
@@ -124,12 +123,10 @@ class ResolvedRateOptions(MotionOptions):
 
 
 class _SmoothPath:
-    """A smooth path through points (K, 3), m, from the origin: a natural cubic spline over chord
-    length, which is a straight line for two points.
+    """A path through points (K, 3), m, from the origin: a natural cubic spline over chord length.
 
     ``turn`` (3,) is the rotation vector from the start to the end, in step with the way, rad;
-    ``total_length`` is that of the chords together, m. There are no ``curvature_breaks``, shares of
-    the way at which its curvature jumps.
+    ``total_length`` is that of the chords, m; its curvature has no jumps (``curvature_breaks``).
     """
 
     curvature_breaks = np.zeros(0)
@@ -167,8 +164,7 @@ class _LinkPath:
     """The line of a link E in the initial base frame B_0, relative to the centre of mass.
 
     ``displacements`` (k, 3) and ``rotations`` (l, 3) are the directions in which the joints move
-    and rotate it, and in which it follows; ``start_position`` (3,) and ``start_attitude`` (4,) its
-    pose at the start.
+    and rotate it; ``start_position`` (3,) and ``start_attitude`` (4,) are its first pose.
     """
 
     link: str
@@ -473,8 +469,7 @@ class ResolvedRateGait(GaitMethod):
     The motion is from rest to rest, as fast as the joint limits allow. Handles goal positions, or
     goal poses with a rotation about one axis, of one or more end-effectors; only a single
     end-effector can follow a given path. Lines that meet a dynamic singularity, a joint limit or a
-    contact are rejected, or followed until shortly before that point; ``optimal`` reaches the ends
-    of most of these lines.
+    contact are rejected or followed until shortly before; ``optimal`` reaches most of their ends.
     """
 
     name: ClassVar[str] = "resolved_rate"

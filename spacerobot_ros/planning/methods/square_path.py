@@ -108,8 +108,7 @@ class _SquareFamily:
 class SquarePathGait(GaitMethod):
     """Controls the attitude and shape of planar trees with three or more links and revolute joints.
 
-    The base position follows from the attitude and the shape (the centre of mass is at rest), so it
-    cannot be chosen.
+    The base position follows from attitude and shape (the centre of mass is at rest).
     """
 
     name: ClassVar[str] = "square_path"
@@ -188,8 +187,7 @@ class SquarePathGait(GaitMethod):
 
     def _find_loop(self, psi_e: Array, wanted: float) -> tuple[Array, int, Notes]:
         """Return the square for a rotation ``wanted`` (rad), with other joints at ``psi_e`` (n,):
-        its corners (4, n) in the order of travel, beginning with the one nearest to ``psi_e``, the
-        number of loops, and notes.
+        its corners (4, n) in order of travel from the one nearest to ``psi_e``, loops, and notes.
 
         Among all joint pairs, the one with the fewest loops is chosen, and among those the one with
         the smallest square; if links come too close on all of these, more loops around smaller
@@ -220,21 +218,18 @@ class SquarePathGait(GaitMethod):
                 nearest = int(np.argmin(np.linalg.norm(corners - psi_e, axis=1)))
                 corners = np.roll(corners, -nearest, axis=0)
                 shapes = np.vstack([psi_e, corners, corners[0], psi_e])
-                too_near = self._too_near(shapes, at_ticks=False)
-                if not too_near:
-                    return (
-                        corners,
-                        loops,
-                        {
-                            "joints": ", ".join(self.robot.joint_names[i] for i in candidates.pair),
-                            "psi_star": centre.tolist(),
-                            "z_star": side,
-                            "loops": float(loops),
-                            "direction": "clockwise" if clockwise else "counter-clockwise",
-                            "corner": corners[0].tolist(),
-                        },
-                    )
-                obstacle = obstacle or too_near
+                if too_near := self._too_near(shapes, at_ticks=False):
+                    obstacle = obstacle or too_near
+                    continue
+                notes: Notes = {
+                    "joints": ", ".join(self.robot.joint_names[i] for i in candidates.pair),
+                    "psi_star": centre.tolist(),
+                    "z_star": side,
+                    "loops": float(loops),
+                    "direction": "clockwise" if clockwise else "counter-clockwise",
+                    "corner": corners[0].tolist(),
+                }
+                return corners, loops, notes
         raise PlanningError(
             f"On square loops within the joint limits, links come too close to each other with up "
             f"to most_loops = {self.options.most_loops} loops: {obstacle}."

@@ -178,8 +178,7 @@ class EndEffectorRows:
     def evaluate(self, X: Array, q: Array, parameters: Array) -> tuple[Array, Array, Array]:
         """Return rows (K, m) and their derivatives (K, m, 3) and (K, m, n) at K motion ends.
 
-        The derivatives are with respect to a base rotation, in the base frame, and to the shape;
-        ``X`` (K, 4) and ``q`` (K, n).
+        The derivatives are by a rotation in the base frame and the shape; X (K, 4), q (K, n).
         """
         K = len(q)
         p = np.repeat(parameters[:, np.newaxis], K, axis=1)
@@ -280,25 +279,19 @@ class EndEffectorRows:
         vectors = np.random.default_rng(0).normal(size=(len(shapes), len(self.axes))) @ self.axes
         return shapes, quaternions_from_rotvecs(vectors)
 
-    def _rates(self, link: str, q: Array, X: Array) -> tuple[Array, Array]:
-        """Return link Jacobians in B_0, relative to the centre of mass: displacement over rotation.
-
-        (6, n) is due to the joints at zero momentum, the generalised Jacobian, and (6, m) to base
-        rotations about the axes.
-        """
-        R_X = matrix_from_quaternion(X)
-        # [v_cm; omega; qdot] -> [v_E; omega_E]
-        by_base = self.robot.jacobian(link, q)[:, 3:6]
-        blocks = self.robot.generalised_jacobian(link, q), by_base @ self.axes.T
-        first, second = (np.vstack([R_X @ each[:3], R_X @ each[3:]]) for each in blocks)
-        return first, second
-
     def _directions(self, link: str, attitude: bool) -> LinkDirections:
-        samples = zip(*self._samples(), strict=True)
-        rates = np.hstack([np.hstack(self._rates(link, q, X)) for q, X in samples])
-        return LinkDirections(
-            link, _span(rates[:3]), _span(rates[3:]) if attitude else np.zeros((0, 3))
-        )
+        # Rates in B_0 relative to the centre of mass: by the joints at zero momentum, and by base
+        # rotations about the axes.
+        velocities, turns = [], []
+        for q, X in zip(*self._samples(), strict=True):
+            R_X = matrix_from_quaternion(X)
+            # [v_cm; omega; qdot] -> [v_E; omega_E]
+            by_base = self.robot.jacobian(link, q)[:, 3:6] @ self.axes.T
+            for rates in (self.robot.generalised_jacobian(link, q), by_base):
+                velocities.append(R_X @ rates[:3])
+                turns.append(R_X @ rates[3:])
+        rotations = _span(np.hstack(turns)) if attitude else np.zeros((0, 3))
+        return LinkDirections(link, _span(np.hstack(velocities)), rotations)
 
 
 def _span(vectors: Array) -> Array:
@@ -328,8 +321,7 @@ class _InverseKinematics:
         """Return shapes (K, n), turns (K, 4) and errors (K,) of ends, from initial shapes (K, n).
 
         The ``turns`` (K, 4) of the base are fixed, or initial values that are free along the axes;
-        None: they follow from the direct path. ``exact``: whether the ends must meet the goal
-        exactly.
+        None: they follow the direct path. ``exact``: whether ends meet the goal exactly.
         """
         damping = _DAMPING_OF_EXACT_ENDS if exact else _DAMPING
         error = _GIVEN_SHAPE_ERROR if exact else _END_ERROR / 10
@@ -386,8 +378,7 @@ class EndEffectorSpecification:
         The components of the base pose in the goal, and whether joint positions are part of it.
     overdetermined
         Whether the goal has more coordinates than the joints can move independently. Few such goals
-        can be reached, and only in isolated shapes, which inverse kinematics finds before
-        the motion is planned.
+        can be reached, in isolated shapes, which inverse kinematics finds before planning.
     """
 
     rows: EndEffectorRows

@@ -128,8 +128,7 @@ class ManoeuvreModel:
         The commands take the trajectory's time, rounded up to whole ticks, or longer if required by
         the limits (``fixed``: not longer); None if no such commands are found. If the boundary
         conditions leave the last shape free, it is the trajectory's last shape, or close to it.
-        ``before`` are the velocities (n,) held before the start; None: as in the boundary
-        conditions.
+        ``before`` are the velocities (n,) before the start; None: as in ``boundary``.
         """
         if before is not None:
             boundary = replace(boundary, velocity=before)
@@ -154,10 +153,7 @@ class ManoeuvreModel:
             positions = self._move_to_final(positions, boundary, final, limits)
             held = self._adjust_to_goal(positions, boundary, limits, moves_end=moves_end)
             if held is not None:
-                motion = self._motion(held, boundary)
-                needed, overrun = limits.excess(motion)
-                too_fast = max(needed - 1, overrun) > _LIMIT_ROUNDING
-                factor = max(needed, self._slowing_factor(held, motion))
+                too_fast, factor = self._excess(held, boundary, limits)
                 if not too_fast and factor <= 1 + _LIMIT_ROUNDING:
                     return held
             if too_fast and programs < _MAX_PROGRAMS:
@@ -183,10 +179,16 @@ class ManoeuvreModel:
         L_B = boundary.momenta_in_base(held.quaternions)
         return HeldMotion(held.positions, self.control_period, before, after, L_B)
 
-    def _slowing_factor(self, held: HeldCommands, motion: HeldMotion) -> float:
-        """Return the factor of slowdown needed by the limits on joint efforts and base rate."""
-        rate = self.constraints.excess_rate(held.quaternions, self.control_period)
-        return rate if self.efforts is None else max(rate, self.efforts.excess(motion))
+    def _excess(
+        self, held: HeldCommands, boundary: BoundaryConditions, limits: MotionLimits
+    ) -> tuple[bool, float]:
+        """Return whether commands exceed the motion limits, and the slowdown that meets all."""
+        motion = self._motion(held, boundary)
+        needed, overrun = limits.excess(motion)
+        factor = max(needed, self.constraints.excess_rate(held.quaternions, self.control_period))
+        if self.efforts is not None:
+            factor = max(factor, self.efforts.excess(motion))
+        return max(needed - 1, overrun) > _LIMIT_ROUNDING, factor
 
     def _fit_to_limits(
         self,
@@ -196,9 +198,7 @@ class ManoeuvreModel:
         *,
         moves_end: bool,
     ) -> HeldCommands | None:
-        """Return commands close to shapes (N + 1, n) that end at the goal attitude and satisfy all
-        limits, if there are any; every shape may change.
-        """
+        """Return commands near shapes (N + 1, n), all variable, that meet the goal and limits."""
         for _ in range(_MAX_PROGRAMS_IN_TURN):
             held = self._with_attitudes(positions, boundary)
             error, rows = self._end_error(held, boundary), self._end_rows(held, boundary)
@@ -214,10 +214,8 @@ class ManoeuvreModel:
         found = self._adjust_to_goal(positions, boundary, limits, moves_end=moves_end)
         if found is None:
             return None
-        motion = self._motion(found, boundary)
-        needed, overrun = limits.excess(motion)
-        needed = max(needed, self._slowing_factor(found, motion))
-        return found if max(needed - 1, overrun) <= _LIMIT_ROUNDING else None
+        too_fast, factor = self._excess(found, boundary, limits)
+        return None if too_fast or factor > 1 + _LIMIT_ROUNDING else found
 
     def _with_attitudes(self, positions: Array, boundary: BoundaryConditions) -> HeldCommands:
         """Return shapes (N + 1, n) at the ticks with the attitudes to which they lead."""

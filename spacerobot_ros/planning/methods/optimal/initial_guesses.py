@@ -39,8 +39,7 @@ _CANDIDATES_PER_GUESS, _CANDIDATES_PER_CLEAR_GUESS = 24, 240
 guesses, which are one in ten for two arms."""
 
 _MIN_LOOP_SIZE = 0.1
-"""Smallest loop size on the path to a possible end shape, in half ranges of the joints, for all
-guesses but the first."""
+"""Smallest loop size to a possible end, in half ranges of the joints, except in first guesses."""
 
 _MAX_RANGE_SHARE = 0.85
 

@@ -83,18 +83,30 @@ class CenterReach:
         base = bodies[0].inertia
         origin, radius = base.mass * base.com, 0.0
         slots = np.zeros((3, len(lower)))
-        places = [_FrameBounds(np.zeros(3), np.eye(3), (), 0.0)]
-        for joint, body in enumerate(bodies[1:]):
-            place = places[body.parent].of_child(joint, body, lower[joint], upper[joint])
-            places.append(place)
-            mass, com = body.inertia.mass, body.inertia.com
-            if place.R is None:
-                origin = origin + mass * place.r
-                radius += mass * (place.radius + float(np.linalg.norm(com)))
+        # The frame of a body is within a distance of r, displaced by sliders (3, m); R is its
+        # attitude in B, None if that depends on the shape.
+        places: list[tuple[Array, Array | None, Array, float]]
+        places = [(np.zeros(3), np.eye(3), slots.copy(), 0.0)]
+        for k, body in enumerate(bodies[1:]):
+            assert body.joint is not None
+            slides = body.joint.kind is JointKind.PRISMATIC
+            r, R, moved, around = places[body.parent]
+            if R is None:
+                travel = max(abs(lower[k]), abs(upper[k])) if slides else 0.0
+                around = around + float(np.linalg.norm(body.origin.r)) + travel
             else:
-                origin = origin + mass * (place.r + place.R @ com)
-            for slider, axis in place.sliders:
-                slots[:, slider] += mass * axis
+                r, R = r + R @ body.origin.r, R @ body.origin.R
+                moved = moved.copy()
+                moved[:, k] = slides * (R @ body.joint.axis)
+                R = R if slides else None
+            places.append((r, R, moved, around))
+            mass, com = body.inertia.mass, body.inertia.com
+            slots += mass * moved
+            if R is None:
+                origin = origin + mass * r
+                radius += mass * (around + float(np.linalg.norm(com)))
+            else:
+                origin = origin + mass * (r + R @ com)
         sliders = np.flatnonzero(slots.any(axis=0))
         total = robot.total_mass
         slots = slots[:, sliders] / total
@@ -127,33 +139,6 @@ def moving_joint_ranges(robot: SpaceRobot, lower: Array, upper: Array) -> tuple[
 
 
 @dataclass(frozen=True)
-class _FrameBounds:
-    """Bounds on the frame of a body for all shapes.
-
-    It is within ``radius`` m of ``r`` (3,), displaced by the ``sliders``: pairs of an index and a
-    direction (3,). ``R`` (3, 3) is its attitude in B, None if that depends on the shape.
-    """
-
-    r: Array
-    R: Array | None
-    sliders: tuple[tuple[int, Array], ...]
-    radius: float
-
-    def of_child(self, index: int, body: Body, lower: float, upper: float) -> _FrameBounds:
-        """Return the bounds for a child body, carried by a joint with these limits."""
-        assert body.joint is not None
-        slides = body.joint.kind is JointKind.PRISMATIC
-        if self.R is None:
-            travel = max(abs(lower), abs(upper)) if slides else 0.0
-            around = self.radius + float(np.linalg.norm(body.origin.r)) + travel
-            return _FrameBounds(self.r, None, self.sliders, around)
-        r, R = self.r + self.R @ body.origin.r, self.R @ body.origin.R
-        if slides:
-            return _FrameBounds(r, R, (*self.sliders, (index, R @ body.joint.axis)), self.radius)
-        return _FrameBounds(r, None, self.sliders, self.radius)
-
-
-@dataclass(frozen=True)
 class ConnectionBounds:
     """Bounds on the base motion at zero momentum, for all shapes within the joint limits.
 
@@ -164,8 +149,7 @@ class ConnectionBounds:
     center
         (n,) largest centre-of-mass displacement relative to the base, m per rad or m.
     inertia
-        Smallest moment of inertia of the robot with its joints locked, kg m^2; for planar robots,
-        about their axis.
+        Smallest moment of inertia with locked joints, kg m^2; if planar, about the robot's axis.
     """
 
     turn: Array
@@ -233,8 +217,7 @@ class _Tree:
 
     def reach(self, body: int, point: Array) -> float:
         """Return the largest distance, m, of a point (3,) of a body from the centre of mass: the
-        vector between them is the mass-weighted mean of the vectors from the centres of mass of all
-        bodies.
+        vector between them is the mass-weighted mean of the vectors from all centres of mass.
         """
         masses = [each.inertia.mass for each in self.bodies]
         apart = self.distances(body, point, -1, np.eye(3))
@@ -326,9 +309,7 @@ class _Tree:
 
 
 def reach_of_end_effector(robot: SpaceRobot, lower: Array, upper: Array, link: str) -> float:
-    """Return an upper bound, m, on the distance of a link's origin from the centre of mass, with
-    the joints within ``lower`` and ``upper`` (n,).
-    """
+    """Return an upper bound, m, on a link's distance from the centre of mass, by limits (n,)."""
     body, pose = robot.description.frames[link]
     return _Tree.of(robot, lower, upper).reach(body, pose.r)
 

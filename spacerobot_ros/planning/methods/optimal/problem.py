@@ -12,7 +12,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError, PlanningError, counted
 from spacerobot_ros.model import SpaceRobot, symbolic_rotations
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
+from spacerobot_ros.model.rotations import matrices_from_quaternions
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import for_each_joint, nonnegative, parameter
 from spacerobot_ros.planning.core.goal import RobotState
@@ -221,8 +221,7 @@ class MotionLimits:
     def of(cls, robot: SpaceRobot, options: MotionOptions, method: str = "optimal") -> MotionLimits:
         """Return the robot's limits, narrowed by a method's options.
 
-        Without ``max_acceleration``, the acceleration limit of reaction wheels follows from their
-        motor torque with the base at rest.
+        Without ``max_acceleration``, wheels accelerate by their motor torque with the base at rest.
 
         Raises
         ------
@@ -264,11 +263,7 @@ class MotionLimits:
         The given ``shapes`` (n,) always stay within the limits.
         """
         # Where two margins overlap, the joint stays in the middle of its range.
-        with np.errstate(invalid="ignore"):
-            room = np.where(
-                np.isfinite(self.upper - self.lower), (self.upper - self.lower) / 2, np.inf
-            )
-        kept = np.minimum(margin, room)
+        kept = np.minimum(margin, (self.upper - self.lower) / 2)
         lower = np.min([self.lower + kept, *shapes], axis=0)
         upper = np.max([self.upper - kept, *shapes], axis=0)
         return replace(
@@ -276,16 +271,14 @@ class MotionLimits:
         )
 
     def joint_ranges(self, q: Array) -> tuple[Array, Array]:
-        """Return the middle and the half width (n,) of the joint ranges; unlimited ranges are
-        replaced by finite ones around ``q`` (n,)."""
+        """Return middles and half widths (n,) of joint ranges; unlimited ones lie around ``q``."""
         lower = np.maximum(self.lower, q - 2 * _UNLIMITED_HALF_RANGE)
         upper = np.minimum(self.upper, q + 2 * _UNLIMITED_HALF_RANGE)
         middle = np.where(np.isfinite(self.lower) & np.isfinite(self.upper), (lower + upper) / 2, q)
         return middle, np.minimum((upper - lower) / 2, _UNLIMITED_HALF_RANGE)
 
     def speeds(self, q: Array) -> Array:
-        """Return a finite speed (n,) for every joint: half of its range around ``q`` (n,) per
-        second if its velocity is unlimited."""
+        """Return finite speeds (n,): half the range around ``q`` (n,) per second if unlimited."""
         return np.where(np.isfinite(self.velocity), self.velocity, self.joint_ranges(q)[1])
 
     def excess(self, motion: HeldMotion) -> tuple[float, float]:
@@ -389,8 +382,7 @@ class PathConstraints:
         Largest base rate, rad/s; 0: no limit.
     axis_B, direction_W, cone_half_angle
         The direction ``axis_B`` (3,), fixed in the base, stays out of the cone with half angle
-        ``cone_half_angle`` (rad) around ``direction_W`` (3,), like an instrument that must not see
-        the Sun.
+        ``cone_half_angle`` (rad) around ``direction_W`` (3,): an instrument that avoids the Sun.
     keep_out_boxes
         (K, 2, n) lower and upper corners of shape boxes that the joints must not enter.
     smooth_keep_out_bodies
@@ -464,10 +456,7 @@ class PathConstraints:
                     f"the shape enters a keep_out box at {np.argmax(inside) * period:.4g} s"
                 )
         if self.axis_B is not None and self.direction_W is not None:
-            seen = [
-                float(matrix_from_quaternion(x) @ self.axis_B @ self.direction_W)
-                for x in quaternions
-            ]
+            seen = matrices_from_quaternions(quaternions) @ self.axis_B @ self.direction_W
             angle = np.arccos(np.clip(np.max(seen), -1.0, 1.0))
             if angle < self.cone_half_angle - 1e-9:
                 raise UnusableCandidateError(
@@ -526,8 +515,7 @@ def per_joint(
 ) -> Array:
     """Return a list-valued method option as (n,) numbers.
 
-    ``default`` (n,) are the values for joints not named in a list of strings ``NAME:VALUE``, and
-    for all joints if the list is empty.
+    ``default`` (n,) are the values for joints that a list of ``NAME:VALUE`` omits, or for all.
 
     Raises
     ------

@@ -20,8 +20,7 @@ weighted mean of the quaternions at both knots, normalised, so the attitude is o
 accurate. These functions differ from those for zero momentum, and are derived only if a robot
 drifts.
 
-All stages have the same functions. The derivatives are computed once, and inserted into the
-program's sparse matrices.
+All stages share their functions, whose derivatives are inserted into sparse matrices.
 
 Method: H. G. Bock and K. J. Plitt, "A multiple shooting algorithm for direct solution of optimal
 control problems", IFAC World Congress, 1984.
@@ -33,7 +32,7 @@ import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 
 import casadi as ca
@@ -148,8 +147,7 @@ class Stages:
     rotation_of_step
         Rotation vector (3,) of a step (:func:`turn_function`).
     distances
-        Distances of link pairs, and of links and obstacles, from planes in an interval, plus a lack
-        variable: program rows, ``>= 0``; None: none.
+        Distances of pairs from planes in an interval, plus a lack variable: rows ``>= 0``.
     """
 
     joints: int
@@ -247,11 +245,8 @@ def _cached_interval(
         "" if inequality is None else inequality.serialize(),
         f"drifting {drifting}",
     ]
-    return ConstraintBlock.cached(
-        "interval",
-        facts,
-        lambda: _interval_block(robot, constraints, inequality, drifting=drifting),
-    )
+    derive = partial(_interval_block, robot, constraints, inequality, drifting=drifting)
+    return ConstraintBlock.cached("interval", facts, derive)
 
 
 def _interval_block(
@@ -412,9 +407,7 @@ def _distance_block(n: int, rows: PlaneDistances, instants: int) -> ConstraintBl
 
 
 def _curved_where_it_counts(rows: PlaneDistances) -> ca.Function:
-    """Return ``(y, planes, lambda) -> lambda' J, H``: zeros without evaluation if all multipliers
-    are negligible, as they mostly are.
-    """
+    """Return ``(y, planes, lambda) -> lambda' J, H``: zeros if all multipliers are negligible."""
     arguments = [ca.MX.sym(f"a{i}", rows.hessian.sparsity_in(i)) for i in range(3)]
     nothing = [ca.MX.zeros(rows.hessian.sparsity_out(i)) for i in range(2)]
     of_nothing = ca.Function("nothing", arguments, nothing)
