@@ -69,10 +69,6 @@ class BasePrediction:
         substeps = count_steps(control_period, integration_step)
         self._step = robot.buffered(f"velocity_step:{substeps}")
 
-    def attitudes(self, positions: Array, quaternion: Array, L_W: Array) -> Array:
-        """Return the attitude (N + 1, 4) at every tick for the shapes ``positions`` (N + 1, n)."""
-        return self._integrate(positions, quaternion, L_W, self._control_period)
-
     def true_end(self, positions: Array, attitudes: Array, L_W: Array) -> Array:
         """Return the attitude (4,) after motion at any speed through the shapes (N + 1, n).
 
@@ -85,15 +81,18 @@ class BasePrediction:
             halves = np.empty((2 * len(path) - 1, path.shape[1]))
             halves[::2], halves[1::2] = path, (path[1:] + path[:-1]) / 2
             path, period = halves, period / 2
-            fine = self._integrate(path, attitudes[0], L_W, period)[-1]
+            fine = self.attitudes(path, attitudes[0], L_W, period)[-1]
             error = attitude_error(coarse, fine) / 15
             if np.linalg.norm(error) < _LARGE_ERROR:
                 break
             coarse = fine
         return quaternion_multiply(fine, quaternion_from_rotvec(error))
 
-    def _integrate(self, positions: Array, quaternion: Array, L_W: Array, period: float) -> Array:
-        """Return the attitude (N + 1, 4) at shapes (N + 1, n) that are a period, s, apart."""
+    def attitudes(
+        self, positions: Array, quaternion: Array, L_W: Array, period: float | None = None
+    ) -> Array:
+        """Return the attitudes (N + 1, 4) at shapes (N + 1, n), a ``period``, s, or tick apart."""
+        period = period or self._control_period
         state, qdot, momentum, h = self._step.inputs
         result = self._step.outputs[0]
         momentum[:], h[:] = L_W, period

@@ -194,7 +194,10 @@ class Executive:
         """
         successor = None
         if commanded_until_ns is not None:
-            if not self._commands_were_obeyed(commanded_until_ns, rests_since_ns):
+            active = self._active_goal
+            if active is None or commanded_until_ns < active.begins_ns:
+                return False
+            if commanded_until_ns < self._commanded_from_ns < rests_since_ns:
                 return False
             self._drop_plan()
             successor = self._new_goal
@@ -209,12 +212,6 @@ class Executive:
         if given_up is not None:
             self._add_abort(f"Aborted by the plant: {why}", given_up)
         return given_up is not None
-
-    def _commands_were_obeyed(self, commanded_until_ns: int, rests_since_ns: int) -> bool:
-        active, since = self._active_goal, self._commanded_from_ns
-        if active is None or commanded_until_ns < active.begins_ns:
-            return False
-        return commanded_until_ns >= since or rests_since_ns <= since
 
     def schedule_ended(self, why: str = "", *, final: bool = False) -> None:
         """End the schedule at the next state, because the robot's own controller has ended it.

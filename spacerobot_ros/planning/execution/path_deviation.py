@@ -135,21 +135,17 @@ class PathCheck:
         catch up, so it is excluded from the mean deviation.
         """
         k, predicted = self._next_pose, self._path.quaternion[self._next_pose]
-        lag = self._joint_lag_deviation(state)
+        behind = state.q - self._positions[round(self._path.time[k] / self._period)]
+        behind[np.abs(behind) <= self._deadband] = 0.0
+        moved_B = -self._robot.connection(state.q) @ behind
+        R_WB = matrix_from_quaternion(state.quaternion)
+        lag = np.concatenate([R_WB @ moved_B[:3], R_WB @ moved_B[3:]])
         turn = matrix_from_quaternion(predicted) @ attitude_error(predicted, state.quaternion)
         deviation = np.concatenate([state.position - self._path.position[k], turn]) - lag
         self._recent_deviations.append((k, deviation))
         self._masses.add(self._sensitivity[k], deviation)
         position, quaternion = self._displaced_pose(self._mean_deviation() + lag)
         return replace(state, position=position, quaternion=quaternion)
-
-    def _joint_lag_deviation(self, state: RobotState) -> Array:
-        """Return the base deviation (6,) in W due to the lag of the joints."""
-        lag = state.q - self._positions[round(self._path.time[self._next_pose] / self._period)]
-        lag[np.abs(lag) <= self._deadband] = 0.0
-        displacement_B = -self._robot.connection(state.q) @ lag
-        R_WB = matrix_from_quaternion(state.quaternion)
-        return np.concatenate([R_WB @ displacement_B[:3], R_WB @ displacement_B[3:]])
 
     @property
     def end(self) -> tuple[Array, Array]:

@@ -89,8 +89,8 @@ class TwistCommand:
         description = robot.description
         if link not in description.frames or link == description.base_link:
             raise PlanningError(f"Robot '{description.name}' has no end-effector '{link}'.")
-        frames: dict[str, TwistFrame]
-        frames = {world: "world", description.base_link: "base", link: "link"}
+        base = description.base_link
+        frames: dict[str, TwistFrame] = {world: "world", base: "base", link: "link"}
         # Frames of a robot may have a prefix.
         found = frames.get(frame) or frames.get(frame.rpartition("/")[2])
         if found is None:
@@ -101,11 +101,6 @@ class TwistCommand:
         if max(np.abs(linear).max(), np.abs(angular).max()) > _MAX_TWIST:
             raise PlanningError(f"The twist has a value beyond {_MAX_TWIST:g} m/s or rad/s.")
         return cls(link, np.asarray(linear, float), np.asarray(angular, float), found)
-
-    def in_base(self, R_WB: Array, R_BE: Array) -> tuple[Array, Array]:
-        """Return the velocity and the angular velocity of a twist, (3,) each, in the base frame."""
-        R = {"world": R_WB.T, "base": np.eye(3), "link": R_BE}[self.frame]
-        return R @ self.linear, R @ self.angular
 
 
 class TwistStep(NamedTuple):
@@ -362,7 +357,9 @@ class TwistFollower:
         """Return rates proportional to those of the twist, and why they are smaller."""
         limits = self._limits
         R_BE, _ = self._robot.link_pose(self.link, q)
-        v, omega = twist.in_base(matrix_from_quaternion(pose[3:]), R_BE)
+        R_BW = matrix_from_quaternion(pose[3:]).T
+        R = {"world": R_BW, "base": np.eye(3), "link": R_BE}[twist.frame]
+        v, omega = R @ twist.linear, R @ twist.angular
         motion = self._scales * np.append(self._displacements @ v, self._rotations @ omega)
         if np.linalg.norm(motion) <= _ROUNDING:
             return np.zeros(len(q)), ""

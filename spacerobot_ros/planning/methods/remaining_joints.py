@@ -92,7 +92,12 @@ class RemainingJointsGait(GaitMethod):
         except PlanningCancelled:
             raise
         except PlanningError as refusal:
-            raise refusal_of_all(f"{self._describe_stuck_joints()}; {refusal}", [refusal]) from None
+            stuck = " and ".join(
+                f"joint '{joint.name}' is stuck at {self._stuck[joint.name]:.4g} {joint.unit}"
+                for joint in self.robot.description.movable_joints
+                if joint.name in self._stuck
+            )
+            raise refusal_of_all(f"{stuck}; {refusal}", [refusal]) from None
 
     def _plan_without_stuck(self, request: PlanRequest, cancellation: Cancellation) -> GaitSchedule:
         moving, state, shape = ~self._is_stuck, request.state, request.goal.joint_positions
@@ -180,13 +185,6 @@ class RemainingJointsGait(GaitMethod):
                 f"the goal requires joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}.",
                 Proof.LIMITS,
             )
-
-    def _describe_stuck_joints(self) -> str:
-        return " and ".join(
-            f"joint '{joint.name}' is stuck at {self._stuck[joint.name]:.4g} {joint.unit}"
-            for joint in self.robot.description.movable_joints
-            if joint.name in self._stuck
-        )
 
 
 def _options_of_remaining(options: Any, gone: Set[str], names: Sequence[str]) -> Any:

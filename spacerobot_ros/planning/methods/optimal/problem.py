@@ -379,7 +379,7 @@ class PathConstraints:
     Attributes
     ----------
     base_rate_limit
-        Largest base rate, rad/s; 0: no limit.
+        Largest base rate, rad/s; infinite: no limit.
     axis_B, direction_W, cone_half_angle
         The direction ``axis_B`` (3,), fixed in the base, stays out of the cone with half angle
         ``cone_half_angle`` (rad) around ``direction_W`` (3,): an instrument that avoids the Sun.
@@ -389,7 +389,7 @@ class PathConstraints:
         Smooth bodies that replace the boxes in the program.
     """
 
-    base_rate_limit: float = 0.0
+    base_rate_limit: float = math.inf
     axis_B: Array | None = None
     direction_W: Array | None = None
     cone_half_angle: float = 0.0
@@ -424,7 +424,8 @@ class PathConstraints:
                 "optimal.keep_out has a box whose lower bound is not below its upper bound."
             )
         bodies = tuple(_SmoothBody.of(robot, *box) for box in corners)
-        return cls(options.max_base_rate, axis, direction, options.keep_angle, corners, bodies)
+        rate = options.max_base_rate or math.inf
+        return cls(rate, axis, direction, options.keep_angle, corners, bodies)
 
     def symbolic(self, q: ca.SX, quaternion: ca.SX, direction: ca.SX) -> ca.SX:
         """Return the inequality constraints (nonnegative if satisfied) at a shape and an attitude.
@@ -462,10 +463,9 @@ class PathConstraints:
                 raise UnusableCandidateError(
                     f"the axis comes within {angle:.4g} rad of keep_direction"
                 )
-        if self.base_rate_limit > 0:
-            rate = _largest_base_rate(quaternions, period)
-            if rate > self.base_rate_limit * (1 + 1e-6):
-                raise UnusableCandidateError(f"the base rotates at {rate:.4g} rad/s")
+        rate = _largest_base_rate(quaternions, period)
+        if rate > self.base_rate_limit * (1 + 1e-6):
+            raise UnusableCandidateError(f"the base rotates at {rate:.4g} rad/s")
 
     @property
     def imposed_base_rate(self) -> float:
@@ -473,17 +473,13 @@ class PathConstraints:
         return self.base_rate_limit * (1 - _CONSTRAINT_RESERVE)
 
     def excess_rate(self, quaternions: Array, period: float) -> float:
-        """Return the largest base rate at attitudes (N + 1, 4) over its bound; 0: no bound."""
-        if self.base_rate_limit == 0:
-            return 0.0
+        """Return the largest base rate at attitudes (N + 1, 4) over its bound."""
         return _largest_base_rate(quaternions, period) / self.base_rate_limit
 
     def slowed(self, guess: Trajectory) -> Trajectory:
         """Return a guess slowed to satisfy the base rate bound."""
-        if self.base_rate_limit == 0:
-            return guess
-        fastest = _largest_base_rate(guess.quaternions, guess.step)
-        return guess.stretched(max(1.0, fastest / self.imposed_base_rate))
+        factor = _largest_base_rate(guess.quaternions, guess.step) / self.imposed_base_rate
+        return guess if factor <= 1 else guess.stretched(factor)
 
 
 def _unit_direction(name: str, values: Sequence[float]) -> Array | None:

@@ -208,7 +208,21 @@ class Stages:
             p.append(ca.SX.sym("end_effectors", end_effectors.size1_in(2)))
             reached.append(end_effectors(X, s, p[-1]))
         ends = ConstraintBlock.of("end", ca.vertcat(X, s), ca.vertcat(*p), ca.vertcat(*reached))
-        interval = _cached_interval(robot, constraints, inequality, drifting=drifting)
+        direction = ca.SX.sym("direction", _DIRECTION_SIZE)
+        on_knots = constraints.symbolic(s, X, direction)
+        facts = [
+            source_hash(
+                *(__name__, momentum_derivatives.__module__),
+                *(solve_positive_definite.__module__, quaternion_multiply.__module__),
+            ),
+            robot.equations_key,
+            float(constraints.imposed_base_rate).hex(),
+            ca.Function("on_knots", [s, X, direction], [on_knots]).serialize(),
+            "" if inequality is None else inequality.serialize(),
+            f"drifting {drifting}",
+        ]
+        derive = partial(_interval_block, robot, constraints, inequality, drifting=drifting)
+        interval = ConstraintBlock.cached("interval", facts, derive)
         path = interval.rows - (2 * n + 4)
         turn = turn_function(robot, drifting=drifting)
         return cls(n, beginning_block(n), interval, ends, path, turn)
@@ -223,30 +237,6 @@ def beginning_block(joints: int) -> ConstraintBlock:
     h, s, v = ca.SX.sym("h"), ca.SX.sym("s", joints), ca.SX.sym("v", joints)
     start = ca.SX.sym("start", joints)
     return ConstraintBlock.of("beginning", ca.vertcat(h, s, v), start, s - h * v / 2 - start)
-
-
-def _cached_interval(
-    robot: SpaceRobot,
-    constraints: PathConstraints,
-    inequality: ca.Function | None,
-    *,
-    drifting: bool,
-) -> ConstraintBlock:
-    q, X, direction = ca.SX.sym("q", robot.n), ca.SX.sym("X", 4), ca.SX.sym("d", 3)
-    on_knots = constraints.symbolic(q, X, direction)
-    facts = [
-        source_hash(
-            *(__name__, momentum_derivatives.__module__),
-            *(solve_positive_definite.__module__, quaternion_multiply.__module__),
-        ),
-        robot.equations_key,
-        float(constraints.imposed_base_rate).hex(),
-        ca.Function("on_knots", [q, X, direction], [on_knots]).serialize(),
-        "" if inequality is None else inequality.serialize(),
-        f"drifting {drifting}",
-    ]
-    derive = partial(_interval_block, robot, constraints, inequality, drifting=drifting)
-    return ConstraintBlock.cached("interval", facts, derive)
 
 
 def _interval_block(
@@ -440,7 +430,7 @@ def _path_constraint_rows(
         z, np.cumsum([0, 1, 4, n, n, n, 4, n, n]).tolist()
     )
     rows = [ca.SX(0, 1), constraints.symbolic(s - h * v / 2, X, direction)]
-    if constraints.base_rate_limit > 0:
+    if math.isfinite(constraints.base_rate_limit):
         # Rates change linearly within an interval and are largest at its ends.
         fastest = h * constraints.imposed_base_rate
         first, second = rates
