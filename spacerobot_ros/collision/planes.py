@@ -3,8 +3,7 @@
 For two convex solids at given poses, a plane touches the first solid at its point nearest to the
 second solid, and moves with the first solid. The distance of the second solid's nearest point from
 this plane equals the distance between the solids (or minus the penetration depth) at these poses
-and, to first order, near them. This distance is cheap to compute. The planes are recomputed for
-every path that a solver finds.
+and, to first order, near them. The planes are recomputed for every path that a solver finds.
 
 Distances between links depend only on the configuration q. The distance of a link from an obstacle
 also depends on the rotation X of the base since the start: without external force, the system's

@@ -114,7 +114,12 @@ def analyze(
             f"Robot '{robot.description.name}' has no link '{link}' other than its base; its links "
             f"are {', '.join(names)}."
         )
-    given = None if shape is None else _check_shape(robot, shape)
+    given = None if shape is None else np.asarray(shape, dtype=float)
+    if given is not None and not (given.shape == (robot.n,) and np.all(np.isfinite(given))):
+        raise ParameterError(
+            f"The shape has {counted(given.size, 'number')}; robot '{robot.description.name}' "
+            f"needs a finite value for each joint: {', '.join(robot.joint_names)}."
+        )
     anywhere = best_sampled_brackets(robot)
     nominal, loops = None, NominalShapeChooser(robot, _LOOP_EDGE_LENGTH)
     if loops.triples and anywhere.controllable:
@@ -145,16 +150,6 @@ def analyze(
         CollisionGeometry(robot.description),
         link,
     )
-
-
-def _check_shape(robot: SpaceRobot, shape: Sequence[float]) -> Array:
-    values = np.asarray(shape, dtype=float)
-    if values.shape != (robot.n,) or not np.all(np.isfinite(values)):
-        raise ParameterError(
-            f"The shape has {counted(values.size, 'number')}; robot '{robot.description.name}' "
-            f"needs a finite value for each joint: {', '.join(robot.joint_names)}."
-        )
-    return values
 
 
 def _condition_numbers(robot: SpaceRobot) -> Array:

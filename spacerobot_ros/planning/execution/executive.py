@@ -57,11 +57,6 @@ class Executive:
     the methods of the current and the new schedule allow it, no braking is needed: the new plan
     takes over in motion at a later tick. This tick depends on parameters and on the request's
     stamp, not on the planning time.
-
-    Parameters
-    ----------
-    robot, config, worker
-        The model, the parameters of the planner, and the worker that makes the plans.
     """
 
     def __init__(self, robot: SpaceRobot, config: PlannerConfig, worker: PlanningWorker) -> None:

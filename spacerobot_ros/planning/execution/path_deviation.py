@@ -131,8 +131,7 @@ class PathCheck:
     def average_pose(self, state: RobotState) -> RobotState:
         """Add a state to the mean deviation; return the state with the averaged pose.
 
-        The part of the deviation due to joints lagging behind the schedule vanishes when the joints
-        catch up, so it is excluded from the mean deviation.
+        The deviation by joints that lag behind vanishes as they catch up, so it is not in the mean.
         """
         k, predicted = self._next_pose, self._path.quaternion[self._next_pose]
         behind = state.q - self._positions[round(self._path.time[k] / self._period)]
@@ -272,8 +271,7 @@ class PathSensitivity:
         ticks = (path.time / schedule.control_period).round().astype(int)
         shapes = schedule.positions[ticks]
         R_WB = np.array([matrix_from_quaternion(each) for each in path.quaternion])
-        # The model changes little from shape to shape: it is evaluated for some of them, and
-        # interpolated in between.
+        # The model changes little between shapes: it is evaluated for some, and interpolated.
         instants: Array = np.arange(knots, dtype=float)
         called = np.unique(np.linspace(0, knots - 1, _MAX_EVALUATED_SHAPES).round().astype(int))
         turns, centers = self._derivatives(shapes[called])
@@ -289,16 +287,11 @@ class PathSensitivity:
 
 
 class MassEstimate:
-    """Estimate of relative mass and inertia errors (P,) from base path deviations.
+    """Estimate of P = ``count`` relative mass and inertia errors from base path deviations.
 
     The first pose of each path has a measurement error. So each path has an unknown constant
     offset, which is eliminated from the normal equations. Deviations that only implausible errors
     would explain (of a failing sensor) are ignored: the estimate is zero, the path is discarded.
-
-    Parameters
-    ----------
-    count
-        Number of parameters P.
     """
 
     def __init__(self, count: int) -> None:

@@ -107,8 +107,7 @@ class StateAverage:
         rates, q = measured_rates.mean(axis=0), shapes.mean(axis=0)
         if not (np.all(np.isfinite(poses)) and np.all(np.isfinite(np.concatenate([q, rates])))):
             raise PlanningError("The measured state is not finite; see odom and joint_states.")
-        # Attitudes differ by noise, so the mean of small rotations from the first attitude is exact
-        # enough.
+        # Attitudes differ by noise: the mean of small rotations from the first is exact enough.
         first = poses[0, 3:]
         quaternion = first
         if len(poses) > 1:

@@ -76,8 +76,7 @@ class PlanningTask:
     rates_after_braking
         (n,) velocities held after braking, m/s or rad/s, for reaction wheels; None: zero.
     take_over
-        Tick at which the plan takes over from the schedule that is tracked before it; None: the
-        plan begins at rest, or with braking. The request's state is the current state.
+        Tick at which the plan takes over in motion; None: the plan begins at rest, or with braking.
     """
 
     request: PlanRequest
@@ -112,7 +111,7 @@ class PlanningWorker:
     interpreter lock for most of the time. A drifting robot keeps moving during planning, so its
     plans begin with a rest period; if planning takes longer, the rest period of the next plan is
     extended. The thread uses the robot's functions, whose buffers are shared: while the worker is
-    :attr:`busy`, nothing else may use them.
+    :attr:`is_busy`, nothing else may use them.
 
     Parameters
     ----------
@@ -208,8 +207,7 @@ class PlanningWorker:
             self._job.start(in_background=self.plans_in_background)
 
     def poll(self, stamp_ns: int) -> Planned | Refused | None:
-        """Return the planning result when the state with this stamp is processed; None until
-        planning has ended, or if it was cancelled.
+        """Return the result for the state with this stamp; None before the end, or if cancelled.
 
         Unexpected method errors are raised here.
         """

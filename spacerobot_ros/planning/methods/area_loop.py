@@ -3,11 +3,9 @@
 Small loops around a nominal shape rotate the base by ``dTheta = M S``: M (3, 3) is the curvature of
 the connection for the joint pairs (1, 2), (2, 3), (3, 1), and S contains the areas enclosed by the
 loop in their planes. Each cycle corrects the fraction k of the remaining rotation, ``S = k M^-1
-dTheta``; the first-order error is corrected in the next cycle, which begins from the measured
-attitude.
+dTheta``; the next cycle, from the measured attitude, corrects the first-order error.
 
-All edges are straight lines in shape space, from rest to rest: the base rotation depends only on
-the path, and held commands follow it.
+Edges are straight lines in shape space, from rest to rest: held commands follow them exactly.
 
 Loops run along joint coordinate axes and enclose given areas (figure 5) in the planes of joints (1,
 2), (2, 3) and (3, 1); an area is positive if the path is counter-clockwise. Six edges of a box
@@ -444,8 +442,7 @@ def edge_path(areas: Array, longest: Array) -> EdgePath:
 def _cube_path(areas: Array, longest: Array) -> EdgePath:
     """Return the path with edges +d1, +d2, +d3, -d1, -d2, -d3 around areas (3,), none of them zero.
 
-    The projected areas are (d1 d2, d2 d3, -d1 d3), with the product -(d1 d2 d3)^2; backwards these
-    change sign.
+    The projected areas are (d1 d2, d2 d3, -d1 d3), of product -(d1 d2 d3)^2; negative backwards.
     """
     S12, S23, S31 = areas
     backwards = bool(S12 * S23 * S31 > 0)

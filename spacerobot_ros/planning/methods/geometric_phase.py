@@ -4,8 +4,7 @@ All joints of a planar robot rotate about parallel axes, and nothing tilts its b
 a single angle theta about the robot axis. At zero angular momentum, ``theta_dot = -s(psi)'
 psi_dot`` (eq. 3), where ``s_i = N_i / D`` is the component of the mechanical connection about the
 axis, ``D`` the inertia of the locked robot about the axis, and ``N_i`` the coupling to joint i. The
-rotation along a shape path is the line integral of ``-s`` (eq. 11): it depends on the path, not on
-the speed.
+rotation along a shape path is the line integral of ``-s`` (eq. 11), at any speed.
 
 Small loops rotate the base most where the curvature is largest (remark 2). Boxes (2, 2) contain the
 lower, then the upper bounds of two joints, rad.

@@ -5,8 +5,7 @@ the masses to this shape (eq. 10). Step 3 rotates the base by n equal cycles wit
 whose brackets sum to the remaining rotation.
 
 The plant holds each command for one tick. The sliders therefore trace polygons inside the smooth
-curves. The polygon area is smaller by a factor ``sin(x)/x``, where ``x`` is the phase per tick; the
-amplitudes compensate for this.
+curves. Amplitudes compensate for the smaller area, by a factor ``sin(x)/x``, x the phase per tick.
 """
 
 from __future__ import annotations
@@ -163,8 +162,7 @@ class LieBracketGait(GaitMethod):
         from scipy.optimize import lsq_linear  # scipy is slow to import, and few goals need it.
 
         z0, lower, upper = (x[self.sliders] for x in (q, self.robot.lower, self.robot.upper))
-        # The solver needs different bounds, so the range of a slider at its end is widened
-        # slightly.
+        # The solver needs different bounds: a slider's range at its end is widened slightly.
         room = 1e-12 * (1.0 + np.abs(upper - lower))
         bounded = lsq_linear(P, shift, (lower - z0 - room, upper - z0 + room), method="bvls")
         gap = float(np.linalg.norm(P @ bounded.x - shift))

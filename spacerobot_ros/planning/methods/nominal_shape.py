@@ -196,8 +196,7 @@ class NominalShapeChooser:
     def best(self, held: Array) -> NominalShape:
         """Return the best nominal shape over all triples; other joints are as in ``held`` (n,).
 
-        Boxes with the longest edges around it fit within the limits. If links have room at any
-        shape, they have room at this one.
+        Boxes with the longest edges fit within the limits. Links have room there, if at any shape.
         """
         triples = self._best_triples()
         points = _GRID_POINTS.get(len(triples), 5)

@@ -729,9 +729,7 @@ class ResolvedRateGait(GaitMethod):
             )
 
     def _find_obstacle(self, lines: _LinkPaths, path: JointPath) -> tuple[int, str] | None:
-        """Return the last point of a path before joint limits are exceeded, or before a singularity
-        is near, with the reason; None if the path is free.
-        """
+        """Return the last point before a joint limit or a singularity, and which; None if free."""
         beyond = lines.beyond_limits(path.shapes[-1])
         slow = np.flatnonzero(path.progress_rate < MIN_PROGRESS_RATE)
         if not len(slow) and beyond.max() > _LIMIT_ROUNDING:

@@ -280,8 +280,7 @@ class EndEffectorRows:
         return shapes, quaternions_from_rotvecs(vectors)
 
     def _directions(self, link: str, attitude: bool) -> LinkDirections:
-        # Rates in B_0 relative to the centre of mass: by the joints at zero momentum, and by base
-        # rotations about the axes.
+        # Rates in B_0 relative to C, by the joints at zero momentum and by base rotations.
         velocities, turns = [], []
         for q, X in zip(*self._samples(), strict=True):
             R_X = matrix_from_quaternion(X)
@@ -485,11 +484,11 @@ class EndEffectorSpecification:
 
         UnreachableError if there is none.
         """
-        X = turn
-        if not self.attitude:
+        if self.attitude:
+            X = turn
+        elif not len(self.rows.axes):
             X = self.rows.turns_along_direct_path(kinematics.start, shape[np.newaxis])[0]
-        most = max(tolerance, _GIVEN_SHAPE_ERROR)
-        if not self.attitude and len(self.rows.axes):
+        else:
             # Joint loops rotate the base about the axes; the shape is given.
             candidates = quaternions_from_rotvecs(
                 np.vstack([np.zeros((1, 3)), *(np.pi * k / 2 * self.rows.axes for k in (1, 2, 3))])
@@ -500,7 +499,7 @@ class EndEffectorSpecification:
             _, turns, miss = given.solve(shapes, candidates, exact=True)
             X = turns[np.argmin(miss)]
         values, _, _ = self.rows.evaluate(X[np.newaxis], shape[np.newaxis], kinematics.parameters)
-        if np.abs(values).max(initial=0.0) > most:
+        if np.abs(values).max(initial=0.0) > max(tolerance, _GIVEN_SHAPE_ERROR):
             raise UnreachableError(
                 f"With the goal's joint positions, no base attitude puts the end-effectors closer "
                 f"than {np.linalg.norm(values):.3g} m or rad to their goals: "

@@ -15,7 +15,6 @@ import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -29,28 +28,17 @@ _PLANNED_EFFORT_SHARE = 0.98
 
 
 class LimitedEfforts(JointEfforts):
-    """Efforts of one robot, with limits that manoeuvres must satisfy.
-
-    Parameters are as in :class:`JointEfforts`.
-
-    Raises
-    ------
-    ParameterError
-        A joint effort limit is not positive.
-    """
-
-    def __init__(self, robot: SpaceRobot, limit: Array) -> None:
-        for name, value in zip(robot.joint_names, limit, strict=True):
-            if not value > 0:
-                raise ParameterError(
-                    f"Joint '{name}' is limited to an effort of {value:g}, which cannot move it; "
-                    "with optimal.effort_limits 2, efforts are not limited."
-                )
-        super().__init__(robot, limit)
+    """Efforts of one robot, with limits that manoeuvres must satisfy."""
 
     @classmethod
     def of(cls, robot: SpaceRobot, options: OptimalOptions) -> LimitedEfforts | None:
-        """Return the efforts that the options limit; None if there are none."""
+        """Return the efforts that the options limit; None if there are none.
+
+        Raises
+        ------
+        ParameterError
+            A joint effort limit is not positive.
+        """
         if options.effort_limits == 2:
             return None
         limit = robot.effort_limit.copy()
@@ -61,6 +49,12 @@ class LimitedEfforts(JointEfforts):
         limit = np.minimum(limit, most)
         if options.effort_limits == 1:
             limit *= 1 - options.effort_reserve
+        for name, value in zip(robot.joint_names, limit, strict=True):
+            if not value > 0:
+                raise ParameterError(
+                    f"Joint '{name}' is limited to an effort of {value:g}, which cannot move it; "
+                    "with optimal.effort_limits 2, efforts are not limited."
+                )
         return cls(robot, limit) if np.any(np.isfinite(limit)) else None
 
     def slowed(self, trajectory: Trajectory, boundary: BoundaryConditions) -> Trajectory:

@@ -17,8 +17,7 @@ and the smallest principal moments of all bodies bound ``H`` from below. Energy 
 bound: the energy of the base motion is not available outboard of the joint,
 ``omega . (H + I_base) omega <= M_ii``. The smaller bound applies.
 
-:class:`DurationBound` follows from both bounds, and from the largest joint travel in a given time.
-No shape is sampled.
+:class:`DurationBound` follows from both, and from the largest joint travel; no shape is sampled.
 """
 
 from __future__ import annotations

@@ -302,8 +302,7 @@ class MotionLimits:
 class Trajectory:
     """N steps of ``step`` seconds with constant accelerations.
 
-    ``shapes`` and ``velocities`` (N + 1, n) at the knots between the steps, and the attitude
-    ``quaternions`` (N + 1, 4) relative to the initial attitude.
+    ``shapes``, ``velocities`` (N + 1, n) at the knots; ``quaternions`` (N + 1, 4) since the start.
     """
 
     step: float

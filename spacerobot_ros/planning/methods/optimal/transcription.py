@@ -4,21 +4,18 @@ Each knot k = 0..N contains an attitude X, a joint velocity v and a vertex s. Th
 interval k is its constant joint acceleration a. All intervals take the same time h, which is free.
 In each interval, the shape runs from ``q_k = s_k - h v_k / 2`` to ``q_{k+1}`` along a parabola
 whose tangents at both ends meet in the vertex ``s_k``. As the parabola lies in the triangle of
-these three points, simple bounds on s also enforce the joint limits between the knots. The dynamics
-are
+these points, simple bounds on s also enforce the joint limits between the knots. The dynamics are
 
 ``v+ = v + h a``, ``s+ = s + h v+``, ``X+ = X exp(Omega(s, h v, h v+))``.
 
 Omega is the fourth-order Magnus expansion of the rates at two Gauss points of the interval; at zero
 momentum, ``D(q) w + D_q(q) u = 0`` (paper 1, eq. 3). So the attitude follows from the shape path at
-any speed, and the base position needs no state: the centre of mass is at rest, and the final shape
-and attitude determine the position.
+any speed, and the base position needs no state: the final shape and attitude determine it.
 
 If a robot drifts, its angular momentum L about the centre of mass is constant in the world, so
 ``D(q) w + D_q(q) u = h X' L_0``, with L_0 in the initial base frame. X at a Gauss point is the
 weighted mean of the quaternions at both knots, normalised, so the attitude is only second-order
-accurate. These functions differ from those for zero momentum, and are derived only if a robot
-drifts.
+accurate. These functions are derived only if a robot drifts.
 
 All stages share their functions, whose derivatives are inserted into sparse matrices.
 
