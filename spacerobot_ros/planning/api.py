@@ -70,8 +70,7 @@ def plan(
         Positions (K, 3) in m, or positions and quaternions (K, 7), through which one end-effector
         moves along straight lines; the last position or pose is the goal.
     start
-        The start: a state, or the shape (n,) with the base at the origin of W; None: all joints at
-        zero, or as close to zero as the joint limits allow.
+        The start: a state, or a shape (n,) at the origin of W; None: joints as near 0 as allowed.
     linear_momentum, angular_momentum
         (3,) each in W, kg m/s and kg m^2/s; angular momentum is about the centre of mass; None: the
         momenta of the start state. Only ``optimal`` plans for drifting robots.

@@ -21,16 +21,20 @@ class PlanningCancelled(PlanningError):  # noqa: N818 - a request, not a failure
 class Cancellation:
     """A request to stop planning, made in one thread and polled in another."""
 
-    requested = False
-    """Whether planning was cancelled."""
+    _requested = False
+
+    @property
+    def requested(self) -> bool:
+        """Whether planning was cancelled."""
+        return self._requested
 
     def cancel(self) -> None:
         """Request that planning stops."""
-        self.requested = True
+        self._requested = True
 
     def raise_if_requested(self) -> None:
         """Raise :class:`PlanningCancelled` if planning was cancelled."""
-        if self.requested:
+        if self._requested:
             raise PlanningCancelled("Planning was cancelled.")
 
 

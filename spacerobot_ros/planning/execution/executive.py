@@ -594,7 +594,8 @@ class Executive:
             self._change_phase(Event.PLAN_REQUESTED, Phase.PLANNING)
             self._handle_refusal(PlanJob(waiting, reason), refusal)
         else:
-            waiting = waiting.kept_at(state.position, state.quaternion)
+            goal = waiting.goal.kept_at(state.position, state.quaternion)
+            waiting = replace(waiting, goal=goal)
             self._request_plan(PlanJob(waiting, reason, take_over=take_over), state)
 
     def _request_plan(self, job: PlanJob, state: RobotState, aim: Goal | None = None) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.files import UntrustedFileError, read_private, write_whole
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.core.goal import NO_TOLERANCE, POSE, EndEffectorGoal, Goal, Tolerance
 
 BASE_GOAL_KEY = "base"
@@ -34,8 +33,7 @@ class IdentifiedGoal:
         Whether a restarted commander resumes the goal. Action goals are not resumed: their clients
         are notified when the commander stops.
     required
-        Tolerances given by the sender; 0: none. A goal with a tolerance for a component
-        that the method or law does not control is rejected.
+        Tolerances given by the sender, for components that must be controlled; 0: none.
     """
 
     goal: Goal
@@ -43,10 +41,6 @@ class IdentifiedGoal:
     tolerance: Tolerance | None = None
     resumes: bool = True
     required: Tolerance = NO_TOLERANCE
-
-    def kept_at(self, position: Array, quaternion: Array) -> IdentifiedGoal:
-        """Return a copy with the goal from :meth:`Goal.kept_at`."""
-        return replace(self, goal=self.goal.kept_at(position, quaternion))
 
 
 @dataclass(frozen=True)

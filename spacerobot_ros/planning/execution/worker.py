@@ -159,8 +159,7 @@ class PlanningWorker:
         self._time = 0.0
         """Wall time of the work on the requested plan so far, s."""
         self._coasting: tuple[PlanningTask, int, float] | None = None
-        """The requested task, if it begins with a rest because the base drifts during planning, the
-        stamp of its state, ns, and the duration of the rest, s."""
+        """A task that begins with a rest while the base drifts, its stamp, ns, and the rest, s."""
 
     @property
     def is_busy(self) -> bool:

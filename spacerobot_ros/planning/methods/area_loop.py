@@ -407,8 +407,7 @@ class EdgePath:
     Attributes
     ----------
     loops
-        Each polygon (V, 3): vertices in order of travel, with the first vertex repeated at the end;
-        the bounding box of the polygons is centred at the origin.
+        Each polygon (V, 3): vertices in order, the first also last, in a box around the origin.
     edge_ratio
         Largest ratio of an edge to the longest allowed edge.
     """

@@ -8,6 +8,7 @@ that the curvature of the connection is not zero everywhere (paper 1, section 4)
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +87,10 @@ class GoalSpecification:
         """Return a robot's goal specification according to the options."""
         position = options.base_position == 1
         if options.base_position == 0:
-            position = _slides_anywhere(robot)
+            # Sliders move the base anywhere if their slots span three directions.
+            with suppress(PlanningError):
+                independent_slots(robot)
+                position = True
         attitude, same_shape = bool(options.base_attitude), bool(options.final_shape)
         return cls(robot, position, attitude, same_shape, BaseRotations.of(robot))
 
@@ -334,15 +338,6 @@ class BaseRotations:
         return cls(np.eye(3) if loops else none, turns_base=True, loops_turn_base=loops)
 
 
-def _slides_anywhere(robot: SpaceRobot) -> bool:
-    """Whether the slots of sliders span three directions, so that the base moves anywhere."""
-    try:
-        independent_slots(robot)
-    except PlanningError:
-        return False
-    return True
-
-
 def _center_rate(robot: SpaceRobot, q: Array) -> Array:
     """Return ``dc/dq`` (3, n) of the centre of mass in the base frame: ``-A_v + c x A_omega``."""
     A = robot.connection(q)
@@ -383,9 +378,23 @@ def _shape_for_center(
     found = nearest_shape_for_center(robot, limits, best, wanted)
     if found is not None:
         return found
-    if _distance_to_center(robot, best, wanted) <= enough:
+    if miss <= enough:
         return best
-    raise _unreachable_center_error(robot, limits, best, wanted)
+    name = robot.description.name
+    gap = CenterReach.of(robot, lower, upper).distance_outside(wanted)
+    if gap <= _POSITION_TOLERANCE:
+        raise NotFoundError(
+            f"No shape of '{name}' that puts the base at the goal position was found from "
+            f"{_MAX_SHAPE_GUESSES} starts: without thrust, the centre of mass stays where it is, "
+            f"and the nearest shape that was found puts the base {miss:.3g} m from it. A closer "
+            "position, another attitude, or optimal.base_position 2, which ignores the position, "
+            "may help."
+        )
+    raise UnreachableError(
+        "The goal position is out of reach: without thrust the centre of mass stays where it is, "
+        f"and the joints of '{name}' bring the base no closer to it than {gap:.3g} m.",
+        Proof.LIMITS,
+    )
 
 
 def nearest_shape_for_center(
@@ -401,29 +410,4 @@ def nearest_shape_for_center(
     if np.maximum(limits.lower - q, q - limits.upper).max() > _JOINT_LIMIT_ROUNDING:
         q = near
     q = np.clip(q, limits.lower, limits.upper)
-    return q if _distance_to_center(robot, q, wanted) <= _POSITION_TOLERANCE else None
-
-
-def _distance_to_center(robot: SpaceRobot, q: Array, wanted: Array) -> float:
-    return float(np.linalg.norm(robot.center_of_mass(q) - wanted))
-
-
-def _unreachable_center_error(
-    robot: SpaceRobot, limits: MotionLimits, near: Array, wanted: Array
-) -> UnreachableError | NotFoundError:
-    """Return the reason why no shape puts the base at ``wanted``; ``near`` (n,) came closest."""
-    name, distance = robot.description.name, _distance_to_center(robot, near, wanted)
-    gap = CenterReach.of(robot, limits.lower, limits.upper).distance_outside(wanted)
-    if gap <= _POSITION_TOLERANCE:
-        return NotFoundError(
-            f"No shape of '{name}' that puts the base at the goal position was found from "
-            f"{_MAX_SHAPE_GUESSES} starts: without thrust, the centre of mass stays where it is, "
-            f"and the nearest shape that was found puts the base "
-            f"{distance:.3g} m from it. A closer position, another attitude, or "
-            "optimal.base_position 2, which ignores the position, may help."
-        )
-    return UnreachableError(
-        "The goal position is out of reach: without thrust the centre of mass stays where it is, "
-        f"and the joints of '{name}' bring the base no closer to it than {gap:.3g} m.",
-        Proof.LIMITS,
-    )
+    return q if np.linalg.norm(robot.center_of_mass(q) - wanted) <= _POSITION_TOLERANCE else None

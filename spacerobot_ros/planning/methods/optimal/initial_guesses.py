@@ -347,8 +347,7 @@ def rates_between(quaternions: Array, step: float) -> Array:
 
 
 def _loop(rng: np.random.Generator, s: Array, n: int) -> Array:
-    """Return a closed path (N + 1, n) of about unit size at instants (N + 1,) in [0, 1]: random
-    harmonics under an envelope that is zero at both ends."""
+    """Return a closed random path (N + 1, n) of about unit size at instants (N + 1,) in [0, 1]."""
     rounds = rng.integers(1, 4)
     path = np.zeros((len(s), n))
     for harmonic in range(rounds, rounds + 3):

@@ -278,8 +278,7 @@ def _interval_block(
 
 @dataclass(frozen=True)
 class AttitudeRows:
-    """Rows (4,) of an interval that vanish if its attitudes follow from the rotations at the Gauss
-    points, with their derivatives with respect to its variables.
+    """Rows (4,) that vanish if attitudes follow from rotations at Gauss points, and derivatives.
 
     Attributes
     ----------
@@ -406,9 +405,7 @@ def _curved_where_it_counts(rows: PlaneDistances) -> ca.Function:
 def _point_derivative_columns(
     A: ca.MX, along: ca.MX, weights: tuple[ca.MX, ca.MX], tau: float, n: int
 ) -> ca.MX:
-    """Return ``A P``, where P is the derivative of a point of an interval and of the rotation there
-    with respect to ``[h; X; s; v; X+; v+]``.
-    """
+    """Return ``A P``, P the derivatives of a point and its rotation by ``[h; X; s; v; X+; v+]``."""
     q, X, by_step = A[:, :n], A[:, n:], A[:, :n] @ along
     b, c = weights
     return ca.horzcat(by_step, (1 - tau) * X, q, b * q, tau * X, c * q)
