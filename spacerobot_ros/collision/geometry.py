@@ -34,7 +34,6 @@ from spacerobot_ros.model.visuals import Visual, solid_mesh
 _SHAPES, _SEED = 1000, 0
 """Number and seed of the random configurations used to find pairs that are always in contact."""
 
-
 _COAXIAL_TOLERANCE = 1e-9
 """Largest offset (m) and tilt (rad) of a body of revolution from its joint axis."""
 

@@ -42,8 +42,7 @@ class PlaneDistances:
     Attributes
     ----------
     values
-        ``(y, w) -> d`` (P,), m, of ``y = [q; X]`` (n + 4) with a quaternion X of any norm; only the
-        distance from an obstacle depends on X.
+        ``(y, w) -> d`` (P,), m, of ``y = [q; X]`` (n + 4), X of any norm and for obstacles only.
     jacobian
         ``(y, w) -> d, J``, with ``J = dd/dy`` (P, n + 4).
     hessian

@@ -41,7 +41,6 @@ class Cancellation:
 NEVER = Cancellation()
 """A cancellation that is never requested, for plans that run to completion."""
 
-
 _Plan = TypeVar("_Plan")
 
 

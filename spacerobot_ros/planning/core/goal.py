@@ -31,7 +31,6 @@ Controlled = Literal["position", "attitude", "shape", "end_effectors"]
 POSE: frozenset[Controlled] = frozenset({"position", "attitude"})
 """The goal components that form the base pose."""
 
-
 POSITION_SLACK = 0.5
 """Fraction of the position tolerance by which a plan may miss an unreachable position."""
 

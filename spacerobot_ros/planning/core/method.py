@@ -230,8 +230,7 @@ class GaitMethod(ABC):
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
         ``velocity`` and ``end_velocities`` (n,) are held before and after the motion. A note
-        reports efforts beyond the URDF limits; ``L_B`` (N + 1, 3) is the angular momentum in the
-        base frame for this check (:class:`JointEfforts`).
+        reports efforts beyond the URDF limits, at the angular momentum ``L_B`` (N + 1, 3) in B.
 
         Raises
         ------

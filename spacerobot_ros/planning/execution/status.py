@@ -35,7 +35,6 @@ from spacerobot_ros.times import SECOND
 _LATE_TIME_SHARE = 1 / 3
 """Fraction of a motion's duration that remains when its late phase begins."""
 
-
 _LEVELS = {
     "stalled": 1,
     "estimating": 1,
@@ -228,7 +227,6 @@ _FORMAT = KeyValueFormat(
     KeyValueField("duration_s", _NUMBER, present_with="method"),
     KeyValueField("notes", _NOTE, prefix="", present_with="method"),
 )
-
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 

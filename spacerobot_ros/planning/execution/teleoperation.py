@@ -51,7 +51,6 @@ _MAX_TWIST = 1e6
 _MIDPOINT_STEPS = 2
 _ROUNDING = 1e-12
 
-
 TwistFrame = Literal["world", "base", "link"]
 """Frame in which the components of a twist are given."""
 

@@ -91,12 +91,11 @@ class LieBracketGait(GaitMethod):
 
     @override
     def setup(self) -> None:
-        robot = self.robot
         # A cycle is a whole number of ticks, so all cycles have the same commands and rotation.
         self.ticks_a_cycle = max(
             round(self.options.cycle_period / self.control_period), _MIN_CYCLE_TICKS
         )
-        self.sliders = sliders_of(robot)
+        self.sliders = sliders_of(self.robot)
 
     @classmethod
     @override

@@ -387,7 +387,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
     the largest sum is the largest speed everywhere.
     """
     from scipy.optimize import linprog
-    from scipy.sparse import csr_array, vstack
+    from scipy.sparse import csr_matrix, vstack
 
     K, n = len(slopes) - 1, slopes.shape[1]
     with np.errstate(divide="ignore"):
@@ -405,7 +405,7 @@ def _fastest_speeds(slopes: Array, bends: Array, limits: MotionLimits, interval:
         values.append(np.stack([(1 - end) * bend - slope, slope + end * bend], axis=-1))
     columns = np.tile(np.repeat(np.arange(K)[:, np.newaxis] + [0, 1], n, axis=0), (2, 1))
     entries = np.ravel(values), columns.ravel(), 2 * np.arange(len(columns) + 1)
-    A = csr_array(entries, shape=(len(columns), K + 1))
+    A = csr_matrix(entries, shape=(len(columns), K + 1))
     found = linprog(
         -np.ones(K + 1),
         A_ub=vstack([A, -A]).tocsr(),
