@@ -244,7 +244,7 @@ class _Search:
         self._lower, self._upper = np.append(lower, -m), np.append(upper, m)
 
     def intervals(self, shapes: Array) -> tuple[list[Interval], int]:
-        """Return the intervals of curves from configurations (K, n), and the number of curves."""
+        """Return the distance intervals of singular shapes found from (K, n), and their number."""
         z = self._project_to_singular_shapes(self._equations.starts(shapes), _NEWTON_STEPS)
         g, _, _, _ = self._equations.evaluate(z)
         z = z[np.linalg.norm(g, axis=1) < _ZERO_RESIDUAL]

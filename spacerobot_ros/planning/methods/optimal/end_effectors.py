@@ -388,7 +388,7 @@ class EndEffectorSpecification:
 
     @classmethod
     def of(cls, base: GoalSpecification, goal: Goal) -> EndEffectorSpecification:
-        """Return the specification for goals with the components of this goal for links."""
+        """Return the specification for goals like this one, whose links are resolved."""
         robot = base.robot
         links = [(each.link, each.quaternion is not None) for each in goal.end_effectors]
         if "position" in goal.base:

@@ -338,7 +338,7 @@ def attitudes_along(turn: ca.Function, q: Array, u: Array, u_next: Array) -> Arr
 
 
 def rates_between(quaternions: Array, step: float) -> Array:
-    """Return the base rates (N + 1, 3), in B, at attitudes (N + 1, 4) ``step`` seconds apart."""
+    """Return angular velocities (N + 1, 3) in B at attitudes (N + 1, 4) ``step`` seconds apart."""
     turns = rotvecs_from_quaternions(
         quaternion_multiply(quaternion_inverse(quaternions[:-1]), quaternions[1:])
     )

@@ -197,7 +197,7 @@ class BoundaryConditions:
         return self.drifts or bool(np.any(self.velocity) or np.any(self.final_velocity))
 
     def momenta_in_base(self, quaternions: Array) -> Array | None:
-        """Return the momentum (..., 3) in B at rotations (..., 4) since the start; None: zero."""
+        """Return the angular momentum (..., 3) in B at rotations (..., 4); None: it is zero."""
         if not self.drifts:
             return None
         # R_0B' multiplied from the left.
@@ -325,7 +325,7 @@ class Trajectory:
         return np.asarray(q + self.step * (v0 * tau + (v1 - v0) * tau**2 / 2))
 
     def within_intervals(self, instants: int) -> tuple[Array, Array]:
-        """Return shapes (N K, n) and attitudes (N K, 4) at K instants in each step, and its end."""
+        """Return shapes (N K, n), attitudes (N K, 4) at K instants a step, the last at its end."""
         X, tau = self.quaternions[:, np.newaxis], np.arange(1, instants + 1)[:, np.newaxis]
         attitudes = (1 - tau / instants) * X[:-1] + tau / instants * X[1:]
         attitudes /= np.linalg.norm(attitudes, axis=2, keepdims=True)
