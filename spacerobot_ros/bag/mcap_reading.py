@@ -409,71 +409,11 @@ _MESSAGE_HEADS = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-_LATEST_TIME_NS = 2**63 - 1
+LATEST_TIME_NS = 2**63 - 1
 """Latest time that int64 nanoseconds can represent: the year 2262."""
 
 _MOST_CHANNELS = 65_536
 _NOT_WANTED = -1
-
-
-class _Wanted:
-    """The messages to read from a file: topics, numbered by their list positions, and times."""
-
-    def __init__(
-        self,
-        file: BagFile,
-        topics: Sequence[str],
-        start_ns: int,
-        end_ns: int,
-    ) -> None:
-        places = {topic: number for number, topic in enumerate(topics)}
-        self.numbers = np.full(_MOST_CHANNELS, _NOT_WANTED, np.intp)
-        for channel in file.summary.channels.values():
-            if channel.topic in places:
-                self.numbers[channel.id] = places[channel.topic]
-        self.start_ns, self.end_ns = min(start_ns, _LATEST_TIME_NS), min(end_ns, _LATEST_TIME_NS)
-
-    def may_be_in(self, index: ChunkIndex) -> bool:
-        """Whether a chunk may contain requested messages."""
-        channels = list(index.message_index_offsets)
-        return (
-            index.message_start_time <= self.end_ns
-            and index.message_end_time >= self.start_ns
-            and (not channels or bool((self.numbers[channels] >= 0).any()))
-        )
-
-
-def _blocks_of_records(opened: BinaryIO, wanted: _Wanted) -> Iterator[MessageBlock]:
-    chunks = ChunkUnpacker(file_size(opened))
-    for place, opcode, record in records(opened, MAGIC_SIZE):
-        if opcode == Opcode.CHUNK:
-            chunk = cast("Chunk", parse_record(record))
-            yield _messages_in(chunks.unpack(chunk, place), place, wanted)
-        elif opcode == Opcode.MESSAGE:
-            yield _messages_in(record, place, wanted)
-        elif opcode == Opcode.DATA_END:
-            return
-
-
-def _messages_in(data: bytes, place: int, wanted: _Wanted) -> MessageBlock:
-    """Return the requested messages in the chunk at ``place``, in record order."""
-    found = [a for a, _ in records_in_chunk(data, place) if data[a] == Opcode.MESSAGE]
-    begins, size = np.array(found, np.int64), _MESSAGE_HEADS.itemsize
-    within = begins[:, np.newaxis] + np.arange(size)
-    heads = np.frombuffer(data, np.uint8).take(within, mode="clip").view(_MESSAGE_HEADS)[:, 0]
-    if (heads["length"] < size - _RECORD_HEAD.size).any():
-        raise ValueError(f"a message of the chunk at byte {place} is shorter than its header")
-    numbers = wanted.numbers[heads["channel"]]
-    rows = np.flatnonzero(
-        (numbers >= 0)
-        & (heads["log_time"] >= wanted.start_ns)
-        & (heads["log_time"] <= wanted.end_ns)
-    )
-    heads, begins = heads[rows], begins[rows]
-    ends = begins + _RECORD_HEAD.size + heads["length"].astype(np.int64)
-    spans = zip((begins + size).tolist(), ends.tolist(), strict=True)
-    messages = [data[a:b] for a, b in spans]
-    return numbers[rows], heads["log_time"], messages
 
 
 class _Section(NamedTuple):
@@ -490,7 +430,7 @@ def blocks_in_time_order(
     files: Sequence[BagFile],
     topics: Sequence[str],
     start_ns: int = 0,
-    end_ns: int = _LATEST_TIME_NS,
+    end_ns: int = LATEST_TIME_NS,
 ) -> Iterator[MessageBlock]:
     """Iterate over the messages in a bag in log time order, and in write order for equal log times.
 
@@ -498,39 +438,32 @@ def blocks_in_time_order(
     contains the messages of chunks that overlap in time; only these chunks are in memory together.
     Errors: see :meth:`BagFile.open`.
     """
-    wanted = [_Wanted(file, topics, start_ns, end_ns) for file in files]
-    sections = [
-        _Section(
-            index.message_start_time, (n, index.chunk_start_offset), index.message_end_time, index
-        )
-        for n, file in enumerate(files)
-        for index in file.summary.chunk_indexes
-        if wanted[n].may_be_in(index)
-    ]
-    sections += [
-        _Section(0, (n, 0), _LATEST_TIME_NS, None)
-        for n, file in enumerate(files)
-        if not file.summary.chunk_indexes
-    ]
-
-    def blocks(cluster: list[_Section]) -> Iterator[MessageBlock]:
+    start_ns, end_ns = min(start_ns, LATEST_TIME_NS), min(end_ns, LATEST_TIME_NS)
+    places = {topic: number for number, topic in enumerate(topics)}
+    numbers = np.full((len(files), _MOST_CHANNELS), _NOT_WANTED, np.intp)
+    sections: list[_Section] = []
+    for n, (file, of_channel) in enumerate(zip(files, numbers, strict=True)):
+        for channel in file.summary.channels.values():
+            of_channel[channel.id] = places.get(channel.topic, _NOT_WANTED)
+        for index in file.summary.chunk_indexes:
+            span = index.message_start_time, index.message_end_time
+            channels = list(index.message_index_offsets)
+            if span[0] > end_ns or span[1] < start_ns:
+                continue
+            if not channels or (of_channel[channels] != _NOT_WANTED).any():
+                place = n, index.chunk_start_offset
+                sections.append(_Section(span[0], place, span[1], index))
+        if not file.summary.chunk_indexes:
+            sections.append(_Section(0, (n, 0), LATEST_TIME_NS, None))
+    for cluster in _overlapping(sections):
+        blocks: list[MessageBlock] = []
         for section in sorted(cluster, key=lambda each: each.written):
             n = section.written[0]
             with files[n].open() as opened:
-                if section.chunk is None:
-                    yield from _blocks_of_records(opened, wanted[n])
-                else:
-                    place = section.chunk.chunk_start_offset
-                    chunk = read_record(opened, place, Chunk)
-                    if chunk.uncompressed_size != section.chunk.uncompressed_size:
-                        raise ValueError(
-                            f"the chunk at byte {place} and its index specify different sizes"
-                        )
-                    data = ChunkUnpacker(file_size(opened)).unpack(chunk, place)
-                    yield _messages_in(data, place, wanted[n])
-
-    for cluster in _overlapping(sections):
-        yield _in_time_order(blocks(cluster))
+                for place_in_file, data in _unpacked(opened, section.chunk):
+                    block = _messages_in(data, place_in_file, numbers[n], start_ns, end_ns)
+                    blocks.append(block)
+        yield _in_time_order(blocks)
 
 
 def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
@@ -546,6 +479,47 @@ def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
         latest, farthest = max(latest, section.end_ns), max(farthest, section.written)
     if cluster:
         yield cluster
+
+
+def _unpacked(opened: BinaryIO, index: ChunkIndex | None) -> Iterator[tuple[int, bytes]]:
+    """Yield the records of an indexed chunk, or those of all chunks and all messages outside of
+    chunks, each after its byte offset."""
+    chunks = ChunkUnpacker(file_size(opened))
+    if index is not None:
+        place = index.chunk_start_offset
+        chunk = read_record(opened, place, Chunk)
+        if chunk.uncompressed_size != index.uncompressed_size:
+            raise ValueError(f"the chunk at byte {place} and its index specify different sizes")
+        yield place, chunks.unpack(chunk, place)
+        return
+    for place, opcode, record in records(opened, MAGIC_SIZE):
+        if opcode == Opcode.CHUNK:
+            yield place, chunks.unpack(cast("Chunk", parse_record(record)), place)
+        elif opcode == Opcode.MESSAGE:
+            yield place, record
+        elif opcode == Opcode.DATA_END:
+            return
+
+
+def _messages_in(
+    data: bytes, place: int, numbers: NDArray[np.intp], start_ns: int, end_ns: int
+) -> MessageBlock:
+    """Return the requested messages in the chunk at ``place``, in record order.
+
+    ``numbers`` are the topic indices of all channels.
+    """
+    found = [a for a, _ in records_in_chunk(data, place) if data[a] == Opcode.MESSAGE]
+    begins, size = np.array(found, np.int64), _MESSAGE_HEADS.itemsize
+    within = begins[:, np.newaxis] + np.arange(size)
+    heads = np.frombuffer(data, np.uint8).take(within, mode="clip").view(_MESSAGE_HEADS)[:, 0]
+    if (heads["length"] < size - _RECORD_HEAD.size).any():
+        raise ValueError(f"a message of the chunk at byte {place} is shorter than its header")
+    topics, times = numbers[heads["channel"]], heads["log_time"]
+    rows = np.flatnonzero((topics != _NOT_WANTED) & (times >= start_ns) & (times <= end_ns))
+    begins = begins[rows]
+    ends = begins + _RECORD_HEAD.size + heads["length"][rows].astype(np.int64)
+    spans = zip((begins + size).tolist(), ends.tolist(), strict=True)
+    return topics[rows], times[rows], [data[a:b] for a, b in spans]
 
 
 def _in_time_order(blocks: Iterable[MessageBlock]) -> MessageBlock:

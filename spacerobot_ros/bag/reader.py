@@ -466,10 +466,9 @@ class Bag(Mapping[str, TopicSeries]):
         for number, (topic, kind) in enumerate(types.items()):
             self._series_by_topic[topic] = TopicSeries(
                 topic,
-                self.topics[topic],
+                kind,
                 np.concatenate(times[number]).astype(np.int64),
                 data[number],
-                kind,
                 self._max_decoded_bytes,
             )
 

@@ -46,14 +46,13 @@ class TopicSeries:
     def __init__(
         self,
         topic: str,
-        type_name: str,
+        kind: MessageType,
         time_ns: NDArray[np.int64],
         data: Sequence[bytes],
-        kind: MessageType,
         max_decoded_bytes: float = math.inf,
     ) -> None:
         self.topic = topic
-        self.type_name = type_name
+        self.type_name = kind.name
         self.time_ns = time_ns
         # An in-place change would affect every reader of the array.
         self.time_ns.flags.writeable = False
@@ -255,7 +254,7 @@ class TopicSeries:
 
     @cached_property
     def _columns(self) -> Columns | None:
-        return read_columns(self.data, self.type_name, self._fields)
+        return read_columns(self.data, self._kind)
 
     def _require_decodable(self) -> None:
         """Refuse to decode a topic that is much larger than the bag's file."""

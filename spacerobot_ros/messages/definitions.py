@@ -10,9 +10,10 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -222,16 +223,7 @@ def _share_folder(package: str) -> Path:
     return folder
 
 
-@cache
-def fields_of(type_name: str) -> Fields:
-    """Return the fields of an installed type and of all nested types.
-
-    Raises as :func:`message_definition` does.
-    """
-    return dict(_parsed(message_definition(type_name), type_name))
-
-
-# -- types of bags ----------------------------------------------------------------------------
+# -- parsed types -----------------------------------------------------------------------------
 
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
 _MAX_TEXT_BYTES = 262_144
@@ -243,7 +235,14 @@ _MAX_NESTING = 32
 
 
 class MessageType:
-    """A message type defined by its schema in a bag.
+    """A message type, as defined by an installed package or by a schema in a bag.
+
+    Parameters
+    ----------
+    name
+        Such as ``nav_msgs/msg/Odometry``.
+    text
+        The full definition, as returned by :func:`message_definition`; it may be untrusted.
 
     Attributes
     ----------
@@ -253,47 +252,58 @@ class MessageType:
     Raises
     ------
     ValueError
-        The schema cannot be parsed or exceeds a limit.
+        The definition cannot be parsed or exceeds a limit.
     """
 
-    def __init__(self, type_name: str, text: bytes) -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self._store = get_typestore(Stores.EMPTY)
-        try:
-            self._store.register(_parsed_within_limits(type_name, text))
-            self._definition = self._store.get_msgdef(type_name)
-        # The parser raises any kind of error, depending on the text.
-        except Exception as error:
-            words = " ".join(str(error).split()) or type(error).__name__
-            raise ValueError(words if len(words) <= 200 else f"{words[:200]} ...") from error
-        self.fields: Fields = self._store.fielddefs
+    def __init__(self, name: str, text: bytes) -> None:
+        self.name = name
+        with _as_value_errors():
+            self.fields: Fields = _parsed(name, text)
 
     def decode(self, data: bytes) -> Any:
-        """Return a message from its serialised form."""
+        """Return a message from its serialised form; any defect raises an exception."""
         # Not `Typestore.deserialize_cdr`: that one refuses what rclpy serialises with an empty
         # list of float64, which has some meaningless bytes at its end.
-        definition = self._definition
+        store, definition = self._code
         little = data[1] & 1
         decode = definition.deserialize_cdr_le if little else definition.deserialize_cdr_be
-        return decode(data[4:], 0, definition.cls, self._store)[0]
+        return decode(data[4:], 0, definition.cls, store)[0]
+
+    @cached_property
+    def _code(self) -> tuple[Typestore, Any]:
+        """Code that ``rosbags`` generates, which takes longer than parsing the definition."""
+        from rosbags.typesys import Stores, get_typestore
+
+        store = get_typestore(Stores.EMPTY)
+        with _as_value_errors():
+            store.register(self.fields)
+            return store, store.get_msgdef(self.name)
 
 
 message_type = lru_cache(maxsize=64)(MessageType)
 """Return a :class:`MessageType`; its code is generated once and shared by all bags."""
 
 
-def _parsed(text: str, type_name: str) -> Any:
+@cache
+def installed_type(type_name: str) -> MessageType:
+    """Return a message type of an installed package. Raises as :func:`message_definition` does."""
+    return MessageType(type_name, message_definition(type_name).encode())
+
+
+@contextmanager
+def _as_value_errors() -> Iterator[None]:
+    """Convert exceptions: the parser raises any kind of error, depending on the definition."""
+    try:
+        yield
+    except Exception as error:
+        words = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(words if len(words) <= 200 else f"{words[:200]} ...") from error
+
+
+def _parsed(type_name: str, text: bytes) -> Fields:
     # The parser is slow to import, and tools that read no messages do not need it.
     from rosbags.typesys import get_types_from_msg
 
-    # The parser would rename service types, but leaves names in the form of messages unchanged.
-    parsed_name = type_name.replace("/srv/", "/msg/")
-    types = get_types_from_msg(text, parsed_name)
-    return {type_name if name == parsed_name else name: of for name, of in types.items()}
-
-
-def _parsed_within_limits(type_name: str, text: bytes) -> Any:
     if not _TYPE_NAME.fullmatch(type_name):
         raise ValueError("a type name must have the form 'package/msg/Type'")
     if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
@@ -301,9 +311,12 @@ def _parsed_within_limits(type_name: str, text: bytes) -> Any:
             f"its definition is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, more "
             "than any message needs"
         )
-    types = _parsed(text.decode(), type_name)
-    _count_fields(types, type_name, {})
-    return types
+    # The parser would rename service types, but leaves names in the form of messages unchanged.
+    parsed_name = type_name.replace("/srv/", "/msg/")
+    types = get_types_from_msg(text.decode(), parsed_name)
+    fields = {type_name if name == parsed_name else name: of for name, of in types.items()}
+    _count_fields(fields, type_name, {})
+    return fields
 
 
 def _count_fields(types: Fields, name: str, counts: dict[str, int], depth: int = 0) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
-from spacerobot_ros.messages.definitions import Fields, fields_of
+from spacerobot_ros.messages.definitions import Fields, MessageType, installed_type
 from spacerobot_ros.times import SECOND
 
 DTYPES = {
@@ -77,10 +77,8 @@ class Layout:
     ----------
     message
         The serialised message, little-endian.
-    type_name
-        Such as ``nav_msgs/msg/Odometry``.
-    fields
-        Definitions of the type and of all nested types; by default, those of the installed types.
+    kind
+        Type of the message.
     elements
         Whether to include the fields inside lists, with paths such as
         ``markers[2].pose.position.x``.
@@ -107,12 +105,7 @@ class Layout:
     """
 
     def __init__(
-        self,
-        message: bytes | bytearray,
-        type_name: str,
-        fields: Fields | None = None,
-        *,
-        elements: bool = False,
+        self, message: bytes | bytearray, kind: MessageType, *, elements: bool = False
     ) -> None:
         self.leaves: dict[str, Leaf] = {}
         self.counts: dict[str, int] = {}
@@ -121,8 +114,8 @@ class Layout:
         self.fixed: list[tuple[int, int]] = []
         self.end = ENCAPSULATION
         self._message, self._elements = message, elements
-        self._fields = fields_of(type_name) if fields is None else fields
-        self._walk(type_name, "")
+        self._fields = kind.fields
+        self._walk(kind.name, "")
 
     def _walk(self, type_name: str, prefix: str | None) -> None:
         """Add the fields of a type below ``prefix``; None if the fields get no paths."""
@@ -219,7 +212,7 @@ def encode(type_name: str, values: Mapping[str, Any] | None = None) -> bytes:
         The type is not installed.
     """
     buffer = bytearray(LITTLE_ENDIAN + bytes(ENCAPSULATION - len(LITTLE_ENDIAN)))
-    _encode(buffer, fields_of(type_name), type_name, values or {})
+    _encode(buffer, installed_type(type_name).fields, type_name, values or {})
     return bytes(buffer)
 
 
@@ -297,7 +290,7 @@ def encode_list(
     # Three elements show the layout: only the padding of the first may differ.
     few = [encode(type_name, {**values, name: [element] * k}) for k in range(4)]
     none, _, second, _ = map(len, few)
-    leaves = Layout(few[3], type_name, elements=True).leaves
+    leaves = Layout(few[3], installed_type(type_name), elements=True).leaves
     head = bytearray(few[1])
     struct.pack_into("<I", head, none - 4, count)
     rows = np.tile(np.frombuffer(few[3][second:], np.uint8), (count - 1, 1))
@@ -358,7 +351,7 @@ def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
     return dtype.newbyteorder("=")
 
 
-def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> Columns | None:
+def read_columns(messages: Sequence[bytes], kind: MessageType) -> Columns | None:
     """Return the fields that have the same position in every message of one type.
 
     Fields in lists of messages or strings are omitted. None if the layouts differ.
@@ -366,7 +359,7 @@ def read_columns(messages: Sequence[bytes], type_name: str, fields: Fields) -> C
     if not messages or len(set(map(len, messages))) != 1:
         return None
     try:
-        layout = Layout(messages[0], type_name, fields)
+        layout = Layout(messages[0], kind)
     except (IndexError, KeyError):
         return None
     matrix = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)

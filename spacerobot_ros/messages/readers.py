@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, counted
-from spacerobot_ros.messages.definitions import fields_of
+from spacerobot_ros.messages.definitions import installed_type
 from spacerobot_ros.messages.layout import LITTLE_ENDIAN, Layout, encode, seconds_and_nanoseconds
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
@@ -56,7 +56,7 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
         The bytes are not a message of this type.
     """
     try:
-        leaf = Layout(raw, type_name).leaves[path]
+        leaf = Layout(raw, installed_type(type_name)).leaves[path]
     except IndexError as error:
         raise UnreadableError(f"its bytes are not a {type_name.rpartition('/')[2]}") from error
     return raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
@@ -76,7 +76,7 @@ class MessageTemplate:
 
     def __init__(self, type_name: str, prototype: bytes) -> None:
         self._buffer = bytearray(prototype)
-        self._leaves = Layout(prototype, type_name, elements=True).leaves
+        self._leaves = Layout(prototype, installed_type(type_name), elements=True).leaves
         self._feeds: dict[str, tuple[slice, memoryview]] = {}
         size = HEADER_STAMP.stop - HEADER_STAMP.start
         self._stamps = [
@@ -148,8 +148,7 @@ class TemplateReader:
     def __init__(
         self, type_name: str, spans: Mapping[str, int | None], max_size: float = math.inf
     ) -> None:
-        self._type_name, self._spans, self._max_size = type_name, spans, max_size
-        self._fields = fields_of(type_name)
+        self._kind, self._spans, self._max_size = installed_type(type_name), spans, max_size
         self._size = -1
         self.raw = bytes(2)  # The initial template matches no message.
         """The accepted message."""
@@ -205,9 +204,9 @@ class TemplateReader:
         try:
             if raw[:2] != LITTLE_ENDIAN:
                 raise IndexError("it is not in little-endian CDR")
-            layout = Layout(raw, self._type_name, self._fields, elements=True)
+            layout = Layout(raw, self._kind, elements=True)
         except IndexError as error:
-            short = self._type_name.rpartition("/")[2]
+            short = self._kind.name.rpartition("/")[2]
             raise UnreadableError(f"its bytes are not a {short}") from error
         self.raw, self._size, self._layout = raw, len(raw), layout
         fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]

@@ -23,7 +23,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from spacerobot_ros.bag import RecordingError, message_definition, type_hash
-from spacerobot_ros.messages.definitions import message_type
+from spacerobot_ros.messages.definitions import installed_type, message_type
 from spacerobot_ros.messages.layout import read_columns
 from spacerobot_ros.nodes.common.messages import message_class
 
@@ -288,7 +288,7 @@ FIELD_COUNTS = {
 
 def check(messages: list[bytes], type_name: str, decoded: list[Any] | None = None) -> int:
     """Compare every column with the decoded messages; return how many columns there are."""
-    found = read_columns(messages, type_name, TYPESTORE.fielddefs)
+    found = read_columns(messages, installed_type(type_name))
     assert found is not None
     if decoded is None:
         decoded = [TYPESTORE.deserialize_cdr(message, type_name) for message in messages]
@@ -367,24 +367,24 @@ def test_strings_of_one_length_may_differ() -> None:
 )
 def test_there_are_no_columns_where_layouts_differ(messages: list[JointState]) -> None:
     data = [serialize_message(message).ljust(80, b"\0") for message in messages]
-    assert read_columns(data, "sensor_msgs/msg/JointState", TYPESTORE.fielddefs) is None
+    assert read_columns(data, installed_type("sensor_msgs/msg/JointState")) is None
 
 
 def test_there_are_no_columns_in_what_is_no_message() -> None:
     data = serialize_message(JointState(name=["a"]))
     for broken in (b"", data[:3], data[:10], data[:-12], b"\0\0" + data[2:]):
-        assert read_columns([broken], "sensor_msgs/msg/JointState", TYPESTORE.fielddefs) is None
+        assert read_columns([broken], installed_type("sensor_msgs/msg/JointState")) is None
 
 
 def test_there_are_no_columns_where_the_order_of_bytes_changes() -> None:
     little, big = (bytes([0, order, 0, 0]) + bytes(8) for order in (1, 0))
-    time = "builtin_interfaces/msg/Time"
-    assert read_columns([little, little], time, TYPESTORE.fielddefs) is not None
-    assert read_columns([little, big], time, TYPESTORE.fielddefs) is None
+    time = installed_type("builtin_interfaces/msg/Time")
+    assert read_columns([little, little], time) is not None
+    assert read_columns([little, big], time) is None
 
 
 def test_numbers_beyond_int64_stay_as_they_are() -> None:
     message = bytes([0, 1, 0, 0]) + (2**63 + 5).to_bytes(8, "little")
-    found = read_columns([message] * 2, "std_msgs/msg/UInt64", TYPESTORE.fielddefs)
+    found = read_columns([message] * 2, installed_type("std_msgs/msg/UInt64"))
     assert found is not None
     assert [int(each) for each in found["data"]] == [2**63 + 5] * 2

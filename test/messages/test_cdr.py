@@ -24,6 +24,7 @@ from support.random_messages import few, messages
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
+from spacerobot_ros.messages.definitions import installed_type
 from spacerobot_ros.messages.layout import Layout, encode
 from spacerobot_ros.messages.readers import (
     MessageTemplate,
@@ -65,7 +66,9 @@ def type_name(message_type: Any) -> str:
 
 
 def layout(message: Any) -> Layout:
-    return Layout(serialize_message(message), type_name(type(message)), elements=True)
+    return Layout(
+        serialize_message(message), installed_type(type_name(type(message))), elements=True
+    )
 
 
 def offset(found: Layout, path: str) -> int:

@@ -30,7 +30,7 @@ from spacerobot_ros.events import (
     list_format,
 )
 from spacerobot_ros.messages.builders import trajectory_message
-from spacerobot_ros.messages.definitions import MessageType, fields_of
+from spacerobot_ros.messages.definitions import MessageType, installed_type
 from spacerobot_ros.messages.layout import (
     encode_list,
     read_columns,
@@ -527,7 +527,7 @@ def test_copies_differ_in_stamps_and_numbers() -> None:
     forces = np.arange(9.0).reshape(3, 3) + 0.5
     name = "geometry_msgs/msg/WrenchStamped"
     copies = MessageTemplate(name, prototype).copies(stamps, {"wrench.force.x": forces})
-    found = read_columns(copies, name, fields_of(name))
+    found = read_columns(copies, installed_type(name))
     assert found is not None
     assert list(found["header.stamp.sec"]) == [0, 1, 5]
     assert list(found["header.stamp.nanosec"]) == [1, 2, 0]
