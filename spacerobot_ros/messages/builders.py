@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,13 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.errors import CommandError
 from spacerobot_ros.messages.layout import encode, encode_list, seconds_and_nanoseconds
-from spacerobot_ros.messages.readers import ODOMETRY, JointReader, MessageTemplate, TemplateReader
+from spacerobot_ros.messages.readers import (
+    ODOMETRY,
+    POSE_PATH,
+    JointReader,
+    MessageTemplate,
+    TemplateReader,
+)
 from spacerobot_ros.model.description import (
     DEFAULT_END_EFFECTOR,
     Array,
@@ -35,36 +42,29 @@ TRANSFORM_TYPE = "tf2_msgs/msg/TFMessage"
 TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"
 """Transform topic names before remapping."""
 
-_NUMBERS_PER_POSE = 7
-_POSE_PATH = "pose.pose.position.x"
 
-
-class TransformTemplate:
-    """A serialised tf2_msgs/TFMessage whose stamps and values are written in place.
+def transform_messages(frames: Frames, times_ns: NDArray[np.int64], poses: Array) -> list[bytes]:
+    """Return one serialised tf2_msgs/TFMessage per time.
 
     Parameters
     ----------
     frames
-        Parent and child frame of each transform.
+        Parent and child frame of each of the k transforms.
+    times_ns
+        (m,) stamps, ns.
+    poses
+        (m, k, 7) poses of the child frames in their parents, m.
     """
+    columns = {f"transforms[{i}].transform.translation.x": poses[:, i] for i in range(len(frames))}
+    return _transform_template(frames).copies(times_ns, columns)
 
-    def __init__(self, frames: Frames) -> None:
-        transforms = [
-            {"header": {"frame_id": parent}, "child_frame_id": child} for parent, child in frames
-        ]
-        self._template = MessageTemplate(
-            TRANSFORM_TYPE, encode(TRANSFORM_TYPE, {"transforms": transforms})
-        )
-        self._numbers = [
-            self._template.floats(f"transforms[{i}].transform.translation.x", _NUMBERS_PER_POSE)
-            for i in range(len(frames))
-        ]
 
-    def serialised(self, time_ns: int, poses: Array) -> bytes:
-        """Return the message with the poses (k, 7) at one time."""
-        for numbers, pose in zip(self._numbers, poses, strict=True):
-            numbers[:] = pose
-        return self._template.serialised(stamp_bytes(time_ns))
+@lru_cache(maxsize=64)
+def _transform_template(frames: Frames) -> MessageTemplate:
+    transforms = [
+        {"header": {"frame_id": parent}, "child_frame_id": child} for parent, child in frames
+    ]
+    return MessageTemplate(TRANSFORM_TYPE, encode(TRANSFORM_TYPE, {"transforms": transforms}))
 
 
 class RobotTransforms:
@@ -87,33 +87,27 @@ class RobotTransforms:
     ) -> None:
         self._links = ForwardKinematics(description) if links else None
         moving, fixed = ((), ()) if self._links is None else (self._links.moving, self._links.fixed)
-        frames = ((world_frame, prefix + description.base_link), *_prefix_frames(moving, prefix))
-        self._template = TransformTemplate(frames)
-        self._poses = np.zeros((len(frames), _NUMBERS_PER_POSE))
+        base = world_frame, prefix + description.base_link
+        self._moving = (base, *_prefix_frames(moving, prefix))
         self._fixed = _prefix_frames(fixed, prefix)
 
     def message(self, time_ns: int, pose: Array, q: Array) -> bytes:
         """Return the message for a base link pose (7,) and joint positions (n,)."""
-        self._poses[0] = pose
-        if self._links is not None:
-            self._poses[1:] = self._links.transforms_at(q)
-        return self._template.serialised(time_ns, self._poses)
+        return self.messages(np.array([time_ns]), pose[np.newaxis], q[np.newaxis])[0]
 
     def messages(self, times_ns: NDArray[np.int64], poses: Array, q: Array) -> list[bytes]:
         """Return the messages for times (m,), base poses (m, 7) and joint positions (m, n)."""
         every = poses[:, np.newaxis]
         if self._links is not None:
             every = np.concatenate([every, self._links.transforms_at(q)], axis=1)
-        return [
-            self._template.serialised(time_ns, each)
-            for time_ns, each in zip(times_ns.tolist(), every, strict=True)
-        ]
+        return transform_messages(self._moving, times_ns, every)
 
     def static_message(self, time_ns: int) -> bytes | None:
         """Return the message for links fixed to their parents; None without such links."""
         if self._links is None or not self._fixed:
             return None
-        return TransformTemplate(self._fixed).serialised(time_ns, self._links.fixed_transforms)
+        poses = self._links.fixed_transforms[np.newaxis]
+        return transform_messages(self._fixed, np.array([time_ns]), poses)[0]
 
 
 def _prefix_frames(frames: Iterable[tuple[str, str]], prefix: str) -> Frames:
@@ -125,8 +119,10 @@ class StateFrames:
 
     def __init__(self, description: RobotDescription) -> None:
         self._description = description
-        self._odom = TemplateReader(ODOMETRY, {_POSE_PATH: _NUMBERS_PER_POSE})
+        self._odom = TemplateReader(ODOMETRY)
         self._joints = JointReader(description.joint_names, ["position"], measured=True)
+        self.q = self._joints.values["position"]
+        """Joint positions (n,), m or rad."""
 
     def accept(self, odom: bytes, joint_states: bytes) -> None:
         """Take the new state from the serialised messages.
@@ -147,23 +143,18 @@ class StateFrames:
     @property
     def pose(self) -> Array:
         """Base link pose (7,)."""
-        return self._odom.floats(_POSE_PATH)
+        return self._odom.floats(POSE_PATH, 7)
 
     @property
-    def q(self) -> Array:
-        """Joint positions (n,), m or rad."""
-        return self._joints.values["position"]
-
-
-def robot_frames(description: RobotDescription, state: StateFrames) -> dict[str, tuple[str, Array]]:
-    """Return each link's parent and pose (7,) in the parent, by link name, for a measured state."""
-    links, prefix = ForwardKinematics(description), state.prefix
-    frames = {prefix + description.base_link: (state.world, state.pose)}
-    moving = links.transforms_at(state.q)
-    for names, poses in ((links.moving, moving), (links.fixed, links.fixed_transforms)):
-        for (parent, child), pose in zip(names, poses, strict=True):
-            frames[prefix + child] = prefix + parent, pose
-    return frames
+    def frames(self) -> dict[str, tuple[str, Array]]:
+        """Each link's parent, and pose (7,) in the parent, by link name."""
+        links, prefix = ForwardKinematics(self._description), self.prefix
+        frames = {prefix + self._description.base_link: (self.world, self.pose)}
+        moving = links.transforms_at(self.q)
+        for names, poses in ((links.moving, moving), (links.fixed, links.fixed_transforms)):
+            for (parent, child), pose in zip(names, poses, strict=True):
+                frames[prefix + child] = prefix + parent, pose
+        return frames
 
 
 def state_message(
@@ -421,11 +412,10 @@ class RobotMarkers:
         """Whether there are any markers; the robot, the target and the obstacles may all lack
         visuals."""
         self._template = MessageTemplate(MARKER_ARRAY, encode(MARKER_ARRAY, {"markers": markers}))
-        moved = len(poses) + len(self._of_target)
-        self._places = [
-            self._template.floats(f"markers[{i}].pose.position.x", 7) for i in range(moved)
-        ]
         self._placement = LinkPlacement(len(robot.links), poses)
+        self._target_poses = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(self._of_target), 1))
+        for i, pose in enumerate([*self._placement.poses, *self._target_poses]):
+            self._template.feed(f"markers[{i}].pose.position.x", pose)
 
     def message(
         self, time_ns: int, base: Array, link_R: Array, link_r: Array, target: Array | None
@@ -442,12 +432,9 @@ class RobotMarkers:
             Attitudes (3, 3 L) and positions (3, L) of the links in the base frame, m.
         """
         self._placement.update(base, link_R, link_r)
-        count = len(self._placement.poses)
-        for place, pose in zip(self._places[:count], self._placement.poses, strict=True):
-            place[:] = pose
         if target is not None:
             at = Pose(matrix_from_quaternion(target[3:]), target[:3])
-            for place, fixed in zip(self._places[count:], self._of_target, strict=True):
+            for pose, fixed in zip(self._target_poses, self._of_target, strict=True):
                 shape = at @ fixed
-                place[:3], place[3:] = shape.r, quaternion_from_matrix(shape.R)
+                pose[:3], pose[3:] = shape.r, quaternion_from_matrix(shape.R)
         return self._template.serialised(stamp_bytes(time_ns))

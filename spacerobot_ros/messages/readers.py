@@ -36,8 +36,8 @@ _OTHER_JOINTS_BYTES = 65536
 _NOT_FINITE_RATES = "velocities are not finite"
 
 _HEADER_BYTES = 4096
-_POSE_PATH, _TWIST_PATH = "pose.pose.position.x", "twist.twist.linear.x"
-_WRENCH_PATH = "wrench.force.x"
+POSE_PATH = "pose.pose.position.x"
+"""First of the seven numbers of the pose in an Odometry message."""
 
 Quantity = Literal["position", "velocity", "effort"]
 """Name of a numeric array in a JointState."""
@@ -55,11 +55,9 @@ def read_text(raw: bytes, type_name: str, path: str) -> str:
     UnreadableError
         The bytes are not a message of this type.
     """
-    try:
-        leaf = Layout(raw, installed_type(type_name)).leaves[path]
-    except IndexError as error:
-        raise UnreadableError(f"its bytes are not a {type_name.rpartition('/')[2]}") from error
-    return raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
+    reader = TemplateReader(type_name)
+    reader.accept(raw)
+    return reader.text(path)
 
 
 class MessageTemplate:
@@ -84,10 +82,6 @@ class MessageTemplate:
             for path, leaf in self._leaves.items()
             if path in ("header.stamp.sec", "clock.sec") or path.endswith(".header.stamp.sec")
         ]
-
-    def floats(self, path: str, count: int) -> Array:
-        """Return a writable view of the ``count`` float64 values beginning at ``path``."""
-        return np.frombuffer(self._buffer, np.float64, count, self._leaves[path].offset)
 
     def feed(self, path: str, source: Array) -> None:
         """Copy ``source``, a contiguous array that is updated in place, to ``path`` in every
@@ -136,24 +130,18 @@ class TemplateReader:
     Parameters
     ----------
     type_name
-        Message type, which must begin with a header.
-    spans
-        Paths to read, and the number of float64 values at each: ``{"pose.pose.position.x": 7}``;
-        None for an array of any length.
+        Message type; to read the stamp, the type must begin with a header.
     max_size
         Largest size of messages with a different layout, bytes; larger messages are rejected
         without being read.
     """
 
-    def __init__(
-        self, type_name: str, spans: Mapping[str, int | None], max_size: float = math.inf
-    ) -> None:
-        self._kind, self._spans, self._max_size = installed_type(type_name), spans, max_size
-        self._size = -1
-        self.raw = bytes(2)  # The initial template matches no message.
+    def __init__(self, type_name: str, max_size: float = math.inf) -> None:
+        self._kind, self._max_size = installed_type(type_name), max_size
+        self.raw = bytes(2)
         """The accepted message."""
-        self._fixed_spans: list[tuple[slice, bytes]] = []
-        self._value_spans: dict[str, tuple[int, int]] = {}
+        # Matches no message.
+        self._fixed_spans: list[tuple[slice, bytes]] = [(slice(0, 2), b"")]
         self._layout: Layout | None = None
 
     def accept(self, raw: bytes) -> bool:
@@ -166,20 +154,25 @@ class TemplateReader:
         """
         if raw is self.raw:
             return False
-        if len(raw) == self._size and all(raw[place] == text for place, text in self._fixed_spans):
+        same_size = len(raw) == len(self.raw)
+        if same_size and all(raw[place] == text for place, text in self._fixed_spans):
             self.raw = raw
             return False
         self._learn_layout(raw)
         return True
 
-    def floats(self, path: str) -> Array:
-        """Return a read-only view of the values at ``path``."""
-        offset, count = self._value_spans[path]
-        return np.frombuffer(self.raw, np.float64, count, offset)
+    def floats(self, path: str, count: int | None = None) -> Array:
+        """Return a read-only view of the ``count`` float64 values beginning at ``path``; by default
+        those of the array at ``path``, which must not be empty."""
+        assert self._layout is not None
+        leaf = self._layout.leaves[path]
+        number = leaf.shape[0] if count is None else count
+        return np.frombuffer(self.raw, np.float64, number, leaf.offset)
 
     def value_count(self, path: str) -> int:
-        """Return the number of values at ``path`` in messages with this layout; 0 if none."""
-        return self._value_spans[path][1] if path in self._value_spans else 0
+        """Return the number of values of the array at ``path`` in messages with this layout."""
+        assert self._layout is not None
+        return self._layout.leaves[path].shape[0]
 
     def text(self, path: str) -> str:
         """Return a string in messages with this layout."""
@@ -208,15 +201,9 @@ class TemplateReader:
         except IndexError as error:
             short = self._kind.name.rpartition("/")[2]
             raise UnreadableError(f"its bytes are not a {short}") from error
-        self.raw, self._size, self._layout = raw, len(raw), layout
+        self.raw, self._layout = raw, layout
         fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
         self._fixed_spans = [(slice(a, b), raw[a:b]) for a, b in fixed]
-        self._value_spans = {}
-        for path, wanted in self._spans.items():
-            leaf = layout.leaves[path]
-            count = leaf.shape[0] if wanted is None else wanted
-            if count:
-                self._value_spans[path] = leaf.offset, count
 
 
 class JointReader:
@@ -254,8 +241,7 @@ class JointReader:
         own = sum(len(name.encode()) + 32 for name in joint_names)
         max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
-        spans: dict[str, int | None] = dict.fromkeys(quantities)
-        self._reader = TemplateReader(JOINT_STATE, spans, max_size)
+        self._reader = TemplateReader(JOINT_STATE, max_size)
         self._problem = ""
         self._order = _JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._missing = ""
@@ -429,9 +415,7 @@ class MessageDecoder:
         self.ignored, self.joined = self._joints.ignored, self._joints.joined
         """Ignored parts of joint states, and a function that merges joint states."""
         self._references = JointReader(joint_names, ["position", "velocity"])
-        spans = {_POSE_PATH: 7, _TWIST_PATH: 6}
-        self._odom = TemplateReader(ODOMETRY, spans)
-        self._target = TemplateReader(ODOMETRY, spans)
+        self._odom, self._target = TemplateReader(ODOMETRY), TemplateReader(ODOMETRY)
         self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
         self.check_robot, self.decode_joints = self._joints.require, self._joints.accept
 
@@ -442,18 +426,21 @@ class MessageDecoder:
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return the pose (7,) and twist (6,) in an Odometry message."""
-        self._odom.accept(odom)
-        return self._odom.floats(_POSE_PATH), self._odom.floats(_TWIST_PATH)
+        return _pose_and_twist(self._odom, odom)
 
     def target(self, odom: bytes) -> tuple[Array, Array]:
         """Return the pose (7,) and twist (6,) in a target Odometry message."""
-        self._target.accept(odom)
-        return self._target.floats(_POSE_PATH), self._target.floats(_TWIST_PATH)
+        return _pose_and_twist(self._target, odom)
 
     def joint_reference(self, message: bytes) -> tuple[Array, Array]:
         """Return the positions and rates (n,) in a JointState; missing quantities are 0."""
         self._references.accept(message)
         return self._references.values["position"], self._references.values["velocity"]
+
+
+def _pose_and_twist(reader: TemplateReader, odom: bytes) -> tuple[Array, Array]:
+    reader.accept(odom)
+    return reader.floats(POSE_PATH, 7), reader.floats("twist.twist.linear.x", 6)
 
 
 class CommandReader:
@@ -521,7 +508,7 @@ class _WrenchReader:
     def __init__(self, base_link: str, frame_prefix: str) -> None:
         self.values: Array = np.zeros(6)
         self._base_link, self._accepted = base_link, ("", base_link, frame_prefix + base_link)
-        self._reader = TemplateReader(WRENCH, {_WRENCH_PATH: 6})
+        self._reader = TemplateReader(WRENCH)
         self._frame = ""
 
     def accept(self, raw: bytes) -> int:
@@ -532,7 +519,7 @@ class _WrenchReader:
             raise CommandError(
                 f"the wrench is in frame '{self._frame}'; it must be in '{self._base_link}'"
             )
-        self.values[:] = reader.floats(_WRENCH_PATH)
+        self.values[:] = reader.floats("wrench.force.x", 6)
         return reader.stamp_ns
 
     @property

@@ -455,7 +455,7 @@ ORIGIN, ZERO_TURN_PER_AREA = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 
 
 def reader() -> TemplateReader:
-    return TemplateReader("sensor_msgs/msg/JointState", {"velocity": None})
+    return TemplateReader("sensor_msgs/msg/JointState")
 
 
 @pytest.mark.parametrize("text", [b"\xff\xfe", b"a\0"], ids=["not UTF-8", "zero byte inside"])

@@ -190,8 +190,8 @@ def test_a_template_changes_its_numbers_and_nothing_else(
     prototype: Odometry, numbers: list[float], time_ns: int
 ) -> None:
     patched = template(prototype)
-    patched.floats("pose.pose.position.x", 7)[:] = numbers
-    patched.floats("pose.covariance", 36)[:] = np.arange(36.0)
+    patched.feed("pose.pose.position.x", np.array(numbers))
+    patched.feed("pose.covariance", np.arange(36.0))
     sent = deserialize_message(patched.serialised(stamp_bytes(time_ns)), Odometry)
     p, o = prototype.pose.pose.position, prototype.pose.pose.orientation
     p.x, p.y, p.z, o.x, o.y, o.z, o.w = numbers
@@ -217,8 +217,8 @@ def test_a_template_stamps_the_clock() -> None:
 
 def test_what_a_template_has_given_out_does_not_change() -> None:
     patched = template(Float64MultiArray(data=[0.0] * 3))
-    data = patched.floats("data", 3)
-    data[:] = 1.0
+    data = np.ones(3)
+    patched.feed("data", data)
     first = patched.serialised(stamp_bytes(0))
     data[:] = 2.0
     patched.serialised(stamp_bytes(1))
@@ -232,7 +232,6 @@ QUANTITIES = ("position", "velocity", "effort")
 
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
-spans = {"position": None, "velocity": None}
 
 
 def check_reads(reader: TemplateReader, message: JointState) -> None:
@@ -242,7 +241,6 @@ def check_reads(reader: TemplateReader, message: JointState) -> None:
         assert reader.value_count(name) == len(expected)
         if len(expected):
             np.testing.assert_array_equal(reader.floats(name), expected)
-    assert not reader.value_count("effort")
 
 
 # Few different layouts, so that they come again.
@@ -264,7 +262,7 @@ joint_states = st.builds(
 @settings(few, max_examples=80)
 @given(st.lists(joint_states, min_size=1, max_size=12))
 def test_a_reader_reads_what_rclpy_reads_whatever_comes(sent: list[JointState]) -> None:
-    reader = TemplateReader(JOINT_STATE, spans)
+    reader = TemplateReader(JOINT_STATE)
     for message in sent:
         reader.accept(serialize_message(message))
         check_reads(reader, message)
@@ -281,7 +279,7 @@ def test_a_reader_reads_what_rclpy_reads_whatever_comes(sent: list[JointState]) 
 def test_a_reader_learns_a_layout_once(
     message: JointState, series: list[list[float]], random: Any
 ) -> None:
-    reader = TemplateReader(JOINT_STATE, spans)
+    reader = TemplateReader(JOINT_STATE)
     reader.accept(serialize_message(message))
     found = layout(message)
     for numbers in series:
@@ -303,7 +301,7 @@ def test_a_reader_learns_a_layout_once(
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_a_reader_sees_that_a_name_of_equal_length_has_changed(quantity: str) -> None:
-    reader = TemplateReader(JOINT_STATE, {quantity: None})
+    reader = TemplateReader(JOINT_STATE)
     changes = ((["a", "b"], True), (["a", "b"], False), (["b", "a"], True), (["b", "a"], False))
     for names, changed in changes:
         numbers: dict[str, Any] = {q: [1.0, 2.0] for q in QUANTITIES}
@@ -314,7 +312,7 @@ def test_a_reader_sees_that_a_name_of_equal_length_has_changed(quantity: str) ->
 
 def test_a_reader_sees_that_numbers_have_moved_from_one_field_to_the_next() -> None:
     # The same size and names, and other lengths.
-    reader = TemplateReader(JOINT_STATE, spans)
+    reader = TemplateReader(JOINT_STATE)
     for position, velocity in (([1.0, 2.0], [3.0]), ([1.0], [2.0, 3.0]), ([1.0, 2.0], [3.0])):
         message = JointState(name=["a"], position=position, velocity=velocity, effort=[0.0])
         assert reader.accept(serialize_message(message))
@@ -324,14 +322,14 @@ def test_a_reader_sees_that_numbers_have_moved_from_one_field_to_the_next() -> N
 def test_a_name_without_its_final_zero_is_whole_as_in_other_readers() -> None:
     raw = bytearray(serialize_message(JointState(name=["ab", "cd"])))
     raw[raw.index(b"ab\0") + 2] = 1
-    reader = TemplateReader(JOINT_STATE, {})
+    reader = TemplateReader(JOINT_STATE)
     reader.accept(bytes(raw))
     assert reader.texts("name") == list(deserialize_message(bytes(raw), JointState).name)
     assert reader.texts("name") == ["ab\x01", "cd"]
 
 
 def test_a_reader_refuses_what_is_no_message() -> None:
-    reader = TemplateReader(JOINT_STATE, spans)
+    reader = TemplateReader(JOINT_STATE)
     for position in (1.0, 2.0):
         message = JointState(name=["a"], position=[position], velocity=[2.0], effort=[0.0])
         reader.accept(serialize_message(message))

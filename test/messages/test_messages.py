@@ -492,7 +492,7 @@ def test_single_texts_are_read_and_broken_ones_refused() -> None:
 def test_a_template_of_joints_has_all_their_quantities() -> None:
     template = joint_template(["a", "bc"])
     for number, name in enumerate(("position", "velocity", "effort")):
-        template.floats(name, 2)[:] = [number + 0.5, number + 0.25]
+        template.feed(name, np.array([number + 0.5, number + 0.25]))
     found = JointReader(["a", "bc"], ["position", "velocity", "effort"])
     assert found.accept(template.serialised(stamp_bytes(2 * S + 5))) == 2 * S + 5
     assert [values.tolist() for values in found.values.values()] == [

@@ -21,7 +21,7 @@ from support.ros_harness import Harness, nanoseconds
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.reader import columns
-from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, TransformTemplate
+from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, transform_messages
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
@@ -251,7 +251,7 @@ def test_serialised_frames_are_what_ros_makes_of_each(robot: str) -> None:
     links = [joint.child for joint in load_robot(robot_file(robot)).joints]
     frames = tuple((f"p{'x' * i}", name) for i, name in enumerate(links))
     poses = np.random.default_rng(3).normal(size=(len(frames), 7))
-    raw = TransformTemplate(frames).serialised(5_000_000_007, poses)
+    (raw,) = transform_messages(frames, np.array([5_000_000_007]), poses[np.newaxis])
     place = 8
     for (parent, child), pose in zip(frames, poses, strict=True):
         one = TransformStamped(child_frame_id=child)

@@ -25,7 +25,7 @@ from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.commanding.plant_state import PlantStopped, Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
-from spacerobot_ros.messages.builders import StateFrames, robot_frames
+from spacerobot_ros.messages.builders import StateFrames
 from spacerobot_ros.messages.diagnostics import encode_diagnostics, state_diagnostics
 from spacerobot_ros.messages.readers import MessageDecoder
 from spacerobot_ros.messages.statuses import StatusRecord, read_status
@@ -293,7 +293,7 @@ class CommanderNode(FlightNode):
             state = StateFrames(robot.description)
             with suppress(CommandError):  # The state is of another robot, so no frame is known.
                 state.accept(states.odom, states.joints)
-                own = robot_frames(robot.description, state)
+                own = state.frames
         return self._known_frames.pose(frame, self.config.world_frame, own)
 
     def _abort(self) -> str:
