@@ -6,13 +6,11 @@ killed or the disk is full.
 
 from __future__ import annotations
 
-import copy
 import errno
 import fcntl
 import io
 import os
 from collections import Counter
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,8 +80,6 @@ class QosProfile:
 
         profiles = []
         try:
-            if len(text) > _MAX_YAML_CHARACTERS:
-                raise ValueError("it is too long")
             entries = [cls().to_dict() | entry for entry in load_yaml(text) or []]
             for given in parse_qos(entries):
                 if type(given.depth) is not int or not 0 <= given.depth <= _INFINITE_NS:
@@ -96,7 +92,7 @@ class QosProfile:
 
     def to_yaml(self) -> str:
         """Return a channel's ``offered_qos_profiles`` with this profile, in rosbag2's format."""
-        return yaml.dump([self.to_dict()], Dumper=_Dumper, sort_keys=False).rstrip()
+        return _to_yaml([self.to_dict()]).rstrip()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the profile as it appears in rosbag2's YAML."""
@@ -105,10 +101,10 @@ class QosProfile:
             "depth": self.depth,
             "reliability": self.reliability,
             "durability": self.durability,
-            "deadline": {**_INFINITE_DURATION},
-            "lifespan": {**_INFINITE_DURATION},
+            "deadline": _INFINITE_DURATION,
+            "lifespan": _INFINITE_DURATION,
             "liveliness": self.liveliness,
-            "liveliness_lease_duration": {**_INFINITE_DURATION},
+            "liveliness_lease_duration": _INFINITE_DURATION,
             "avoid_ros_namespace_conventions": False,
         }
 
@@ -119,9 +115,14 @@ LATCHED = QosProfile(depth=1, durability="transient_local")
 
 _POLICIES = ("history", "reliability", "durability", "liveliness")
 
-_MAX_YAML_CHARACTERS = 65_536
 
-_Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _to_yaml(values: Any) -> str:
+    return yaml.dump(values, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 # -- the metadata record ----------------------------------------------------------------------
@@ -141,49 +142,6 @@ class RecordedTopic:
     type_name: str
     type_hash: str
     qos: QosProfile
-
-
-def _rosbag2_metadata(
-    file_name: str,
-    topics: Sequence[tuple[RecordedTopic, int]],
-    start_ns: int | None,
-    end_ns: int | None,
-) -> dict[str, str]:
-    """Return the record for topics and their numbers of messages."""
-    start, duration = _INFINITE_NS, 0
-    if start_ns is not None and end_ns is not None:
-        start, duration = start_ns, end_ns - start_ns
-    content = {
-        "duration": {"nanoseconds": duration},
-        "starting_time": {"nanoseconds_since_epoch": start},
-        "message_count": sum(count for _, count in topics),
-    }
-    whole = {
-        "version": _METADATA_VERSION,
-        "storage_identifier": "mcap",
-        **content,
-        "topics_with_message_count": [
-            {
-                "topic_metadata": {
-                    "name": topic.name,
-                    "type": topic.type_name,
-                    "serialization_format": "cdr",
-                    "offered_qos_profiles": [topic.qos.to_dict()],
-                    "type_description_hash": topic.type_hash,
-                },
-                "message_count": count,
-            }
-            for topic, count in topics
-        ],
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [file_name],
-        "files": [{"path": file_name, **copy.deepcopy(content)}],
-        "custom_data": None,
-        "ros_distro": os.environ.get("ROS_DISTRO", "jazzy"),
-    }
-    text = yaml.dump(whole, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-    return {"serialized_metadata": text}
 
 
 # -- the file ---------------------------------------------------------------------------------
@@ -323,9 +281,39 @@ class McapFile(Writer):
 
     def add_rosbag2_metadata(self) -> None:
         """Append rosbag2's metadata record for the messages written so far."""
-        counted = [(topic, self.message_counts[channel]) for channel, topic in self.topics.items()]
-        values = _rosbag2_metadata(self.path.name, counted, self.start_ns, self.end_ns)
-        self.add_metadata(METADATA_NAME, values)
+        start, duration = _INFINITE_NS, 0
+        if self.start_ns is not None and self.end_ns is not None:
+            start, duration = self.start_ns, self.end_ns - self.start_ns
+        content = {
+            "duration": {"nanoseconds": duration},
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "message_count": sum(self.message_counts[channel] for channel in self.topics),
+        }
+        whole = {
+            "version": _METADATA_VERSION,
+            "storage_identifier": "mcap",
+            **content,
+            "topics_with_message_count": [
+                {
+                    "topic_metadata": {
+                        "name": topic.name,
+                        "type": topic.type_name,
+                        "serialization_format": "cdr",
+                        "offered_qos_profiles": [topic.qos.to_dict()],
+                        "type_description_hash": topic.type_hash,
+                    },
+                    "message_count": self.message_counts[channel],
+                }
+                for channel, topic in self.topics.items()
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [self.path.name],
+            "files": [{"path": self.path.name, **content}],
+            "custom_data": None,
+            "ros_distro": os.environ.get("ROS_DISTRO", "jazzy"),
+        }
+        self.add_metadata(METADATA_NAME, {"serialized_metadata": _to_yaml(whole)})
 
     def flush(self) -> None:
         """Complete the current chunk."""
