@@ -264,20 +264,31 @@ class MessageType:
         """Return a message from its serialised form; any defect raises an exception."""
         # Not `Typestore.deserialize_cdr`: that one refuses what rclpy serialises with an empty
         # list of float64, which has some meaningless bytes at its end.
-        store, definition = self._code
+        store = self._store
+        definition = store.get_msgdef(self.name)
         little = data[1] & 1
         decode = definition.deserialize_cdr_le if little else definition.deserialize_cdr_be
         return decode(data[4:], 0, definition.cls, store)[0]
 
+    def encode(self, message: Any) -> bytes:
+        """Return the serialised form of a message of this type."""
+        return bytes(self._store.serialize_cdr(message, self.name, little_endian=True))
+
+    @property
+    def classes(self) -> dict[str, Any]:
+        """Classes of the type and of all nested types, by name."""
+        return self._store.types
+
     @cached_property
-    def _code(self) -> tuple[Typestore, Any]:
+    def _store(self) -> Typestore:
         """Code that ``rosbags`` generates, which takes longer than parsing the definition."""
         from rosbags.typesys import Stores, get_typestore
 
         store = get_typestore(Stores.EMPTY)
         with _as_value_errors():
             store.register(self.fields)
-            return store, store.get_msgdef(self.name)
+            store.get_msgdef(self.name)
+        return store
 
 
 message_type = lru_cache(maxsize=64)(MessageType)

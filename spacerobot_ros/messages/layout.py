@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
-from spacerobot_ros.messages.definitions import Fields, MessageType, installed_type
+from spacerobot_ros.messages.definitions import MessageType, installed_type
 from spacerobot_ros.times import SECOND
 
 DTYPES = {
@@ -202,7 +202,8 @@ def encode(type_name: str, values: Mapping[str, Any] | None = None) -> bytes:
         Such as ``sensor_msgs/msg/JointState``.
     values
         Fields by name: numbers, strings, arrays, mappings for messages, and lists of these; a time
-        or duration may also be given in integer nanoseconds. All other fields are zero or empty.
+        or duration may also be given in integer nanoseconds, and a ``byte`` is signed. All other
+        fields are zero or empty.
 
     Raises
     ------
@@ -211,57 +212,38 @@ def encode(type_name: str, values: Mapping[str, Any] | None = None) -> bytes:
     RecordingError
         The type is not installed.
     """
-    buffer = bytearray(LITTLE_ENDIAN + bytes(ENCAPSULATION - len(LITTLE_ENDIAN)))
-    _encode(buffer, installed_type(type_name).fields, type_name, values or {})
-    return bytes(buffer)
+    kind = installed_type(type_name)
+    return kind.encode(_message(kind, type_name, values or {}))
 
 
-def _encode(buffer: bytearray, fields: Fields, type_name: str, values: Any) -> None:
+def _message(kind: MessageType, type_name: str, values: Any) -> Any:
     if type_name in _TIME_TYPES and isinstance(values, int):
         values = dict(zip(("sec", "nanosec"), divmod(values, SECOND), strict=True))
-    own = fields[type_name][1]
-    unknown = values.keys() - {name for name, _ in own}
+    fields = dict(kind.fields[type_name][1])
+    unknown = values.keys() - fields.keys()
     if unknown:
         raise KeyError(f"{type_name} has no field {min(unknown)}")
-    for name, node in own:
-        _encode_field(buffer, fields, node, values.get(name))
+    given = {name: _field_value(kind, node, values.get(name)) for name, node in fields.items()}
+    return kind.classes[type_name](**given)
 
 
-def _encode_field(buffer: bytearray, fields: Fields, node: Any, value: Any) -> None:
-    kind, detail = node
-    if kind == Nodetype.NAME:
-        _encode(buffer, fields, detail, {} if value is None else value)
-    elif kind == Nodetype.BASE:
-        _encode_number_or_text(buffer, detail[0], value)
-    else:
-        element, count = detail
-        numbers = element[0] == Nodetype.BASE and element[1][0] != "string"
-        if kind == Nodetype.SEQUENCE:
-            count = 0 if value is None else len(value)
-            _append_aligned(buffer, np.uint32(count).tobytes(), 4)
-        if numbers:
-            dtype = DTYPES[element[1][0]]
-            data = np.zeros(count, dtype) if value is None else np.asarray(value, dtype)
-            if data.shape != (count,):
-                raise ValueError(f"{count} numbers are required; the shape is {data.shape}")
-            _append_aligned(buffer, data.tobytes(), dtype.itemsize)
-        else:
-            for each in [None] * count if value is None else value:
-                _encode_field(buffer, fields, element, each)
-
-
-def _encode_number_or_text(buffer: bytearray, base: str, value: Any) -> None:
-    if base == "string":
-        text = ("" if value is None else value).encode() + b"\0"
-        _append_aligned(buffer, np.uint32(len(text)).tobytes() + text, 4)
-    else:
-        dtype = DTYPES[base]
-        _append_aligned(buffer, np.array(value or 0, dtype).tobytes(), dtype.itemsize)
-
-
-def _append_aligned(buffer: bytearray, data: bytes, alignment: int) -> None:
-    if data:
-        buffer += bytes(-(len(buffer) - ENCAPSULATION) % alignment) + data
+def _field_value(kind: MessageType, node: Any, value: Any) -> Any:
+    node_type, detail = node
+    if node_type == Nodetype.NAME:
+        return _message(kind, detail, {} if value is None else value)
+    if node_type == Nodetype.BASE:
+        zero = "" if detail[0] == "string" else 0
+        return zero if value is None else value
+    element, count = detail
+    if value is None:
+        value = [None] * count if node_type == Nodetype.ARRAY else []
+    if element[0] == Nodetype.NAME or element[1][0] == "string":
+        return [_field_value(kind, element, each) for each in value]
+    dtype = DTYPES[element[1][0]]
+    numbers = np.zeros(count, dtype) if value[:1] == [None] else np.ascontiguousarray(value, dtype)
+    if numbers.shape != (count if node_type == Nodetype.ARRAY else len(value),):
+        raise ValueError(f"{count} numbers are required; the shape is {numbers.shape}")
+    return numbers
 
 
 def encode_list(

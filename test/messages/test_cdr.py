@@ -148,7 +148,7 @@ def plain(message: Any) -> dict[str, Any]:
         if hasattr(part, "get_fields_and_field_types"):
             return plain(part)
         if isinstance(part, bytes):
-            return part[0]
+            return int.from_bytes(part, "little", signed=True)
         if isinstance(part, list):
             return [value(each) for each in part]
         return part
