@@ -6,12 +6,11 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
-from html import escape
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
-from mcap.records import Attachment, AttachmentIndex, Metadata, MetadataIndex, Statistics
+from mcap.records import Attachment, Metadata, Statistics
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.mcap_file import QosProfile
@@ -181,32 +180,15 @@ class Bag(Mapping[str, TopicSeries]):
         return default
 
     def __repr__(self) -> str:
-        rows = self._topic_rows()
-        wide = max((len(row[0]) for row in rows), default=0)
-        lines = [f"  {name:<{wide}}  {count:>7}  {kind}" for name, count, kind in rows]
-        return "\n".join([f"{self._summary_text()}{':' if lines else ''}", *lines])
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{escape(name)}</td><td>{count}</td><td>{escape(kind)}</td></tr>"
-            for name, count, kind in self._topic_rows()
-        )
-        head = "<tr><th>topic</th><th>messages</th><th>type</th></tr>"
-        return f"<p>{escape(self._summary_text())}</p><table>{head}{rows}</table>"
-
-    def _summary_text(self) -> str:
         span = f", {self.end_time - self.start_time:.6g} s" if self.message_count() else ""
-        return f"Bag {self.path}: {self.message_count()} messages on {len(self)} topics{span}"
-
-    def _topic_rows(self) -> list[tuple[str, int, str]]:
-        return [
-            (
-                printable(topic),
-                sum(c.message_count for c in channels),
-                printable(self.topics[topic]),
-            )
+        head = f"Bag {self.path}: {self.message_count()} messages on {len(self)} topics{span}"
+        wide = max(map(len, map(printable, self)), default=0)
+        lines = [
+            f"  {printable(topic):<{wide}}  {sum(each.message_count for each in channels):>7}  "
+            f"{printable(self.topics[topic])}"
             for topic, channels in sorted(self._channels_by_topic.items())
         ]
+        return "\n".join([f"{head}{':' if lines else ''}", *lines])
 
     def _recorded_name(self, topic: str) -> str:
         """Return the recorded name of a topic, which may be given without its leading slash."""
@@ -219,22 +201,20 @@ class Bag(Mapping[str, TopicSeries]):
     def metadata(self) -> dict[str, dict[str, str]]:
         """Keys and values of every metadata record by name; if a name is repeated, the last record
         takes precedence."""
-        return {each.name: each.metadata for each in self._records(Metadata)}
+        return {each.name: each.metadata for each in self._records("metadata_indexes", Metadata)}
 
     @cached_property
     def attachments(self) -> dict[str, bytes]:
         """Content of every attachment by name; if a name is repeated, the last attachment takes
         precedence."""
-        return {each.name: each.data for each in self._records(Attachment)}
+        return {each.name: each.data for each in self._records("attachment_indexes", Attachment)}
 
-    def _records(self, kind: type[RecordT]) -> Iterator[RecordT]:
+    def _records(self, indexes: str, kind: type[RecordT]) -> Iterator[RecordT]:
         """Read the records of one kind that the summaries list, each once."""
         for file in self._files:
-            indexes: Sequence[AttachmentIndex | MetadataIndex] = file.summary.attachment_indexes
-            if kind is Metadata:
-                indexes = file.summary.metadata_indexes
+            places = (index.offset for index in getattr(file.summary, indexes))
             with file.open() as opened:
-                for place in dict.fromkeys(index.offset for index in indexes):
+                for place in dict.fromkeys(places):
                     yield read_record(opened, place, kind)
 
     @property
@@ -289,19 +269,6 @@ class Bag(Mapping[str, TopicSeries]):
         channels = (each.channel for each in self._channels(topic))
         texts = [channel.metadata.get("offered_qos_profiles", "") for channel in channels]
         return [profile for text in texts for profile in QosProfile.from_yaml(text)]
-
-    def times(self, topic: str) -> NDArray[np.float64]:
-        """Return the log times on a topic in seconds, shape (N,)."""
-        return self[topic].time
-
-    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Iterate over the decoded messages on a topic, in log time order.
-
-        Yields
-        ------
-        Log time in nanoseconds, message.
-        """
-        return self[topic].messages()
 
     @overload
     def to_pandas(self, topic: str, *, euler: bool = False) -> pandas.DataFrame: ...

@@ -178,14 +178,14 @@ def _table_fields(
     if series.element_type(path) == _KEY_VALUES:
         rows = [key_values(pairs) for pairs in values]
         return [
-            Field(f"{path}[{key}]", _object_array([row.get(key, "") for row in rows]), ("",))
+            Field(f"{path}[{key}]", np.array([row.get(key, "") for row in rows], object), ("",))
             for key in dict.fromkeys(key for row in rows for key in row)
         ]
     if path in _TIME_COLUMNS:
         path = f"message.{path}"
     if not isinstance(values, np.ndarray) or values[:1].size > _MAX_ARRAY_COLUMNS:
         texts = [x if isinstance(x, str) else json.dumps(_json_value(x)) for x in values]
-        return [Field(path, _object_array(texts), ("",))]
+        return [Field(path, np.array(texts, object), ("",))]
     if values.ndim == 1:
         return [number_field(path, values)]
     if not values.shape[1]:
@@ -265,12 +265,6 @@ def _joint_unit(path: str, is_prismatic: bool | None) -> str:
     if path not in _JOINT_UNITS or is_prismatic is None:
         return ""
     return _JOINT_UNITS[path][0 if is_prismatic else 1]
-
-
-def _object_array(values: list[str]) -> NDArray[Any]:
-    made = np.empty(len(values), object)
-    made[:] = values
-    return made
 
 
 def _json_value(value: Any) -> Any:
@@ -517,7 +511,7 @@ def _matlab_variable(name: str, taken: Mapping[str, Any]) -> str:
 
 
 def _cell_array(texts: list[str]) -> Any:
-    return _object_array(texts)[:, np.newaxis]
+    return np.array(texts, object)[:, np.newaxis]
 
 
 def _import_library(name: str) -> Any:

@@ -98,7 +98,7 @@ def test_what_a_bag_holds(path: Path) -> None:
 def test_times(path: Path) -> None:
     bag = read_bag(path)
     expected = 5.0 + 1e-3 * np.arange(N)
-    assert bag.times("/odom") == pytest.approx(expected, abs=1e-12)
+    assert bag["/odom"].time == pytest.approx(expected, abs=1e-12)
     assert bag["/odom"].time.dtype == np.float64
     assert bag["/odom"].time_ns.tolist() == [5 * 10**9 + k * 10**6 for k in range(N)]
     assert bag["/odom"].stamp == pytest.approx(expected - 5e-4, abs=1e-12)
@@ -155,7 +155,7 @@ def test_lists_that_differ_in_length(tmp_path: Path) -> None:
 
 def test_a_topic_without_messages(path: Path, tmp_path: Path) -> None:
     assert read_bag(path)["/silent"].field("data") == []
-    assert list(read_bag(path).messages("/silent")) == []
+    assert list(read_bag(path)["/silent"].messages()) == []
     with BagWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/odom", "nav_msgs/msg/Odometry")
     bag = read_bag(tmp_path / "a.mcap")
@@ -172,7 +172,7 @@ def test_every_type(tmp_path: Path, samples: list[Sample], assert_same: AssertSa
             writer.write(writer.add_topic(topic, type_name), serialize_message(message), 1, 1)
     bag = read_bag(tmp_path / "a.mcap")
     for topic, _, message in samples:
-        ((time_ns, decoded),) = bag.messages(topic)
+        ((time_ns, decoded),) = bag[topic].messages()
         assert time_ns == 1
         assert_same(message, decoded)
 
@@ -184,7 +184,7 @@ def test_meaningless_bytes_at_the_end_do_no_harm(tmp_path: Path) -> None:
         channel = writer.add_topic("/a", "sensor_msgs/msg/JointState")
         writer.write(channel, data + b"\xff" * 8, 1, 1)
         writer.write(channel, data, 2, 2)
-    read = list(read_bag(tmp_path / "a.mcap").messages("/a"))
+    read = list(read_bag(tmp_path / "a.mcap")["/a"].messages())
     assert len(read) == 2
     for _, decoded in read:
         assert decoded.position.tolist() == [1.0, 2.0]
@@ -456,7 +456,7 @@ def test_a_field_that_is_not_there(good: Path, field: str, words: str) -> None:
 
 def test_a_topic_that_is_not_there(good: Path) -> None:
     bag = read_bag(good)
-    for ask in (bag.__getitem__, bag.times, bag.messages, bag.message_count):
+    for ask in (bag.__getitem__, bag.qos, bag.table, bag.message_count):
         with pytest.raises(RecordingError, match="has no topic /odm: it has /silent, /odom"):
             ask("/odm")
 
@@ -536,7 +536,7 @@ def test_a_topic_of_two_publishers_is_one_topic(tmp_path: Path) -> None:
     assert channels[0] != channels[1]
     bag = read_bag(tmp_path / "a.mcap")
     assert bag.message_count("/a") == bag.message_count() == 5
-    assert [message.data for _, message in bag.messages("/a")] == list("01234")
+    assert [message.data for _, message in bag["/a"].messages()] == list("01234")
 
 
 def test_of_many_topics_some_are_named(tmp_path: Path) -> None:

@@ -280,7 +280,7 @@ def test_a_recording_is_split_by_time_and_flushed_as_often_as_it_is_to(
     recorder.trigger_cleanup()
     files = sorted(tmp_path.iterdir())
     assert len(files) > 1
-    assert [m.data for path in files for _, m in read_bag(path).messages("/talk")] == list("012")
+    assert [m.data for path in files for _, m in read_bag(path)["/talk"].messages()] == list("012")
 
 
 class Lost(NamedTuple):

@@ -244,7 +244,7 @@ def odometry_in(bag: Path) -> tuple[Any, Any, Any]:
     """Times (s), positions and attitudes of the target, read message by message."""
     found = [
         (message.header.stamp, message.pose.pose)
-        for _, message in read_bag(bag).messages("/target/odom")
+        for _, message in read_bag(bag)["/target/odom"].messages()
     ]
     times = np.array([stamp.sec + stamp.nanosec * 1e-9 for stamp, _ in found])
     positions = np.array([[pose.position.x, pose.position.y, pose.position.z] for _, pose in found])
@@ -259,7 +259,7 @@ def odometry() -> tuple[Any, Any, Any]:
 
 def test_the_target_has_the_solids_of_its_urdf(scene: View3D) -> None:
     (described,) = (
-        message.data for _, message in read_bag(BAG).messages("/target/robot_description")
+        message.data for _, message in read_bag(BAG)["/target/robot_description"].messages()
     )
     visuals = [v for link in parse_robot(described).links for v in link.shapes]
     drawn = [
@@ -335,7 +335,7 @@ def test_reaction_wheels_have_rates_and_no_angles() -> None:
     wheels = {"wheel_plus_x", "wheel_plus_y", "wheel_minus_x", "wheel_minus_y"}
     assert {report.joint_names[i] for i in report.wheel_columns} == wheels
     bag = read_bag(BAG.with_name("servicing.mcap"))
-    recorded = [message for _, message in bag.messages("/joint_states")]
+    recorded = [message for _, message in bag["/joint_states"].messages()]
     angles = {name: [m.position[list(m.name).index(name)] for m in recorded] for name in wheels}
     assert max(abs(x) for each in angles.values() for x in each) > 1000
     groups = shape_groups(report)

@@ -406,12 +406,12 @@ def test_nothing_is_lost_or_recorded_twice(result: RunResult) -> None:
     bag = read_bag(result.summary["bag"])
     ticks = result.summary["ticks"]
     # The scenario asks for base_pose once a second, that is every 20 ticks.
-    assert len(bag.times("/base_pose")) == ticks // 20 + 1
+    assert len(bag["/base_pose"].time) == ticks // 20 + 1
     for topic in ("/clock", "/odom", "/joint_states", "/momentum"):
-        times = bag.times(topic)
+        times = bag[topic].time
         assert len(times) == ticks + 1, topic
         np.testing.assert_allclose(times, np.arange(ticks + 1) * 0.05, atol=1e-9)
-    np.testing.assert_allclose(bag["/odom"].stamp, bag.times("/odom"), atol=1e-9)
+    np.testing.assert_allclose(bag["/odom"].stamp, bag["/odom"].time, atol=1e-9)
 
 
 def test_bag_says_how_it_was_made(result: RunResult) -> None:
