@@ -16,8 +16,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.messages.definitions import MessageType
-from spacerobot_ros.messages.layout import DTYPES, Columns, column_dtype, read_columns
+from spacerobot_ros.messages.definitions import DTYPES, MessageType
+from spacerobot_ros.messages.layout import Columns, column_dtype, read_columns
 from spacerobot_ros.times import SECOND
 
 JOINT_STATE = "sensor_msgs/msg/JointState"

@@ -84,8 +84,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         self._compression, self._overwrite = compression, overwrite and not next_free
         self._chunk_size = chunk_size
         self._next_free = next_free
-        self.splits = 0
-        """Number of files started after the first one."""
         self._earlier_counts: Counter[int] = Counter()
         self._repeated: list[Callable[[McapFile], None]] = []
         """One function per attachment or metadata record; it adds the attachment or record to a
@@ -331,7 +329,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                 # A file of another bag has this number: in flight, the next number is used.
                 if self._overwrite:
                     raise
-        self.splits += 1
         for topic in done.topics.values():
             self._file.add_topic(topic)
         self._file.add_rosbag2_metadata()

@@ -17,6 +17,7 @@ from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 from rosbags.interfaces import Nodetype
 
 from spacerobot_ros.errors import RecordingError
@@ -70,8 +71,15 @@ no underscores.
 
 _SECTION_END = re.compile(r"^---[ \t]*\r?\n?", re.MULTILINE)
 
-_INTEGERS = {f"{kind}{bits}" for kind in ("int", "uint") for bits in (8, 16, 32, 64)}
-_PRIMITIVES = {"bool", "byte", "char", "float32", "float64", "string", "wstring", *_INTEGERS}
+DTYPES = {
+    **{name: np.dtype(name).newbyteorder("<") for name in ("bool", "float32", "float64")},
+    **{f"int{bits}": np.dtype(f"<i{bits // 8}") for bits in (8, 16, 32, 64)},
+    **{f"uint{bits}": np.dtype(f"<u{bits // 8}") for bits in (8, 16, 32, 64)},
+    **dict.fromkeys(("byte", "char"), np.dtype("u1")),
+}
+"""Number types in serialised messages, by their names in message definitions."""
+
+_PRIMITIVES = {"string", "wstring", *DTYPES}
 
 
 @cache

@@ -18,25 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
-from spacerobot_ros.messages.definitions import MessageType, installed_type
+from spacerobot_ros.messages.definitions import DTYPES, MessageType, installed_type
 from spacerobot_ros.times import SECOND
-
-DTYPES = {
-    "bool": np.dtype("?"),
-    "byte": np.dtype("u1"),
-    "char": np.dtype("u1"),
-    "int8": np.dtype("i1"),
-    "uint8": np.dtype("u1"),
-    "int16": np.dtype("<i2"),
-    "uint16": np.dtype("<u2"),
-    "int32": np.dtype("<i4"),
-    "uint32": np.dtype("<u4"),
-    "int64": np.dtype("<i8"),
-    "uint64": np.dtype("<u8"),
-    "float32": np.dtype("<f4"),
-    "float64": np.dtype("<f8"),
-}
-"""Number types in serialised messages, by their names in message definitions."""
 
 ENCAPSULATION = 4
 """Length of the CDR header, bytes; alignment is relative to the end of the header."""
@@ -294,30 +277,35 @@ def seconds_and_nanoseconds(times_ns: NDArray[np.int64]) -> NDArray[np.uint32]:
 # -- reading columns --------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
 class Columns:
     """Fields with the same position in all messages of a list, as arrays with one entry per
-    message."""
+    message.
 
-    def __init__(
-        self, matrix: NDArray[np.uint8], leaves: dict[str, Leaf], texts: dict[str, slice]
-    ) -> None:
-        self._matrix = matrix
-        self._leaves = leaves
-        self._texts = texts
+    Attributes
+    ----------
+    matrix
+        The messages, one per row.
+    layout
+        Layout of each message.
+    """
+
+    matrix: NDArray[np.uint8]
+    layout: Layout
 
     @property
     def paths(self) -> KeysView[str]:
         """The fields, such as ``pose.pose.position.x``."""
-        return self._leaves.keys()
+        return self.layout.leaves.keys()
 
     def constant(self, path: str) -> bool:
         """Whether a list of strings is identical in all messages."""
-        part = self._texts.get(path)
-        return part is not None and bool((self._matrix[:, part] == self._matrix[0, part]).all())
+        part = self.layout.texts.get(path)
+        return part is not None and bool((self.matrix[:, part] == self.matrix[0, part]).all())
 
     def __getitem__(self, path: str) -> NDArray[Any] | list[str]:
-        leaf = self._leaves[path]
-        rows = np.ascontiguousarray(self._matrix[:, leaf.offset : leaf.offset + leaf.size])
+        leaf = self.layout.leaves[path]
+        rows = np.ascontiguousarray(self.matrix[:, leaf.offset : leaf.offset + leaf.size])
         if leaf.dtype is None:
             return [row.tobytes().decode() for row in rows]
         column = rows.reshape(-1).view(leaf.dtype).reshape(len(rows), *leaf.shape)
@@ -344,10 +332,10 @@ def read_columns(messages: Sequence[bytes], kind: MessageType) -> Columns | None
         layout = Layout(messages[0], kind)
     except (IndexError, KeyError):
         return None
-    matrix = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
     if messages[0][:2] != LITTLE_ENDIAN:
         return None
+    matrix = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
     fixed = [slice(0, 2), *(slice(start, start + 4) for start in layout.lengths)]
     if any((matrix[:, part] != matrix[0, part]).any() for part in fixed):
         return None
-    return Columns(matrix, layout.leaves, layout.texts)
+    return Columns(matrix, layout)

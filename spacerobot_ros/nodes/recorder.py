@@ -161,7 +161,7 @@ class RecorderNode(FlightNode):
         self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
         self.create_timer(config.flush_period, self.flush, clock=steady)
         self.create_timer(_CHECK_PERIOD, self._check_file, clock=steady)
-        self._splits = 0
+        self._path = writer.path
         self._steps_back_of_one_clock = 0
         asked = Path(config.bag).name
         if asked and not writer.path.name.startswith((f"{Path(asked).stem}_", asked)):
@@ -370,11 +370,9 @@ class RecorderNode(FlightNode):
         recording.check()
         if recording.failure is not None:
             self._publish_state()
-        elif recording.writer.splits != self._splits:
-            self._splits = recording.writer.splits
-            self._report_bag_event(
-                EventKind.FILE_SPLIT, f"Recording continues in {recording.writer.path}."
-            )
+        elif recording.writer.path != self._path:
+            self._path = recording.writer.path
+            self._report_bag_event(EventKind.FILE_SPLIT, f"Recording continues in {self._path}.")
 
     def _report_bag_event(self, kind: EventKind, message: str, level: int = 0) -> None:
         bag = str(self.recording.writer.path) if self.recording is not None else ""

@@ -206,7 +206,7 @@ def test_a_compressed_file_is_read(tmp_path: Path) -> None:
         assert_has_all_that_rosbags_reads(table, folder)
     assert read_bag(file).path == file
     file.write_bytes(zstandard.compress(bytes(40_000_000)))
-    with pytest.raises(RecordingError, match="inflates to more than the 32000000 bytes"):
+    with pytest.raises(RecordingError, match=r"inflates to .*more than the 32000000 allowed"):
         read_bag(file)
     refused = CliRunner().invoke(main, ["salvage", str(file)]).stderr
     assert_one_sentence(refused, "is compressed: unpack it with 'zstd -d'")
