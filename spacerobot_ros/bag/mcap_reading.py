@@ -207,7 +207,7 @@ def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
             f"The bag {path} is empty: its writer stopped before it wrote anything."
         )
     require_mcap(path, start)
-    length = file.seek(0, os.SEEK_END)
+    length = file_size(file)
     file.seek(max(length - size, 0))
     if length < 2 * size or file.read(size) != MCAP0_MAGIC:
         if _is_being_written(file):
@@ -232,11 +232,8 @@ def _is_being_written(file: BinaryIO) -> bool:
 
 
 def file_size(file: BinaryIO) -> int:
-    """Return the size of an open file in bytes, without moving its read position."""
-    place = file.tell()
-    size = file.seek(0, os.SEEK_END)
-    file.seek(place)
-    return size
+    """Return the size of an open file in bytes."""
+    return os.fstat(file.fileno()).st_size
 
 
 # -- records ----------------------------------------------------------------------------------

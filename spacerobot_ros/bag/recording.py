@@ -144,19 +144,14 @@ class Recording:
         ``published_ns`` is the publication time of the message; 0 selects the recording time.
         """
         if self.state is not RecordingState.ON_CLOCK:
-            arrival_ns = self._wall_time()
-            if not self.running:
-                if self.state is RecordingState.PAUSED and channel in self.latched:
-                    self.latched[channel] = _EarlyMessage(
-                        channel, message, published_ns, arrival_ns
-                    )
+            arrived = _EarlyMessage(channel, message, published_ns, self._wall_time())
+            if self.state is RecordingState.PAUSED and channel in self.latched:
+                self.latched[channel] = arrived
+            elif self.state is RecordingState.WAITING:
+                self.early_messages.append(arrived)
+            if self.state is not RecordingState.ON_WALL_TIME:
                 return
-            if self.state is RecordingState.WAITING:
-                self.early_messages.append(
-                    _EarlyMessage(channel, message, published_ns, arrival_ns)
-                )
-                return
-            self.now_ns = arrival_ns
+            self.now_ns = arrived.arrival_ns
         try:
             self._write(channel, message, self.now_ns, published_ns or self.now_ns)
         except RecordingError as error:

@@ -241,29 +241,24 @@ class TopicSeries:
         Raises
         ------
         RecordingError
-            A message is damaged.
+            A message is damaged, or the messages are much larger than the bag's file.
         """
-        self._require_decodable()
-        for time_ns, data in zip(self.time_ns.tolist(), self.data, strict=True):
-            yield time_ns, self._decode_message(data)
-
-    @cached_property
-    def _messages(self) -> list[Any]:
-        self._require_decodable()
-        return [self._decode_message(data) for data in self.data]
-
-    @cached_property
-    def _columns(self) -> Columns | None:
-        return read_columns(self.data, self._kind)
-
-    def _require_decodable(self) -> None:
-        """Refuse to decode a topic that is much larger than the bag's file."""
         size = sum(map(len, self.data))
         if size > self._max_decoded_bytes:
             raise RecordingError(
                 f"The messages on {self.topic} total {size} bytes; the limit "
                 f"for a bag of this size is {self._max_decoded_bytes:.0f} bytes."
             )
+        for time_ns, data in zip(self.time_ns.tolist(), self.data, strict=True):
+            yield time_ns, self._decode_message(data)
+
+    @cached_property
+    def _messages(self) -> list[Any]:
+        return [message for _, message in self.messages()]
+
+    @cached_property
+    def _columns(self) -> Columns | None:
+        return read_columns(self.data, self._kind)
 
     def _decode_message(self, data: bytes) -> Any:
         try:

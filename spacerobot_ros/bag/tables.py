@@ -41,11 +41,11 @@ _MAX_ARRAY_COLUMNS = 1000
 """Largest array that is split into columns; images, for example, are larger and are not split."""
 
 _JOINT_UNITS = {
-    "position": ("m", "rad"),
-    "velocity": ("m/s", "rad/s"),
-    "effort": ("N", "N m"),
+    "position": {True: "m", False: "rad"},
+    "velocity": {True: "m/s", False: "rad/s"},
+    "effort": {True: "N", False: "N m"},
 }
-"""Joint state units: for prismatic and for revolute joints."""
+"""Joint state units, by whether the joint is prismatic."""
 
 _THRUSTER_UNITS = {"position": "s", "velocity": "1", "effort": "N"}
 _MOMENTUM_UNITS = {"linear": "kg m/s", "angular": "kg m^2/s", "kinetic": "J"}
@@ -212,13 +212,12 @@ def array_field(
     """
     width = values.shape[1]
     if names and width == len(names):
-        thrusters = topic == "thrusters"
-        column_kind = "thruster" if thrusters else "joint"
-        units = tuple(
-            _THRUSTER_UNITS.get(path, "") if thrusters else _joint_unit(path, prismatic.get(name))
-            for name in names
-        )
-        return Field(path, values, units, tuple(names), column_kind)
+        if topic == "thrusters":
+            units = (_THRUSTER_UNITS.get(path, ""),) * width
+            return Field(path, values, units, tuple(names), "thruster")
+        by_kind = _JOINT_UNITS.get(path, {})
+        units = tuple(by_kind.get(prismatic[n], "") if n in prismatic else "" for n in names)
+        return Field(path, values, units, tuple(names), "joint")
     stack = TOPICS.get(topic)
     labels = stack.state[0].array_entry_names if stack is not None and stack.state else ()
     if path != "data" or len(labels) != width:
@@ -259,12 +258,6 @@ def _euler_angles(quaternions: NDArray[np.float64]) -> tuple[NDArray[np.float64]
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arctan2(2 * (w * y - x * z), np.hypot(along, across))
     return roll, pitch, np.arctan2(across, along)
-
-
-def _joint_unit(path: str, is_prismatic: bool | None) -> str:
-    if path not in _JOINT_UNITS or is_prismatic is None:
-        return ""
-    return _JOINT_UNITS[path][0 if is_prismatic else 1]
 
 
 def _json_value(value: Any) -> Any:

@@ -200,7 +200,13 @@ class _InterfaceName:
         return f"{self.package}/{self.kind}/{self.whole}"
 
     def file(self) -> Path:
-        share = _share_folder(self.package)
+        # Packages from pip are below the environment's prefix and set no search path.
+        share = installed_share_directory(self.package) or Path(sys.prefix, "share", self.package)
+        if not share.is_dir():
+            raise RecordingError(
+                f"The message package {self.package} is neither on AMENT_PREFIX_PATH nor in "
+                f"{share.parent}: install it, or source the workspace that contains it."
+            )
         path = share / self.kind / f"{self.interface}.{self.kind}"
         if not path.is_file():
             raise RecordingError(
@@ -218,17 +224,6 @@ class _InterfaceName:
         if isinstance(section, str):
             return section.format(f"{self.package}/{self.interface}")
         return [*_SECTION_END.split(text), "", ""][section]
-
-
-def _share_folder(package: str) -> Path:
-    # Packages from pip are below the environment's prefix and set no search path.
-    folder = installed_share_directory(package) or Path(sys.prefix) / "share" / package
-    if not folder.is_dir():
-        raise RecordingError(
-            f"The message package {package} is neither on AMENT_PREFIX_PATH nor in "
-            f"{folder.parent}: install it, or source the workspace that contains it."
-        )
-    return folder
 
 
 # -- parsed types -----------------------------------------------------------------------------

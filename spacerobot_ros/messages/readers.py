@@ -242,10 +242,9 @@ class JointReader:
         max_size = _HEADER_BYTES + 2 * own + _OTHER_JOINTS_BYTES
         self.values: dict[str, Array] = {name: np.zeros(len(joint_names)) for name in quantities}
         self._reader = TemplateReader(JOINT_STATE, max_size)
-        self._problem = ""
+        self._problem: tuple[type[CommandError], str] | None = None
+        """Error to raise for messages with this layout."""
         self._order = _JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
-        self._missing = ""
-        """A joint missing from measured states with this layout; empty if no joint is missing."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
         """Joints received since the last complete state; their values are in ``values``."""
 
@@ -324,10 +323,9 @@ class JointReader:
         """
         if self._reader.accept(raw):
             self._check_names_and_lengths()
-        if self._problem:
-            raise CommandError(self._problem)
-        if self._missing:
-            raise MissingJointError(f"joint '{self._missing}' is missing")
+        if self._problem is not None:
+            kind, clause = self._problem
+            raise kind(clause)
 
     @property
     def stamp_ns(self) -> int:
@@ -336,7 +334,7 @@ class JointReader:
 
     def _check_names_and_lengths(self) -> None:
         names = self._reader.texts("name")
-        self._problem = self._missing = ""
+        self._problem = None
         try:
             self._order = self._order_of(names)
             for i, quantity in enumerate(self._quantities):
@@ -347,13 +345,14 @@ class JointReader:
                         f"{counted(count, f'{quantity} value')}"
                     )
         except CommandError as error:
-            self._problem = str(error)
+            self._problem = CommandError, str(error)
             return
-        present = set(self._order.of_model.tolist())
-        self._missing = next((n for i, n in enumerate(self._joints) if i not in present), "")
-        if not self._missing:
-            for values in self.values.values():
-                values[:] = 0.0
+        for i, name in enumerate(self._joints):
+            if i not in self._order.of_model:
+                self._problem = MissingJointError, f"joint '{name}' is missing"
+                return
+        for values in self.values.values():
+            values[:] = 0.0
 
     def _order_of(self, named: Sequence[str]) -> _JointOrder:
         """Return the order of named joints; a measured state may lack joints and name others, if it
