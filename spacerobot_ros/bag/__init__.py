@@ -8,8 +8,8 @@ from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile
-    from spacerobot_ros.bag.playback import Playback, ReplayMessage, ReplayTopic
+    from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile, RecordedTopic
+    from spacerobot_ros.bag.playback import Playback, ReplayMessage
     from spacerobot_ros.bag.reader import Bag, RecordedRobot, read_bag
     from spacerobot_ros.bag.recording import Recording, RecordingState
     from spacerobot_ros.bag.series import TopicSeries
@@ -23,11 +23,11 @@ __all__ = [
     "Playback",
     "QosProfile",
     "RecordedRobot",
+    "RecordedTopic",
     "Recording",
     "RecordingError",
     "RecordingState",
     "ReplayMessage",
-    "ReplayTopic",
     "TopicSeries",
     "free_name",
     "message_definition",
@@ -41,9 +41,9 @@ __getattr__ = lazy_names(
     {
         "LATCHED": "spacerobot_ros.bag.mcap_file",
         "QosProfile": "spacerobot_ros.bag.mcap_file",
+        "RecordedTopic": "spacerobot_ros.bag.mcap_file",
         "Playback": "spacerobot_ros.bag.playback",
         "ReplayMessage": "spacerobot_ros.bag.playback",
-        "ReplayTopic": "spacerobot_ros.bag.playback",
         "Bag": "spacerobot_ros.bag.reader",
         "RecordedRobot": "spacerobot_ros.bag.reader",
         "read_bag": "spacerobot_ros.bag.reader",

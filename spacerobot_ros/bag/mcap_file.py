@@ -136,12 +136,12 @@ _METADATA_VERSION = 9
 
 @dataclass(frozen=True)
 class RecordedTopic:
-    """One topic of a bag: name, type, type hash and offered QoS."""
+    """One topic of a bag: name, type, offered QoS, and type hash if known."""
 
     name: str
     type_name: str
-    type_hash: str
     qos: QosProfile
+    type_hash: str = ""
 
 
 # -- the file ---------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice, starmap
 
-from spacerobot_ros.bag.mcap_file import QosProfile
+from spacerobot_ros.bag.mcap_file import QosProfile, RecordedTopic
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.events import SECONDS, KeyValueField, KeyValueFormat, number_format
@@ -18,20 +18,6 @@ _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
 
 _MAX_REPLAYED_TOPICS = 1000
 """Largest number of replayed topics: each requires a publisher, memory and discovery."""
-
-
-@dataclass(frozen=True)
-class ReplayTopic:
-    """A topic to publish: its name, type and QoS in the bag."""
-
-    name: str
-    type_name: str
-    qos: QosProfile
-
-    @property
-    def latched(self) -> bool:
-        """Whether late subscribers receive the last message."""
-        return self.qos.durability == "transient_local"
 
 
 @dataclass(frozen=True)
@@ -201,7 +187,8 @@ class Playback:
         """Time from the first to the last replayed message, s."""
         self._names = [_with_slash(name) for name in topics or bag.topics]
         profiles = {name: [*bag.qos(name), QosProfile()][0] for name in self._names}
-        self.topics = [ReplayTopic(name, bag.topics[name], profiles[name]) for name in self._names]
+        self.topics = [RecordedTopic(name, bag.topics[name], profiles[name]) for name in profiles]
+        """The topics to publish."""
         self._rate = rate
         self._bag_ns = self.start_ns
         self._clock_ns: int | None = None
@@ -329,7 +316,7 @@ class Playback:
 
     def _last_messages(self, time_ns: int, since_ns: int, until_ns: int) -> list[ReplayMessage]:
         """Return the last message of each topic, oldest first, to be published at a given time."""
-        latched = [topic.name for topic in self.topics if topic.latched]
+        latched = [each.name for each in self.topics if each.qos.durability == "transient_local"]
         last: dict[str, ReplayMessage] = {}
         spans = (latched, 0, time_ns - 1), (self._names, since_ns, until_ns)
         for names, begin, end in spans:
@@ -338,8 +325,7 @@ class Playback:
         return [replace(message, log_time_ns=time_ns) for message in ordered]
 
     def _messages(self, names: list[str], start_ns: int, end_ns: int) -> Iterator[ReplayMessage]:
-        if start_ns <= end_ns:
-            yield from starmap(ReplayMessage, self._bag.raw_messages(names, start_ns, end_ns))
+        return starmap(ReplayMessage, self._bag.raw_messages(names, start_ns, end_ns))
 
 
 def _with_slash(topic: str) -> str:

@@ -194,8 +194,8 @@ class _Copy:
                     self._file.topics[number] = RecordedTopic(
                         channel.topic,
                         type_name,
+                        [*profiles, QosProfile()][0],
                         words.get("topic_type_hash", ""),
-                        profiles[0] if profiles else QosProfile(),
                     )
             case Attachment() as file:
                 self._file.add_attachment(0, file.log_time, file.name, file.media_type, file.data)

@@ -178,7 +178,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
                         f"{type_name}."
                     )
                 return channel
-        topic = RecordedTopic(name, type_name, type_hash(type_name), qos or QosProfile())
+        topic = RecordedTopic(name, type_name, qos or QosProfile(), type_hash(type_name))
         return self._file.add_topic(topic)
 
     def write(self, channel_id: int, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
