@@ -286,12 +286,10 @@ def parse_record(record: bytes) -> McapRecord | None:
 
 def read_record(file: BinaryIO, place: int, kind: type[RecordT]) -> RecordT:
     """Return the record of the given kind at byte ``place`` of a file."""
-    for _, _, record in records(file, place):
-        found = parse_record(record)
-        if isinstance(found, kind):
-            return found
-        break
-    raise ValueError(f"the file has no {kind.__name__} record at byte {place}")
+    found = next((parse_record(record) for _, _, record in records(file, place)), None)
+    if not isinstance(found, kind):
+        raise ValueError(f"the file has no {kind.__name__} record at byte {place}")
+    return found
 
 
 # -- chunks -----------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
@@ -96,28 +96,22 @@ def message_definition(type_name: str) -> str:
     RecordingError
         The name is not a message type, or a required package is neither installed nor in Jazzy.
     """
-    return _of_installed_or_jazzy(
-        type_name,
-        lambda name: _with_dependencies(name, set()),
-        lambda jazzy, name: jazzy.generate_msgdef(name, ros_version=2)[0],
-    )
-
-
-def _of_installed_or_jazzy(
-    type_name: str,
-    of_installed: Callable[[_InterfaceName], str],
-    of_jazzy: Callable[[Typestore, str], str],
-) -> str:
     name = _InterfaceName.of(type_name)
     try:
-        return of_installed(name)
-    except RecordingError:
-        from rosbags.typesys import Stores, get_typestore
+        return _with_dependencies(name, set())
+    except RecordingError as error:
+        return _jazzy_with(name, error).generate_msgdef(name.full, ros_version=2)[0]
 
-        jazzy = get_typestore(Stores.ROS2_JAZZY)
-        if name.full not in jazzy.fielddefs:
-            raise
-        return of_jazzy(jazzy, name.full)
+
+def _jazzy_with(name: _InterfaceName, error: RecordingError) -> Typestore:
+    """Return the types of ROS 2 Jazzy, which replace missing packages; raise ``error`` if the type
+    is not among them."""
+    from rosbags.typesys import Stores, get_typestore
+
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    if name.full not in jazzy.fielddefs:
+        raise error
+    return jazzy
 
 
 def _with_dependencies(name: _InterfaceName, seen: set[str]) -> str:
@@ -144,17 +138,15 @@ def type_hash(type_name: str) -> str:
     installed without type descriptions (``share/<package>/msg/<Type>.json``). Raises as
     :func:`message_definition` does.
     """
-
-    def of_installed(name: _InterfaceName) -> str:
+    name = _InterfaceName.of(type_name)
+    try:
         description = name.file().with_suffix(".json")
-        if not description.is_file():
-            return ""
-        hashes = json.loads(description.read_bytes())["type_hashes"]
-        return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name.full), "")
-
-    return _of_installed_or_jazzy(
-        type_name, of_installed, lambda jazzy, name: jazzy.hash_rihs01(name)
-    )
+    except RecordingError as error:
+        return _jazzy_with(name, error).hash_rihs01(name.full)
+    if not description.is_file():
+        return ""
+    hashes = json.loads(description.read_bytes())["type_hashes"]
+    return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name.full), "")
 
 
 def message_module(type_name: str) -> tuple[str, str, str]:
