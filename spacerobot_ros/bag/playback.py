@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from itertools import chain, islice, starmap
 
 from spacerobot_ros.bag.mcap_file import QosProfile, RecordedTopic
+from spacerobot_ros.bag.mcap_reading import LATEST_TIME_NS
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.events import SECONDS, KeyValueField, KeyValueFormat, number_format
 from spacerobot_ros.times import SECOND
 
-_LATEST_TIME_NS = 2**63 - 1
 _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
 
 _MAX_REPLAYED_TOPICS = 1000
@@ -178,10 +178,10 @@ class Playback:
             )
         self._bag = bag
         self._loop = loop
-        self.start_ns = min(bag.start_time_ns + round(start * SECOND), _LATEST_TIME_NS)
+        self.start_ns = min(bag.start_time_ns + round(start * SECOND), LATEST_TIME_NS)
         """Log time at which the replay starts, ns."""
-        end_ns = self.start_ns + round(duration * SECOND) if duration else _LATEST_TIME_NS
-        self._end_ns = min(end_ns, _LATEST_TIME_NS)
+        end_ns = self.start_ns + round(duration * SECOND) if duration else LATEST_TIME_NS
+        self._end_ns = min(end_ns, LATEST_TIME_NS)
         self._last_ns = max(min(bag.end_time_ns, self._end_ns), self.start_ns)
         self.duration_s = (self._last_ns - self.start_ns) / SECOND
         """Time from the first to the last replayed message, s."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from spacerobot_ros.bag.mcap_file import QosProfile
 from spacerobot_ros.bag.mcap_reading import (
+    LATEST_TIME_NS,
     BagFile,
     RecordedChannel,
     RecordT,
@@ -249,7 +250,7 @@ class Bag(Mapping[str, TopicSeries]):
         return sum(channel.message_count for channel in self._channels(topic))
 
     def raw_messages(
-        self, topics: Sequence[str], start_ns: int = 0, end_ns: int = 2**63 - 1
+        self, topics: Sequence[str], start_ns: int = 0, end_ns: int = LATEST_TIME_NS
     ) -> Iterator[tuple[str, int, bytes]]:
         """Iterate over the serialised messages on some topics, in log time order.
 
