@@ -107,7 +107,6 @@ class Recording:
         self.early_messages: list[_EarlyMessage] = []
         """Messages kept until the bag's time base is chosen."""
         self._time_base: RecordingState | None = None
-        self._write = writer.write
 
     @property
     def running(self) -> bool:
@@ -152,8 +151,11 @@ class Recording:
             if self.state is not RecordingState.ON_WALL_TIME:
                 return
             self.now_ns = arrived.arrival_ns
+        self._write(channel, message, self.now_ns, published_ns or self.now_ns)
+
+    def _write(self, channel: int, message: bytes, log_ns: int, published_ns: int) -> None:
         try:
-            self._write(channel, message, self.now_ns, published_ns or self.now_ns)
+            self.writer.write(channel, message, log_ns, published_ns)
         except RecordingError as error:
             self._fail(error)
             return
@@ -224,14 +226,10 @@ class Recording:
             self.state = state
         on_clock = state is RecordingState.ON_CLOCK
         early, self.early_messages = self.early_messages, []
-
-        def write_early_messages() -> None:
-            for channel, message, published_ns, arrival_ns in early:
+        for channel, message, published_ns, arrival_ns in early:
+            if self.failure is None:
                 log_ns = self.now_ns if on_clock else arrival_ns
                 self._write(channel, message, log_ns, published_ns or log_ns)
-                self.messages += 1
-
-        self._fail_on_error(write_early_messages)
 
     def _fail_on_error(self, act: Callable[[], None]) -> None:
         if self.failure is None and self.state is not RecordingState.CLOSED:

@@ -200,20 +200,15 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         RecordingError
             Writing fails or has failed earlier, the channel is unknown, or a time is negative.
         """
-        if self._refusal is not None or channel_id not in self._file.topics:
+        if self._refusal is None and channel_id not in self._file.topics:
             raise RecordingError(
-                self._refusal
-                or f"The bag {self.path} has no channel {channel_id}: use channels from add_topic."
+                f"The bag {self.path} has no channel {channel_id}: use channels from add_topic."
             )
         if log_time_ns < 0 or publish_time_ns < 0:
             raise RecordingError(f"The bag {self.path} cannot store negative times.")
-        try:
+        with self._adding():
             self._file.add_message(channel_id, log_time_ns, data, publish_time_ns)
-        except RecordingError as error:
-            self._refusal = str(error)
-            raise
-        if not self._file.bytes_waiting and self._is_full():
-            with self._adding():
+            if not self._file.bytes_waiting and self._is_full():
                 self._begin_next_file()
 
     def add_attachment(self, name: str, data: bytes, media_type: str, log_time_ns: int) -> None:

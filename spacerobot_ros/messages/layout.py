@@ -102,40 +102,37 @@ class Layout:
 
     def _walk(self, type_name: str, prefix: str | None) -> None:
         """Add the fields of a type below ``prefix``; None if the fields get no paths."""
-        for name, (kind, detail) in self._fields[type_name][1]:
-            path = None if prefix is None else prefix + name
-            if kind == Nodetype.BASE:
-                self._add_value(detail[0], path)
-            elif kind == Nodetype.NAME:
-                self._walk(detail, None if path is None else f"{path}.")
-            else:
-                element, count = detail
-                self._add_list(
-                    element, self._read_length() if kind == Nodetype.SEQUENCE else count, path
-                )
+        for name, node in self._fields[type_name][1]:
+            self._add(node, None if prefix is None else prefix + name)
+
+    def _add(self, node: Any, path: str | None) -> None:
+        kind, detail = node
+        if kind == Nodetype.NAME:
+            self._walk(detail, None if path is None else f"{path}.")
+        elif kind != Nodetype.BASE:
+            element, count = detail
+            self._add_list(
+                element, self._read_length() if kind == Nodetype.SEQUENCE else count, path
+            )
+        elif detail[0] == "string":
+            self._add_string(path)
+        else:
+            self._add_numbers(DTYPES[detail[0]], path, ())
 
     def _add_list(self, element: tuple[Any, Any], count: int, path: str | None) -> None:
         kind, detail = element
         if kind == Nodetype.BASE and detail[0] != "string":
             self._add_numbers(DTYPES[detail[0]], path, (count,))
             return
-        begin, inner = self.end, None
+        begin, named = self.end, self._elements and path is not None
         for i in range(count):
-            if self._elements and path is not None:
-                inner = f"{path}[{i}]"
-            if kind == Nodetype.NAME:
-                self._walk(detail, None if inner is None else f"{inner}.")
-            else:
-                self._add_value(detail[0], inner)
+            self._add(element, f"{path}[{i}]" if named else None)
         if path is not None:
             self.counts[path] = count
             if kind == Nodetype.BASE:
                 self.texts[path] = slice(begin, self.end)
 
-    def _add_value(self, base: str, path: str | None) -> None:
-        if base != "string":
-            self._add_numbers(DTYPES[base], path, ())
-            return
+    def _add_string(self, path: str | None) -> None:
         length = self._read_length()
         self.fixed.append((self.end, self.end + length))
         begin = self.end
