@@ -11,7 +11,7 @@ from spacerobot_ros.bag.mcap_file import QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import LATEST_TIME_NS
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.errors import ParameterError, RecordingError
-from spacerobot_ros.events import SECONDS, KeyValueField, KeyValueFormat, number_format
+from spacerobot_ros.events import PLAIN_TEXT, SECONDS, KeyValueField, KeyValueFormat, number_format
 from spacerobot_ros.times import SECOND
 
 _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
@@ -28,22 +28,20 @@ class ReplayStatus:
     ----------
     position_s, duration_s
         Replay time since the first message, and time from the first to the last message, s.
-    paused, ended
-        Whether the replay is paused, and whether all messages have been published.
+    state
+        ``playing``, ``paused``, or ``ended`` if all messages have been published.
     rate
         Bag seconds per second of wall time.
     """
 
     position_s: float
     duration_s: float
-    paused: bool
-    ended: bool
+    state: str
     rate: float
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus."""
-        state = "ended" if self.ended else "paused" if self.paused else "playing"
-        return {"state": state, **_STATUS_FORMAT.to_values(self)}
+        return _STATUS_FORMAT.to_values(self)
 
     @classmethod
     def from_values(cls, values: Mapping[str, str]) -> ReplayStatus:
@@ -54,14 +52,12 @@ class ReplayStatus:
         SpaceRobotError
             The pairs are not a replay status.
         """
-        with _STATUS_FORMAT.reading():
-            state = values["state"]
-        paused, ended = state != "playing", state == "ended"
-        return _STATUS_FORMAT.from_values(cls, values, paused=paused, ended=ended)
+        return _STATUS_FORMAT.from_values(cls, values)
 
 
 _STATUS_FORMAT = KeyValueFormat(
     "status of a replay",
+    KeyValueField("state", PLAIN_TEXT),
     KeyValueField("position_s", SECONDS),
     KeyValueField("duration_s", SECONDS),
     KeyValueField("rate", number_format(".9g")),

@@ -293,7 +293,7 @@ message_type = lru_cache(maxsize=64)(MessageType)
 @cache
 def installed_type(type_name: str) -> MessageType:
     """Return a message type of an installed package. Raises as :func:`message_definition` does."""
-    return MessageType(type_name, message_definition(type_name).encode())
+    return message_type(type_name, message_definition(type_name).encode())
 
 
 @contextmanager

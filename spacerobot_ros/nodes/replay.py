@@ -326,11 +326,11 @@ class ReplayNode(FlightNode):
     def _publish_status(self) -> None:
         playback = self._playback
         position = playback.bag_time(self._now()) - playback.start_ns
+        state = "paused" if self._paused or not self._begun else "playing"
         status = ReplayStatus(
             position_s=min(max(position / SECOND, 0.0), playback.duration_s),
             duration_s=playback.duration_s,
-            paused=self._paused or not self._begun,
-            ended=playback.ended,
+            state="ended" if playback.ended else state,
             rate=self.config.rate,
         )
         message = f"The replay is at {status.position_s:.3f} s of {status.duration_s:.3f} s."

@@ -67,7 +67,7 @@ _ENDED = "The stack has ended: none of its nodes responds."
 
 def silence_message(state: StackState) -> str:
     """Return a message if states no longer arrive or never arrived, otherwise an empty string."""
-    if state.replay is not None and (state.replay.paused or state.replay.ended):
+    if state.replay is not None and state.replay.state != "playing":
         return ""
     if state.age_s == math.inf:
         return "No state received yet: no plant is running in this ROS domain and namespace."
@@ -145,8 +145,7 @@ def status_html(
         lines.append(_line_html(text + _to_go_text(left), None))
     if state.replay is not None:
         replay = state.replay
-        word = "ended" if replay.ended else "paused" if replay.paused else "playing"
-        text = f"Replay {word}: {replay.position_s:.2f} s of {replay.duration_s:.2f} s"
+        text = f"Replay {replay.state}: {replay.position_s:.2f} s of {replay.duration_s:.2f} s"
         lines.append(_line_html(text, 0))
     if state.plant is not None:
         plant = state.plant

@@ -195,7 +195,7 @@ def test_statuses_are_read_by_the_kind_of_their_node(viewed: Viewed) -> None:
     planner = PlannerStatus(PlannerState.PLANNING, "A plan is made.", goal=pose)
     controller = ControllerStatus(ControllerState.TRACKING, "The goal is approached.")
     plant = PlantStatus(PlantState.RUNNING, "A command is active.")
-    replay = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.5)
+    replay = ReplayStatus(1.0, 2.0, state="paused", rate=1.5)
     for name, status in (
         ("planner", planner),
         ("controller", controller),
@@ -468,7 +468,7 @@ def test_a_replay_shows_what_nodes_reported_until_a_plant_begins(
     idle = PlannerStatus(PlannerState.IDLE)
     viewed.report("planner/status", idle, "/planner")
     beat(viewed, "/planner", HeartbeatState.ACTIVE, Role.COMMANDER)
-    status = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
+    status = ReplayStatus(1.0, 2.0, state="paused", rate=1.0)
     viewed.report("replay/status", status, "/replay")
     beat(viewed, "/replay", HeartbeatState.ACTIVE, Role.REPLAY)
     beat(viewed, "/live_plant", HeartbeatState.ACTIVE, Role.PLANT)

@@ -145,7 +145,7 @@ def _controlled() -> dict[str, Any]:
 def _replayed() -> dict[str, Any]:
     """A recording of sliding masses, in which a user jumps."""
     seen = _Situation("sliding_masses")
-    replay = ReplayStatus(3.0, 41.5, paused=False, ended=False, rate=2.0)
+    replay = ReplayStatus(3.0, 41.5, state="playing", rate=2.0)
     state = StackState(measured=seen.measured(13.0, 0.0), age_s=2.5, replay=replay)
     seen.show(state)
     group = next(e for e in seen.server.gui.elements if e.shown.get("options") == ("Play", "Hold"))

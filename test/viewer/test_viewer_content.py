@@ -84,10 +84,10 @@ def test_silence_is_said() -> None:
     assert content.silence_message(replace(STATE, age_s=5.9)) == "No state for 5 s."
     paused = PlantStatus(PlantState.PAUSED, "Time stands still.")
     assert content.silence_message(replace(STATE, age_s=5.9, plant=paused)) == ""
-    held = ReplayStatus(1.0, 2.0, paused=True, ended=False, rate=1.0)
+    held = ReplayStatus(1.0, 2.0, state="paused", rate=1.0)
     assert content.silence_message(replace(STATE, age_s=5.9, replay=held)) == ""
     assert content.silence_message(StackState(replay=held)) == "", "it has not begun"
-    plays = replace(held, paused=False)
+    plays = replace(held, state="playing")
     assert content.silence_message(replace(STATE, age_s=5.9, replay=plays)) == "No state for 5 s."
     head = content.status_html(replace(STATE, silent={"/planner": 3.2}))
     assert "Node &#x27;/planner&#x27; has been silent for 3 s." in head

@@ -387,7 +387,7 @@ def test_a_replay_has_a_time_line(harness: Harness) -> None:
     harness.matched(status)
 
     def tell(position: float) -> bool:
-        replay = ReplayStatus(position, 20.0, paused=False, ended=False, rate=1.0)
+        replay = ReplayStatus(position, 20.0, state="playing", rate=1.0)
         values = [KeyValue(key=k, value=v) for k, v in replay.to_values().items()]
         status.publish(DiagnosticStatus(name="/replay", values=values))
         return False
