@@ -215,14 +215,14 @@ def _field_value(kind: MessageType, node: Any, value: Any) -> Any:
         zero = "" if detail[0] == "string" else 0
         return zero if value is None else value
     element, count = detail
-    if value is None:
-        value = [None] * count if node_type == Nodetype.ARRAY else []
+    size = count if node_type == Nodetype.ARRAY else 0
     if element[0] == Nodetype.NAME or element[1][0] == "string":
-        return [_field_value(kind, element, each) for each in value]
-    dtype = DTYPES[element[1][0]]
-    numbers = np.zeros(count, dtype) if value[:1] == [None] else np.ascontiguousarray(value, dtype)
-    if numbers.shape != (count if node_type == Nodetype.ARRAY else len(value),):
-        raise ValueError(f"{count} numbers are required; the shape is {numbers.shape}")
+        elements = [None] * size if value is None else value
+        return [_field_value(kind, element, each) for each in elements]
+    given = np.zeros(size) if value is None else value
+    numbers = np.ascontiguousarray(given, DTYPES[element[1][0]])
+    if numbers.shape != (size or len(numbers),):
+        raise ValueError(f"{size} numbers are required; the shape is {numbers.shape}")
     return numbers
 
 

@@ -175,6 +175,13 @@ def test_a_field_that_a_type_lacks_is_not_encoded() -> None:
         encode("nav_msgs/msg/Odometry", {"pose": {"covariance": np.zeros(6)}})
 
 
+def test_arrays_may_be_empty() -> None:
+    raw = encode(
+        JOINT_STATE, {"name": [], "position": np.zeros(0), "effort": np.ones((3, 2))[:, 1]}
+    )
+    assert deserialize_message(raw, JointState) == JointState(effort=[1.0] * 3)
+
+
 def test_whole_nanoseconds_are_a_time() -> None:
     raw = encode("rosgraph_msgs/msg/Clock", {"clock": 12_000_000_034})
     assert deserialize_message(raw, Clock) == Clock(clock=Time(sec=12, nanosec=34))
