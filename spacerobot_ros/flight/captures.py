@@ -258,13 +258,11 @@ def _impulses(flight: Flight, states: Signal, about: Array) -> Array:
 
 def _thrust_during_ticks_before(flight: Flight, times: Array) -> Array:
     """Return the thruster wrench (N, 6) on the base in the ticks that end at times (N,)."""
-    fired, commands = flight.signal("thruster_wrench"), flight.commands.get("base_wrench")
+    fired = flight.signal("thruster_wrench")
+    # A command acts in the tick that begins with its state.
+    thrust, delay = (fired, 0) if len(fired) else (flight.wrench, 1)
+    ends, own = (np.round(t / flight.control_period) for t in (times, thrust.time))
+    _, rows, other = np.intersect1d(ends, own + delay, return_indices=True)
     found = np.zeros((len(times), 6))
-    if len(fired):
-        _, own, other = np.intersect1d(times, fired.time, return_indices=True)
-        found[own] = fired.values[other]
-    elif commands is not None and len(commands.tick):
-        ticks = np.round(times / flight.control_period).astype(np.int64) - 1
-        _, own, other = np.intersect1d(ticks, commands.tick, return_indices=True)
-        found[own] = commands.values[other]
+    found[rows] = thrust.values[other]
     return found

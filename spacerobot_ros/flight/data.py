@@ -354,10 +354,14 @@ class FlightData:
         return command is not None and "attitude" in command.controls("end_effector")
 
     @property
+    def wrench(self) -> Signal:
+        """(N, 6) commanded thruster force (N) and torque (N m), in the base link frame."""
+        return self.commands.get("base_wrench", Signal.empty(6))
+
+    @property
     def has_thrust(self) -> bool:
         """Whether thruster forces or torques were commanded."""
-        wrench = self.commands.get("base_wrench")
-        return wrench is not None and bool(wrench.values.any())
+        return bool(self.wrench.values.any())
 
     @property
     def error(self) -> PoseError | None:

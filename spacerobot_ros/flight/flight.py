@@ -22,7 +22,6 @@ from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import counted, quantity, sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.data import FlightData
-from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import CaptureMeasures, Measures, Outcome, peak, peak_wrench
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
@@ -192,7 +191,6 @@ class Flight(FlightData):
 
         ``clearance``: whether to measure the smallest distance between links (slow).
         """
-        wrench = self.commands.get("base_wrench")
         distance, angle = self._largest_end_effector_errors
         return Measures(
             outcome=self.outcome,
@@ -202,7 +200,7 @@ class Flight(FlightData):
             error=self.error,
             peak_rate=peak(self.qdot),
             peak_effort=peak(self.effort),
-            peak_wrench=np.zeros(2) if wrench is None else peak_wrench(wrench.values),
+            peak_wrench=peak_wrench(self.wrench.values),
             lowest=self.q.min(axis=0),
             highest=self.q.max(axis=0),
             momentum_drift=self.momentum_drift,
@@ -245,10 +243,7 @@ class Flight(FlightData):
     def thrust_impulse(self) -> float:
         """Impulse of the thrusters since the start or the last reset, N s: the sum over all, or of
         the commanded force; 0: none."""
-        thrust, commands = self.signal("thruster_force"), self.commands.get("base_wrench")
-        if not len(thrust) and commands is not None:
-            time = commands.tick * np.float64(self.control_period)
-            thrust = Signal(time, commands.values).norms([0, 1, 2])
+        thrust = self.signal("thruster_force") or self.wrench.norms([0, 1, 2])
         first = max([1, *thrust.rows_after(self.resets)])
         return float(thrust.values[first:].sum() * self.control_period)
 

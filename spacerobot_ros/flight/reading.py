@@ -87,9 +87,11 @@ class FlightBag(RecordedRobot):
         The recording.
     namespace
         Namespace of the robot's topics, such as ``/robot_1``; empty if there is no namespace.
+    from_start
+        Whether times begin at the first state.
     """
 
-    def __init__(self, bag: Bag, namespace: str = "") -> None:
+    def __init__(self, bag: Bag, namespace: str = "", *, from_start: bool = False) -> None:
         super().__init__(bag, namespace)
         self.path = bag.path
         self.load(_FLIGHT_TOPICS)
@@ -97,8 +99,11 @@ class FlightBag(RecordedRobot):
             series for name in ("odom", "joint_states", "momentum") if (series := self.get(name))
         ]
         self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK_TOLERANCE for s in states)
+        self._zero = 0.0
         self.began = min((self._times(s)[0] for s in states), default=bag.start_time)
-        """Time of the first state, s."""
+        """Time of the first state according to the bag's clock, s."""
+        if from_start:
+            self._zero = self.began
 
     def messages(self, name: str) -> Iterator[tuple[int, Any]]:
         """Iterate over the messages of a topic, each with its log time in ns."""
@@ -143,7 +148,9 @@ class FlightBag(RecordedRobot):
 
     # -- signals ------------------------------------------------------------------------------
 
-    def signal(self, name: str, fields: Sequence[str], width: int) -> Signal:
+    def signal(
+        self, name: str, fields: Sequence[str], width: int, joints: Sequence[str] = ()
+    ) -> Signal:
         """Return fields of a topic over time, omitting messages that lack a field.
 
         Parameters
@@ -151,16 +158,18 @@ class FlightBag(RecordedRobot):
         name
             The topic.
         fields
-            Paths of numbers, or of one array; joints and thrusters are in the order of the first
-            message.
+            Paths of numbers, or of one array.
         width
             Number of columns.
+        joints
+            Names of the joints or thrusters, in the order of the columns; by default, those in the
+            first message.
         """
         series = self.get(name)
         if series is None:
             return Signal.empty(width)
         if topic_named(name).type == TOPICS["joint_states"].type:
-            names = self.names(name)
+            names = joints or self.names(name)
             values = np.hstack([series.of_joints(path, names) for path in fields])
         else:
             values = series.table(fields, width)
@@ -203,32 +212,35 @@ class FlightBag(RecordedRobot):
         return found
 
     def _times(self, series: TopicSeries) -> Array:
-        return series.stamp if self.stamped else series.time
+        return (series.stamp if self.stamped else series.time) - self._zero
 
     # -- reports ------------------------------------------------------------------------------
 
     def statuses(self, commander: str) -> Iterator[tuple[int, Status | str]]:
-        """Yield a commander's statuses with their log times, ns.
+        """Yield a commander's statuses with their times, ns.
 
         For a status from another package, only the message is returned.
         """
         topic, read = STATUS_TOPICS[commander]
-        for time_ns, recorded in self.messages(topic):
-            message = read_status(recorded)
+        zero_ns = round(self._zero * SECOND)
+        for log_time_ns, recorded in self.messages(topic):
+            time_ns, message = log_time_ns - zero_ns, read_status(recorded)
             try:
                 yield time_ns, read(message.values, message.message)
             except SpaceRobotError:
                 yield time_ns, message.message
 
-    def events(self) -> Iterator[tuple[int, Event]]:
-        """Yield the events with their log times, ns."""
+    def events(self) -> Iterator[Event]:
+        """Yield the events, with their log times if stamps come from another clock."""
         for time_ns, recorded in self.messages("events"):
             message = read_status(recorded)
             try:
                 event = Event.from_values(message.values, message.message, message.level)
             except SpaceRobotError:
                 continue  # The event is from a later version.
-            yield time_ns, replace(event, node=message.name.strip("/"))
+            time = event.time_s if self.stamped else None
+            time = time_ns / SECOND if time is None else time
+            yield replace(event, node=message.name.strip("/"), time_s=time - self._zero)
 
     def goals(self, link: str = "") -> tuple[SentGoal, ...]:
         """Return the valid goals of the base, or of an end-effector, in the odometry frame; for a
@@ -259,7 +271,7 @@ class FlightBag(RecordedRobot):
                 except PlanningError:
                     continue
                 if not world or frame in ("", world):
-                    goals.append(SentGoal(time_ns / SECOND, goal, goal_id))
+                    goals.append(SentGoal(time_ns / SECOND - self._zero, goal, goal_id))
         return tuple(sorted(goals, key=lambda sent: sent.time))
 
     def _goal_shapes(self) -> list[tuple[int, list[float] | None]]:
@@ -274,21 +286,17 @@ class FlightBag(RecordedRobot):
                 shapes.append((time_ns, [given[name] for name in names]))
         return shapes
 
-    def commands(self, scenario: Scenario) -> dict[str, Commands]:
-        """Return the commands by topic."""
-        joints, config = self.names("joint_states"), scenario.plant
+    def commands(self, actuation: str) -> dict[str, Commands]:
+        """Return the commands by topic, for a plant with an actuation."""
+        joints = self.names("joint_states")
+        command = "velocity" if actuation == "velocity" else "effort"
+        fields = {"joint_commands": [command], "joint_reference": ["velocity"]}
+        fields["base_wrench"] = WRENCH_COLUMNS
         found = {}
-        for name in _COMMAND_TOPICS:
-            series = self.get(name)
-            if series is None:
-                continue
-            efforts = name == "joint_commands" and config.actuation != "velocity"
-            values = (
-                series.table(WRENCH_COLUMNS, 6)
-                if name == "base_wrench"
-                else series.of_joints("effort" if efforts else "velocity", joints)
-            )
-            found[name] = Commands(series.stamp_ns // config.period_ns, values)
+        for name in filter(self.__contains__, _COMMAND_TOPICS):
+            width = 6 if name == "base_wrench" else len(joints)
+            signal = self.signal(name, fields[name], width, joints)
+            found[name] = Commands(signal.time, signal.values)
         return found
 
 
@@ -308,7 +316,9 @@ def _completed(true: Signal, measured: Signal) -> Signal:
 # -- any bag ----------------------------------------------------------------------------------
 
 
-def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) -> FlightBag:
+def open_flight_bag(
+    path: str | os.PathLike[str], namespace: str | None = None, *, from_start: bool = False
+) -> FlightBag:
     """Open a bag.
 
     Parameters
@@ -318,6 +328,8 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
     namespace
         Namespace of the robot's topics, with or without the leading slash; None selects the first
         namespace with an ``odom`` topic, in alphabetical order.
+    from_start
+        Whether times begin at the first state.
 
     Raises
     ------
@@ -334,7 +346,7 @@ def open_flight_bag(path: str | os.PathLike[str], namespace: str | None = None) 
             raise RecordingError(
                 f"The bag {bag.path} has no robot in the namespace '{namespace}': it has {known}."
             )
-    return FlightBag(bag, chosen)
+    return FlightBag(bag, chosen, from_start=from_start)
 
 
 def _pose_of(stamped: Any) -> tuple[list[float], list[float]]:
@@ -385,14 +397,9 @@ def read_flight(bag: FlightBag) -> Flight:
         robot=description,
         joint_names=tuple(names),
         series=bag.series(),
-        commands=bag.commands(scenario),
+        commands=bag.commands(scenario.plant.actuation),
         statuses=tuple(sorted((s for each in statuses.values() for s in each), key=lambda s: s[0])),
-        events=tuple(
-            event
-            if bag.stamped and event.time_s is not None
-            else replace(event, time_s=time_ns / SECOND)
-            for time_ns, event in bag.events()
-        ),
+        events=tuple(bag.events()),
         outcome=Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value),
         message=status.message if status is not None else "",
         goal=goal_at_end(reports, goals),
@@ -449,31 +456,6 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
     thrust = flight.signal("thruster_force")
     used = impulse(thrust, table.mass_flow / table.force, flight.resets)
     return replace(flight, series={**series, "propellant": used})
-
-
-def since(flight: Flight, start: float) -> Flight:
-    """Return a flight whose times are relative to ``start``, s."""
-
-    def earlier(goals: tuple[SentGoal, ...]) -> tuple[SentGoal, ...]:
-        return tuple(replace(sent, time=sent.time - start) for sent in goals)
-
-    return replace(
-        flight,
-        series={
-            name: Signal(each.time - start, each.values) for name, each in flight.series.items()
-        },
-        commands={
-            name: replace(each, tick=each.tick - round(start / flight.control_period))
-            for name, each in flight.commands.items()
-        },
-        statuses=tuple((ns - round(start * SECOND), status) for ns, status in flight.statuses),
-        events=tuple(
-            each if each.time_s is None else replace(each, time_s=each.time_s - start)
-            for each in flight.events
-        ),
-        goals=earlier(flight.goals),
-        end_effector_goals=earlier(flight.end_effector_goals),
-    )
 
 
 def impulse(thrust: Signal, weights: Array, resets: Sequence[float] = ()) -> Signal:

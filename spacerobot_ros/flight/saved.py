@@ -313,7 +313,8 @@ def _command_streams(flight: FlightData) -> Iterator[_Stream]:
     period = flight.scenario.plant.period_ns
     velocity = flight.scenario.plant.actuation == "velocity"
     for name, commands in flight.commands.items():
-        stamps, kind = commands.tick * period, TOPICS[name].type
+        ticks = np.rint(commands.time / flight.control_period).astype(np.int64)
+        stamps, kind = ticks * period, TOPICS[name].type
         if name == "base_wrench":
             values: dict[str, Any] = {"header": {"frame_id": flight.required_robot().base_link}}
             path = "wrench.force.x"

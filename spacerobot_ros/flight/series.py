@@ -87,21 +87,14 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class Commands:
-    """The commands on one topic.
+class Commands(Signal):
+    """The commands on one topic as used by the plant or the controller, at the times of the states
+    to which they respond.
 
-    Attributes
-    ----------
-    tick
-        (N,) tick of the state to which each command responds.
-    values
-        (N, size) values used by the plant or the controller.
-    setpoints
-        (N, 2 n) joint positions and rates in a planner's messages; None if not known.
+    ``setpoints`` (N, 2 n) are the joint positions and rates in a planner's messages; None if not
+    known.
     """
 
-    tick: npt.NDArray[np.int64]
-    values: Array
     setpoints: Array | None = None
 
 
@@ -259,7 +252,7 @@ class FlightLog:
         time: Array = np.arange(len(table)) * self._period_ns / SECOND
         commands = {
             topic: Commands(
-                np.array([tick for tick, _ in sent], np.int64),
+                np.array([tick for tick, _ in sent], np.int64) * self._period_ns / SECOND,
                 np.array([values for _, values in sent]).reshape(len(sent), self._sizes[topic]),
                 np.array(self._setpoints[topic]) if topic in self._setpoints else None,
             )

@@ -68,8 +68,7 @@ class Animation:
 def figure(flight: FlightData) -> Picture:
     """Draw the base pose and its goal, the joints, and their efforts or rates."""
     efforts = flight.scenario.plant.actuation == "effort"
-    wrench = flight.commands.get("base_wrench")
-    thrust = wrench is not None and bool(np.any(wrench.values))
+    thrust = flight.has_thrust
     rows = 4 + thrust
     made = Picture(figsize=(8.0, 1.9 * rows + 0.6), layout="constrained")
     FigureCanvasAgg(made)
@@ -87,10 +86,10 @@ def figure(flight: FlightData) -> Picture:
         _plot_lines(panels[3], time, flight.effort, names, "joint efforts, N or N m")
     else:
         _plot_lines(panels[3], time, flight.qdot, names, "joint rates, 1/s")
-    if thrust and wrench is not None:
+    if thrust:
+        wrench = flight.wrench
         norms: Array = np.linalg.norm(wrench.values.reshape(-1, 2, 3), axis=2)
-        at = wrench.tick * np.float64(flight.control_period)
-        _plot_lines(panels[4], at, norms, ("force, N", "torque, N m"), "thrust")
+        _plot_lines(panels[4], wrench.time, norms, ("force, N", "torque, N m"), "thrust")
     panels[-1].set_xlabel("time, s")
     made.suptitle(f"{flight.scenario.name}, {flight.method}: {flight.message}", fontsize=10)
     return made

@@ -17,12 +17,10 @@ from spacerobot_ros.errors import MeshError
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import (
-    WRENCH_COLUMNS,
     FlightBag,
     namespaces,
     open_flight_bag,
     read_flight,
-    since,
 )
 from spacerobot_ros.flight.series import SentGoal, Signal, reported_goal
 from spacerobot_ros.measures import flown_time
@@ -95,25 +93,12 @@ class FlightReport(Flight):
         return self.signal("end_effector_pose")
 
     @property
-    def wrench(self) -> Signal:
-        """Commanded thruster force (N) and torque (N m), in the base link frame (N, 6)."""
-        return self._of_bag("base_wrench", WRENCH_COLUMNS, 6)
-
-    @property
     def efforts(self) -> Signal:
-        """Commanded joint efforts (N, n), in the joint order of the states."""
-        names = self.joint_names
-        # Velocity commands contain no efforts, and reading them takes a while.
-        velocity = self.parameter("plant", "actuation") == "velocity"
-        given = [] if velocity else self.bag.names("joint_commands")
-        if not given or sorted(given) != sorted(names):
-            return Signal.empty(len(names))
-        efforts = self._of_bag("joint_commands", ["effort"], len(names))
-        return Signal(efforts.time, efforts.values[:, [given.index(name) for name in names]])
-
-    def _of_bag(self, topic: str, columns: Sequence[str], width: int) -> Signal:
-        signal = self.bag.signal(topic, columns, width)
-        return Signal(signal.time - self.bag.began, signal.values)
+        """Commanded joint efforts (N, n)."""
+        commands = self.commands.get("joint_commands")
+        if commands is None or self.scenario.plant.actuation == "velocity":
+            return Signal.empty(len(self.joint_names))
+        return commands
 
     @cached_property
     def planned(self) -> list[Array]:
@@ -188,10 +173,7 @@ class FlightReport(Flight):
         status from another package, only the message is returned.
         """
         for commander in COMMANDERS:
-            found = [
-                (time_ns / SECOND - self.bag.began, status)
-                for time_ns, status in self.bag.statuses(commander)
-            ]
+            found = [(time_ns / SECOND, status) for time_ns, status in self.bag.statuses(commander)]
             if found:
                 return found
         return []
@@ -444,8 +426,8 @@ def read_report(path: Path, namespace: str | None = None) -> FlightReport:
     RecordingError
         There is no such bag or robot, or the bag is damaged.
     """
-    bag = open_flight_bag(path, namespace)
-    flight = since(read_flight(bag), bag.began)
+    bag = open_flight_bag(path, namespace, from_start=True)
+    flight = read_flight(bag)
     return FlightReport(
         **{each.name: getattr(flight, each.name) for each in fields(flight)},
         bag=bag,

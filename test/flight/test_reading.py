@@ -163,7 +163,7 @@ def test_reports_of_a_flight_are_those_of_its_last_goal(bag: FlightBag, flight: 
         "Of another package."
     ]
     assert [(event.message, event.time_s) for event in flight.events] == [("It runs.", 1.5)]
-    assert [(time, event.node) for time, event in bag.events()] == [(1_750_000_000, "a/plant")]
+    assert [event.node for event in bag.events()] == ["a/plant"]
     assert bag.began == 1.0
     assert bag.message_count == 37
     assert (flight.scenario.name, flight.scenario.description) == ("made", "It is made.")
@@ -172,11 +172,11 @@ def test_reports_of_a_flight_are_those_of_its_last_goal(bag: FlightBag, flight: 
     assert flight.scenario.published == ()
 
 
-def test_commands_are_counted_in_ticks_of_the_recorded_period(folder: Path) -> None:
+def test_commands_are_in_the_order_of_the_joints(folder: Path) -> None:
     path = write(folder / "velocities.mcap", parameters={"actuation": json.dumps("velocity")})
     flight = read_flight(open_flight_bag(path, "/a/"))
     assert sorted(flight.commands) == ["base_wrench", "joint_commands"]
-    assert flight.commands["joint_commands"].tick.tolist() == [2, 3]
+    assert flight.commands["joint_commands"].time.tolist() == [1.0, 1.5]
     # In the order of the joint states, j1 before j0, whatever that of the commands is.
     assert flight.commands["joint_commands"].values.tolist() == [[7.0, 1.0], [7.0, 1.5]]
     assert flight.commands["base_wrench"].values[:, 5].tolist() == [1.0, 1.5]

@@ -59,7 +59,7 @@ def made_flight(name: str = "servicer_thrusters", **changed: Any) -> Flight:
     }
     series = {name: Signal(time, values) for name, values in arrays.items()}
     late = Signal(time[1:], rng.normal(size=(2, 6)))
-    wrench = Commands(np.array([1, 3]), np.array([[3.0, 0, 4, 0, 5, 12], [0, 0, 1, 2, 0, 0]]))
+    wrench = Commands(np.array([0.5, 1.0]), np.array([[3.0, 0, 4, 0, 5, 12], [0, 0, 1, 2, 0, 0]]))
     parts: dict[str, Any] = {
         "scenario": load_scenario(name),
         "robot": ROBOT,
@@ -188,8 +188,7 @@ def test_a_figure_has_a_panel_for_each_quantity(name: str, pushed: bool) -> None
             assert levels == []
     if pushed:
         force, torque = made.axes[4].get_lines()
-        period = load_scenario(name).plant.control_period
-        assert force.get_xdata().tolist() == [period, 3 * period]
+        assert force.get_xdata().tolist() == [0.5, 1.0]
         assert (force.get_label(), torque.get_label()) == ("force, N", "torque, N m")
         assert force.get_ydata().tolist() == [5.0, 1.0]
         assert torque.get_ydata().tolist() == [13.0, 2.0]
@@ -478,7 +477,7 @@ def test_a_tolerance_is_the_commanders() -> None:
 def test_thrust_is_a_wrench_that_is_not_zero() -> None:
     assert FLIGHT.has_thrust
     assert not made_flight(commands={}).has_thrust
-    idle = Commands(np.array([1]), np.zeros((1, 6)))
+    idle = Commands(np.array([0.5]), np.zeros((1, 6)))
     assert not made_flight(commands={"base_wrench": idle}).has_thrust
 
 

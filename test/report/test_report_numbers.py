@@ -144,7 +144,7 @@ def test_the_numbers_on_top(tmp_path: Path) -> None:
 def test_cards_of_tolerances_thrusters_and_propellant(tmp_path: Path) -> None:
     tolerances = {"position_tolerance": "0.02", "attitude_tolerance": "0.06"}
     found = flight(tmp_path, metadata={"parameters/planner": tolerances})
-    wrench = Commands(np.array([1]), np.array([[0.0, 0.0, 0.0, 0.0, 0.25, 0.0]]))
+    wrench = Commands(np.array([0.5]), np.array([[0.0, 0.0, 0.0, 0.0, 0.25, 0.0]]))
     used = Signal(np.array([0.0, 1.0]), np.array([[0.0], [0.01234]]))
     thrusting = replace(
         found, commands={"base_wrench": wrench}, series={**found.series, "propellant": used}
@@ -168,8 +168,8 @@ def test_traces_break_and_totals_begin_anew_at_a_reset(tmp_path: Path) -> None:
     found = flight(tmp_path, more=more)
     assert found.resets == [1.0]
     period = found.control_period
-    ticks = np.round(np.array([0.0, 0.5, 1.5]) / period).astype(int)
-    commands = {"base_wrench": Commands(ticks, np.outer([1.0, 1.0, 2.0], [0, 1, 0, 0, 0, 0]))}
+    times = np.array([0.0, 0.5, 1.5])
+    commands = {"base_wrench": Commands(times, np.outer([1.0, 1.0, 2.0], [0, 1, 0, 0, 0, 0]))}
     assert replace(found, commands=commands).thrust_impulse == pytest.approx(2.0 * period)
     figure = position_figure(found)
     assert isinstance(figure, ReportFigure)
