@@ -40,7 +40,7 @@ from spacerobot_ros.report.figures import (
     drawing,
     picture_of,
 )
-from spacerobot_ros.report.page_parts import facts, figure, html_page, table, tiles
+from spacerobot_ros.report.page_parts import facts, figure, html_page, missing, table, tiles
 from spacerobot_ros.scenario import different_parameters
 from spacerobot_ros.version import __version__
 
@@ -72,9 +72,8 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     write_output(path, html_page(title, _page_body(results), _FOOTER))
     lines = [f"success     {results.success_share}"]
     lines += [f"{name:<11} {each}" for name, each in results.sampler_shares.items()]
-    lines += (
-        [f"note        {results.incompleteness_warning}"] if results.incompleteness_warning else []
-    )
+    note = results.incompleteness_warning
+    lines += [f"note        {note}"] if note else []
     lines += [f"required    {c}: {results.share_meeting(c)}" for c in results.campaign.criteria]
     lines += [
         f"{outcome:<11} {count} of {len(results)}: {message}"
@@ -161,12 +160,7 @@ def _facts_section(results: Results) -> str:
         "engine " + ", ".join(f"{name} ({count})" for name, count in engines.items()),
     ]
     found += [f"not controlled: {part}" for part in results.not_controlled]
-    note = (
-        f'<p class="missing">{escape(results.incompleteness_warning)}</p>'
-        if results.incompleteness_warning
-        else ""
-    )
-    return f"{facts(found)}{note}"
+    return facts(found) + missing(results.incompleteness_warning)
 
 
 def _success_section(results: Results) -> str:
@@ -207,18 +201,17 @@ def _outcomes_section(results: Results) -> str:
     made = table("outcomes", ["outcome", "flights", "message"], rows)
     fallbacks = Counter(text for text in results.columns.get("fallback", ()) if text)
     for reason, count in fallbacks.most_common(6):
-        line = f"{counted(count, 'flight')} "
-        if reason.endswith("."):  # The reason is an error message.
-            line += f"used engine 'flights': {reason}"
-        else:
-            line += f"{reason} and used engine 'flights'"
+        # A reason is a clause or an error message.
+        used = f"used engine 'flights': {reason}"
+        what = used if reason.endswith(".") else f"{reason} and used engine 'flights'"
+        line = f"{counted(count, 'flight')} {what}"
         made += f'<p class="facts">{escape(line)}</p>'
     return made
 
 
 def _percentiles_section(results: Results) -> str:
     if not results.distributed_metrics:
-        return '<p class="missing">No metric is available for any flight.</p>'
+        return missing("No metric is available for any flight.")
     rows, free = [], results.not_controlled
     for name in results.distributed_metrics:
         values = results.columns[name]
@@ -266,7 +259,7 @@ def _histograms_section(results: Results) -> str:
 
 def _sensitivity_section(found: Sequence[Influence]) -> str:
     if not found:
-        return '<p class="missing">No drawn value is correlated with a metric.</p>'
+        return missing("No drawn value is correlated with a metric.")
     sobol = any(each.total_order_index is not None for each in found)
     rows = []
     for each in _sort_passing_first(found)[:15]:
@@ -390,19 +383,13 @@ def _dispersions_section(campaign: Campaign) -> str:
     for each in campaign.dispersions:
         numbers = [""] * len(_QUANTILES_SHOWN)
         if not each.distribution.choices:
-            numbers = [
-                f"{value:.4g}" for value in each.distribution.quantiles(np.array(_QUANTILES_SHOWN))
-            ]
+            values = each.distribution.quantiles(np.array(_QUANTILES_SHOWN))
+            numbers = [f"{value:.4g}" for value in values]
         rows.append([each.name, str(each), each.target.unit or "", *numbers])
     if not rows:
-        return '<p class="missing">There are no dispersions: the flights differ only in noise.</p>'
-    head = [
-        "parameter",
-        "distribution",
-        "unit",
-        *(f"{100 * share:g} %" for share in _QUANTILES_SHOWN),
-    ]
-    return table("dispersed", head, rows)
+        return missing("There are no dispersions: the flights differ only in noise.")
+    shares = [f"{100 * share:g} %" for share in _QUANTILES_SHOWN]
+    return table("dispersed", ["parameter", "distribution", "unit", *shares], rows)
 
 
 # -- two campaigns ----------------------------------------------------------------------------
@@ -475,20 +462,15 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
         f"{only_a} only {a}, {only_b} only {b} (McNemar's exact test: p = {p:.2g})."
     )
     notes = [*_notes_on_failures(first, second), *_notes_on_control(first, second)]
-    rows = [
-        list(row)
-        for row in different_parameters([first.campaign.scenario, second.campaign.scenario])
-    ]
+    rows = different_parameters([first.campaign.scenario, second.campaign.scenario])
     with drawing():
         body = [
             f"<header><h1>{escape(a)} and {escape(b)}</h1>",
             facts([f"{len(common)} common draws"]),
             f'<p class="outcome">{escape(sentence)}</p></header>',
-            *(f'<p class="missing">{escape(note)}</p>' for note in notes),
+            *map(missing, notes),
             "<h2>Parameters that differ</h2>",
-            table("parameters", ["parameter", a, b], rows)
-            if rows
-            else '<p class="missing">None differ.</p>',
+            table("parameters", ["parameter", a, b], rows) if rows else missing("None differ."),
             "<h2>Paired differences</h2>",
             _difference_table(found, first, second),
             _difference_figure(first, second, flown_a, flown_b, compared[:6]),

@@ -498,7 +498,7 @@ class TraceGroup:
     Attributes
     ----------
     signal, names, colours
-        The traces, with their names and colours.
+        The traces, with their names and colours; by default, those of the palette in order.
     label, unit
         Axis label and unit.
     goals
@@ -521,7 +521,7 @@ class TraceGroup:
     names: Sequence[str]
     label: str
     unit: str
-    colours: Sequence[str]
+    colours: Sequence[str] = ()
     goals: Sequence[tuple[float, float, int, float]] = ()
     limits: Sequence[tuple[int, float]] = ()
     limit_name: str = LIMIT
@@ -529,6 +529,10 @@ class TraceGroup:
     decades: int = 0
     rows: bool = False
     beside: Sequence[Signal] = ()
+
+    def __post_init__(self) -> None:
+        if not self.colours:
+            object.__setattr__(self, "colours", [colour(k) for k in range(len(self.names))])
 
     @property
     def signals(self) -> list[Signal]:

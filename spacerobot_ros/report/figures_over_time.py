@@ -252,15 +252,13 @@ def position_group(flight: FlightReport) -> TraceGroup:
     targets = flight.targets if flight.position_counts else []
     goals = _goal_lines(targets, lambda goal: goal.position)
     path = Signal(flight.time, flight.pose[:, :3])
-    return TraceGroup(path, ["x", "y", "z"], "base position", "m", PALETTE[:3], goals)
+    return TraceGroup(path, "xyz", "base position", "m", goals=goals)
 
 
 def attitude_group(flight: FlightReport) -> TraceGroup:
     """Return the base attitude as a rotation vector, and its goals."""
     goals = _goal_lines(flight.targets, flight.goal_rotvec)
-    return TraceGroup(
-        flight.attitude, ["x", "y", "z"], "rotation vector", "rad", PALETTE[:3], goals
-    )
+    return TraceGroup(flight.attitude, "xyz", "rotation vector", "rad", goals=goals)
 
 
 def _goal_lines(
@@ -328,7 +326,7 @@ def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceG
     """Return a group of the adjacent columns x, y and z for each label and unit."""
     columns = [signal.values[:, 3 * k : 3 * k + 3] for k in range(len(parts))]
     return [
-        TraceGroup(Signal(signal.time, values), list("xyz"), label, unit, PALETTE[:3])
+        TraceGroup(Signal(signal.time, values), "xyz", label, unit)
         for values, (label, unit) in zip(columns, parts, strict=True)
     ]
 
@@ -472,12 +470,11 @@ def thrusters_figure(flight: FlightReport) -> ReportFigure | str | None:
     whole = flight.signal("thruster_duty")
     used = [k for k in range(len(names)) if whole.values[:, k].any()]
     duty = Signal(whole.time, whole.values[:, used])
-    tints = [colour(k) for k in range(len(used))]
     label, unit = "thrusters", "fraction of each tick during which they are on"
-    groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, tints, rows=True)]
+    groups = [TraceGroup(duty, [shortened(names[k]) for k in used], label, unit, rows=True)]
     thrust, propellant = flight.signal("thruster_force"), flight.series.get("propellant")
     total = impulse(thrust, np.ones(thrust.width), flight.resets)
-    groups.append(TraceGroup(total, ["impulse"], "impulse given", "N s", [PALETTE[0]]))
+    groups.append(TraceGroup(total, ["impulse"], "impulse given", "N s"))
     caption = "Fraction of each tick during which each thruster was on; lower panel: total impulse"
     on = whole.values > 0
     # A closed nozzle gives no thrust.
@@ -501,23 +498,12 @@ def momentum_figure(flight: FlightReport) -> ReportFigure | str:
     balance = flight.unexplained_momentum
     if not len(balance):
         return "The bag contains no momentum."
-    changes = momentum_change(balance.values[:, :6], balance.values[0, :6])
+    values = momentum_change(balance.values[:, :6], balance.values[0, :6])
+    changes, energy = Signal(balance.time, values), Signal(balance.time, balance.values[:, 6:7])
+    names, unit = ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"], "kg m/s, kg m²/s"
     groups = [
-        TraceGroup(
-            Signal(balance.time, changes),
-            ["|p − p₀| (kg m/s)", "|L − L₀| (kg m²/s)"],
-            "change",
-            "kg m/s, kg m²/s",
-            PALETTE[:2],
-            decades=_MOMENTUM_DECADES,
-        ),
-        TraceGroup(
-            Signal(balance.time, balance.values[:, 6:7]),
-            ["energy"],
-            "kinetic energy",
-            "J",
-            [colour(2)],
-        ),
+        TraceGroup(changes, names, "change", unit, decades=_MOMENTUM_DECADES),
+        TraceGroup(energy, ["energy"], "kinetic energy", "J", [colour(2)]),
     ]
     caption = (
         "The momentum balance of the whole system. Top: change in the linear momentum p and in the "
@@ -567,14 +553,9 @@ def clearance_figure(flight: FlightReport) -> ReportFigure | str | None:
     time, distances = clearance.over_time(_MAX_CLEARANCE_SAMPLES)
     signal = Signal(time, distances[:, np.newaxis])
     touching = bool(distances.min() <= 0)
+    limits = [(0, 0.0)] if touching else []
     group = TraceGroup(
-        signal,
-        ["distance"],
-        "smallest distance",
-        "m",
-        [PALETTE[0]],
-        limits=[(0, 0.0)] if touching else [],
-        limit_name="contact",
+        signal, ["distance"], "smallest distance", "m", limits=limits, limit_name="contact"
     )
     nearest = clearance.nearest
     sentence = f"{sentence_case(str(nearest))} at {clearance.nearest_time:.4g} s"

@@ -407,7 +407,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     rotvec = [] if goal is None else flight.goal_rotvec(goal).tolist()
     goals = [(0.0, float(number[-1]), i, x) for i, x in enumerate(rotvec)]
     attitude = Signal(number, flight.attitude.values[ends])
-    groups = [TraceGroup(attitude, list("xyz"), "rotation vector", "rad", PALETTE[:3], goals)]
+    groups = [TraceGroup(attitude, "xyz", "rotation vector", "rad", goals=goals)]
     caption = (
         f"Base link attitude at the {len(ends)} instants at which the joints return to the start "
         "of a loop; number 0 is the attitude before the first loop"

@@ -18,7 +18,9 @@ from spacerobot_ros.report.page_parts import (
     PagePart,
     facts,
     figure,
+    folded,
     html_page,
+    missing,
     package_file,
     table,
     tiles,
@@ -160,7 +162,7 @@ def _numbers_html(flight: FlightReport) -> list[str]:
     result, joints = result_table(flight), joint_table(flight)
     parts = ["<h2>Numbers of the run</h2>"]
     if flight.goal is None and not flight.tool_goals:
-        parts.append('<p class="missing">The bag contains no goal pose.</p>')
+        parts.append(missing("The bag contains no goal pose."))
     if result.rows:
         parts.append(table("numbers", (), result.rows))
     if joints is not None:
@@ -181,22 +183,19 @@ def _published_html(flight: FlightReport) -> list[str]:
 
 
 def _figures_html(figures: Figures, *, has_events: bool) -> list[str]:
-    parts, first_chart = [], 0
-    for sentence in dict.fromkeys(each for each in figures if isinstance(each, str)):
-        parts.append(f'<p class="missing">{escape(sentence)}</p>')
+    first_chart = 0
+    sentences = dict.fromkeys(each for each in figures if isinstance(each, str))
+    parts = [missing(each) for each in sentences]
     drawn = [each for each in figures if isinstance(each, ReportFigure)]
     for number, each in enumerate(drawn, start=1):
         numbers = " ".join(str(first_chart + k) for k in range(len(each.groups)))
         charts = f' data-charts="{numbers}"' if numbers else ""
-        heading = escape(each.heading)
-        caption = f"<b>Figure {number}. {heading}.</b> {escape(each.caption)}"
+        caption = f"<b>Figure {number}. {escape(each.heading)}.</b> {escape(each.caption)}"
         if has_events and each.groups and first_chart == 0:
             caption += _EVENTS_CAPTION
         first_chart += len(each.groups)
         shown = figure(each.name, each.svg, each.heading, caption, charts)
-        if each.name in _FOLDED:
-            shown = f"<details><summary>{heading}</summary>{shown}</details>"
-        parts.append(shown)
+        parts.append(folded(each.heading, shown) if each.name in _FOLDED else shown)
     return parts
 
 
@@ -210,23 +209,17 @@ def _events_html(events: Sequence[tuple[float, Event]]) -> list[str]:
     note = f'<p class="facts">{more} more events are in the bag.</p>' if more > 0 else ""
     shown = table("events", head, rows[:_MAX_EVENT_ROWS], (0,)) + note
     if len(rows) > _MAX_UNFOLDED_ROWS:
-        shown = f"<details><summary>{len(rows)} events</summary>{shown}</details>"
+        shown = folded(f"{len(rows)} events", shown)
     return ["<h2>Events</h2>", shown]
 
 
 def _parameters_html(flight: FlightReport) -> list[str]:
-    nodes = {
-        name.partition("/")[2]: values
-        for name, values in flight.bag.metadata.items()
-        if name.startswith("parameters/")
-    }
-    if not nodes:
-        return []
-    parts = ["<h2>Parameters</h2>"]
-    for node, values in nodes.items():
-        shown = table(f"parameters-{node}", (), list(values.items()))
-        parts.append(f"<details><summary>{escape(node)}</summary>{shown}</details>")
-    return parts
+    parts = []
+    for name, values in flight.bag.metadata.items():
+        kind, _, node = name.partition("/")
+        if kind == "parameters":
+            parts.append(folded(node, table(f"parameters-{node}", (), list(values.items()))))
+    return ["<h2>Parameters</h2>", *parts] if parts else []
 
 
 def _footer_text(flights: Sequence[FlightReport]) -> str:

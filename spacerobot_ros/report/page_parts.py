@@ -109,6 +109,16 @@ def unbroken(text: str) -> str:
     return _WITH_EXPONENT.sub(r'<span class="unbroken">\g<0></span>', escape(text))
 
 
+def missing(text: str) -> str:
+    """Return a sentence about something that a page lacks; an empty string if there is none."""
+    return f'<p class="missing">{escape(text)}</p>' if text else ""
+
+
+def folded(summary: str, content: str) -> str:
+    """Return content (HTML) that is shown only after a click on its summary."""
+    return f"<details><summary>{escape(summary)}</summary>{content}</details>"
+
+
 def facts(texts: Sequence[str]) -> str:
     """Return short facts on one line, or an empty string if there are none."""
     spans = "".join(f"<span>{escape(fact)}</span>" for fact in texts)

@@ -35,7 +35,6 @@ from spacerobot_ros.report.figures import (
     WIDTH,
     PictureFormat,
     TraceGroup,
-    colour,
     drawing,
     new_figure,
     panel,
@@ -69,8 +68,6 @@ _RING_STYLES: dict[str, dict[str, Any]] = {
         "lw": 0.6,
     },
 }
-
-_AXIS_NAMES = ("x", "y", "z")
 
 
 def draw_analysis(found: Analysis, format: PictureFormat = PictureFormat.PNG) -> bytes | None:
@@ -202,7 +199,7 @@ def _spatial_figure(found: Analysis) -> Figure:
             _draw_map(axes, x, y, values, norm)
             _mark_shape(axes, found, pair)
             first, second = (_joint_symbol(pair, k) for k in (0, 1))
-            axes.set_title(f"rotation about {_AXIS_NAMES[column]} by loops of {first}, {second}")
+            axes.set_title(f"rotation about {'xyz'[column]} by loops of {first}, {second}")
         # A rotation in rad per area in the plane of the two joints.
         first, second = (movable[joints[k]].unit for k in pair)
         area = f"{first}²" if first == second else f"({first} {second})"
@@ -321,14 +318,13 @@ def _plan_figure(problem: PlanningProblem, trial: PlanEvaluation) -> Figure:
     ticks = problem.control_period * np.arange(len(trial.positions), dtype=np.float64)
     rates = np.diff(trial.positions, axis=0) / problem.control_period
     names = [shortened(name) for name in robot.joint_names]
-    tints = [colour(k) for k in range(len(names))]
     units = sorted({joint.unit for joint in robot.description.movable_joints})
     speeds = ", ".join(f"{unit}/s" for unit in units)
     # Held over a tick: steps.
     held = Signal(np.repeat(ticks, 2)[1:-1], np.repeat(rates, 2, axis=0))
     groups = [
-        TraceGroup(Signal(ticks, trial.positions), names, "joints", ", ".join(units), tints),
-        TraceGroup(held, names, "held velocities", speeds, tints),
+        TraceGroup(Signal(ticks, trial.positions), names, "joints", ", ".join(units)),
+        TraceGroup(held, names, "held velocities", speeds),
     ]
     turned, wanted = rotvecs_from_quaternions(path.quaternion), rotvec_from_quaternion
     for part, label, unit, values, aim in (
@@ -337,7 +333,7 @@ def _plan_figure(problem: PlanningProblem, trial: PlanEvaluation) -> Figure:
     ):
         goals = [(0.0, float(path.time[-1]), k, x) for k, x in enumerate(aim) if part in goal.base]
         signal = Signal(path.time, values)
-        groups.append(TraceGroup(signal, _AXIS_NAMES, label, unit, PALETTE[:3], goals))
+        groups.append(TraceGroup(signal, "xyz", label, unit, goals=goals))
     figure, rows = sheet([[1], [1], [1, 1]], [1.9, 1.9, 1.9], right=room_for(names))
     for axes, group in zip((axes for row in rows for axes in row), groups, strict=True):
         draw_group(axes, group, 0.0)

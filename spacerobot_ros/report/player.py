@@ -27,7 +27,7 @@ from spacerobot_ros.report.figures import (
     PLANNED_COLOUR,
 )
 from spacerobot_ros.report.flight import FlightReport
-from spacerobot_ros.report.page_parts import PagePart, package_file
+from spacerobot_ros.report.page_parts import PagePart, missing, package_file
 from spacerobot_ros.report.scene import Body, bodies_of, goal_of_base, is_flat, obstacles_of
 from spacerobot_ros.report.signals import Cycles, Indices, simplified
 from spacerobot_ros.report.solids import EDGE_COLOUR, View, corner_points, placed_solids
@@ -78,8 +78,7 @@ def player_of(scene: View3D | str) -> PagePart:
     """Return a scene player, or the reason why there is none."""
     viewer = viewer_script()
     if isinstance(scene, str) or viewer is None:
-        sentence = scene if isinstance(scene, str) else NO_VIEWER
-        return PagePart(f'<p class="missing">{escape(sentence)}</p>')
+        return PagePart(missing(scene if isinstance(scene, str) else NO_VIEWER))
     parts = [{"name": name, "start": start, "end": end} for name, start, end in scene.parts]
     return PagePart(
         markup=_MARKUP.format(caption=escape(scene.caption)),
