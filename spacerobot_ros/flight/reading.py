@@ -222,9 +222,9 @@ class FlightBag(RecordedRobot):
         For a status from another package, only the message is returned.
         """
         topic, read = STATUS_TOPICS[commander]
-        zero_ns = round(self._zero * SECOND)
         for log_time_ns, recorded in self.messages(topic):
-            time_ns, message = log_time_ns - zero_ns, read_status(recorded)
+            time_ns = log_time_ns - round(self._zero * SECOND)
+            message = read_status(recorded)
             try:
                 yield time_ns, read(message.values, message.message)
             except SpaceRobotError:
