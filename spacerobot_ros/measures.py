@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -35,48 +34,6 @@ class Outcome(str, Enum):
     ABORTED = "aborted"
     INTERRUPTED = "interrupted"
     """The flight ended before the goal was decided."""
-
-
-def _capture_measure(metric: str, unit: str, description: str, *, yes_or_no: bool = False) -> Any:
-    """Return a field of :class:`CaptureMeasures`, with the metric whose value it is."""
-    facts = {"metric": metric, "unit": unit, "description": description, "yes_or_no": yes_or_no}
-    return field(default=math.nan, metadata=facts)
-
-
-@dataclass(frozen=True)
-class CaptureMeasures:
-    """The measures of a capture, each with the name of its metric, unit and meaning; values are NaN
-    if there is no target, or if the respective event did not occur.
-    """
-
-    captured: float = _capture_measure(
-        "captured", "", "whether the target was captured, 1 or 0", yes_or_no=True
-    )
-    placed: float = _capture_measure(
-        "placed", "", "whether the goal was reached with the target, 1 or 0", yes_or_no=True
-    )
-    time: float = _capture_measure("capture_time_s", "s", "time of the capture")
-    distance: float = _capture_measure(
-        "capture_distance_m",
-        "m",
-        "distance between end-effector and grapple frame at the capture; without a capture, the "
-        "smallest distance",
-    )
-    impulse: float = _capture_measure("capture_impulse_Ns", "N s", "impulse of the capture")
-    angular_impulse: float = _capture_measure(
-        "capture_angular_impulse_Nms", "N m s", "moment of the capture impulse at the end-effector"
-    )
-    joint_impulse: float = _capture_measure(
-        "capture_joint_impulse",
-        "N m s or N s",
-        "largest component of the capture impulse along a joint coordinate",
-    )
-    detumbling_time: float = _capture_measure(
-        "detumbling_time_s", "s", "time until the robot and the target came to rest"
-    )
-    detumbling_bound: float = _capture_measure(
-        "detumbling_bound_s", "s", "shortest time to rest with the available torques"
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +73,7 @@ class Measures:
         Smallest distance between two links, m; a negative value is the penetration depth. Infinite
         for a robot without pairs that could touch, NaN if not measured.
     capture
-        Measures of the capture.
+        The metrics of the capture that have a value, by name; none without a target.
     """
 
     outcome: Outcome
@@ -137,7 +94,7 @@ class Measures:
     plan_time: float = math.nan
     wall_time: float = math.nan
     clearance: float = math.nan
-    capture: CaptureMeasures = CaptureMeasures()
+    capture: Mapping[str, float] = field(default_factory=dict)
 
 
 def momentum_change(momenta: Array, reference: Array) -> Array:
@@ -256,10 +213,8 @@ class Metric:
     yes_or_no: bool = False
 
 
-def _capture_metric(name: str, facts: Mapping[str, Any]) -> Metric:
-    evaluate = attrgetter(f"capture.{name}")
-    unit, description = facts["unit"], facts["description"]
-    return Metric(unit, description, lambda m, _: float(evaluate(m)), yes_or_no=facts["yes_or_no"])
+def _capture_metric(name: str, unit: str, description: str) -> Metric:
+    return Metric(unit, description, lambda m, _: m.capture.get(name, math.nan), yes_or_no=not unit)
 
 
 def _error_metric(part: str, unit: str, description: str) -> Metric:
@@ -284,6 +239,29 @@ def _margin_metric(quantity: str, limit: str, peak_of: Callable[[Measures], Arra
 
 _OF_JOINTS = ("peak_rate", "peak_effort", "lowest", "highest")
 """Fields of :class:`Measures` with one number per joint."""
+
+_CAPTURE_METRICS = {
+    "captured": ("", "whether the target was captured, 1 or 0"),
+    "placed": ("", "whether the goal was reached with the target, 1 or 0"),
+    "capture_time_s": ("s", "time of the capture"),
+    "capture_distance_m": (
+        "m",
+        "distance between end-effector and grapple frame at the capture; without a capture, the "
+        "smallest distance",
+    ),
+    "capture_impulse_Ns": ("N s", "impulse of the capture"),
+    "capture_angular_impulse_Nms": (
+        "N m s",
+        "moment of the capture impulse at the end-effector",
+    ),
+    "capture_joint_impulse": (
+        "N m s or N s",
+        "largest component of the capture impulse along a joint coordinate",
+    ),
+    "detumbling_time_s": ("s", "time until the robot and the target came to rest"),
+    "detumbling_bound_s": ("s", "shortest time to rest with the available torques"),
+}
+"""Unit and description of each metric of a capture; those without a unit are flags."""
 
 CLEARANCE = "clearance_m"
 """Name of the metric that campaigns measure only on request."""
@@ -344,10 +322,7 @@ METRICS: dict[str, Metric] = {
         lambda m, _: m.clearance,
         smallest_is_worst=True,
     ),
-    **{
-        each.metadata["metric"]: _capture_metric(each.name, each.metadata)
-        for each in fields(CaptureMeasures)
-    },
+    **{name: _capture_metric(name, *about) for name, about in _CAPTURE_METRICS.items()},
 }
 """Every metric by name."""
 

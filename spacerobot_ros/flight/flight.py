@@ -22,7 +22,7 @@ from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import counted, quantity, sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.data import FlightData
-from spacerobot_ros.measures import CaptureMeasures, Measures, Outcome, peak, peak_wrench
+from spacerobot_ros.measures import Measures, Outcome, peak, peak_wrench
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning import PoseError
@@ -211,7 +211,7 @@ class Flight(FlightData):
             plan_time=self.plan_time,
             wall_time=self.wall_time,
             clearance=self.smallest_distance if clearance else math.nan,
-            capture=self.capture_measures,
+            capture=self.capture_metrics,
         )
 
     @property
@@ -248,11 +248,11 @@ class Flight(FlightData):
         return float(thrust.values[first:].sum() * self.control_period)
 
     @cached_property
-    def capture_measures(self) -> CaptureMeasures:
-        """The capture measures; all are NaN if there is no target."""
+    def capture_metrics(self) -> dict[str, float]:
+        """The metrics of the capture that have a value; none without a target."""
         capture, detumbling = self.capture, self.detumbling
         if not capture:
-            return CaptureMeasures()
+            return {}
         changes = (EventKind.CAPTURED, EventKind.RELEASED)
         last = [event.kind for event in self.events if event.kind in changes][-1:]
         time, distance = capture.get("time_s", math.nan), capture.get("nearest_m", math.nan)
@@ -261,17 +261,18 @@ class Flight(FlightData):
             distance = distances[int(np.searchsorted(times, time - 1e-9))]
         impulse = np.array(capture.get("impulse_Ns", [math.nan] * 6))
         joints = np.abs(capture.get("joint_impulses_Nms", ()))
-        return CaptureMeasures(
-            captured=float(capture["captured"]),
-            placed=float(self.succeeded and last == [EventKind.CAPTURED]),
-            time=time,
-            distance=float(distance),
-            impulse=float(np.linalg.norm(impulse[:3])),
-            angular_impulse=float(np.linalg.norm(impulse[3:])),
-            joint_impulse=float(joints.max()) if joints.size else math.nan,
-            detumbling_time=detumbling.get("took_s", math.nan),
-            detumbling_bound=detumbling.get("shortest_s", math.nan),
-        )
+        metrics = {
+            "captured": capture["captured"],
+            "placed": self.succeeded and last == [EventKind.CAPTURED],
+            "capture_time_s": time,
+            "capture_distance_m": distance,
+            "capture_impulse_Ns": np.linalg.norm(impulse[:3]),
+            "capture_angular_impulse_Nms": np.linalg.norm(impulse[3:]),
+            "capture_joint_impulse": joints.max() if joints.size else math.nan,
+            "detumbling_time_s": detumbling.get("took_s", math.nan),
+            "detumbling_bound_s": detumbling.get("shortest_s", math.nan),
+        }
+        return {name: float(x) for name, x in metrics.items() if not math.isnan(x)}
 
     # -- verdict ------------------------------------------------------------------------------
 

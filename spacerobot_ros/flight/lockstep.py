@@ -22,7 +22,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import numpy as np
 
@@ -171,13 +170,6 @@ def fly_scenario(
     return flight.fly(progress, longest)
 
 
-class _DecisionState(Enum):
-    """When, from the plant's point of view, a commander has decided about the goal."""
-
-    BEFORE_COMMAND = "before its command"
-    AFTER_COMMAND = "after its command"
-
-
 @dataclass(frozen=True)
 class _Host:
     """The :class:`~spacerobot_ros.commanding.host.CommanderHost` of a commander here."""
@@ -254,8 +246,10 @@ class LockstepFlight:
         self._statuses: dict[str, StatusRecord] = {}
         self.log = FlightLog(self._plant, self._reported, self._commands, self._period_ns)
         self._follower = GoalFollower(GoalIds().of(*_FIRST_GOAL_STAMP))
-        self._decided: _DecisionState | None = None
-        self._moment = _DecisionState.BEFORE_COMMAND
+        self._commanded = False
+        """Whether the command for the current state has been sent."""
+        self._decided_before_command: bool | None = None
+        """Whether a commander decided about the goal before its command; None: not decided."""
         self._status: Status | None = None
         self._interrupted = False
         self._planner: PlannerCommander | None = None
@@ -306,18 +300,18 @@ class LockstepFlight:
         for commander in self._commanders.values():
             commander.activate()
         self._report_plant_status(PlantState.RUNNING)
-        self._moment = _DecisionState.BEFORE_COMMAND
+        self._commanded = False
         self._send_goals()
         self._report_state()
         while True:
             self._answer_state()
             if self._interrupted:
                 return self._interruption
-            if self._decided is _DecisionState.BEFORE_COMMAND:
+            if self._decided_before_command:
                 return ""
             if not self._commands.complete and not self._reported.sensors.dropout:
                 return f"There is no command for the state at {self.time:g} s."
-            ends = self._decided is not None
+            ends = self._decided_before_command is not None
             if not self._step():
                 return ""
             self._report_state()
@@ -379,7 +373,7 @@ class LockstepFlight:
         return True
 
     def _answer_state(self) -> None:
-        self._moment = _DecisionState.BEFORE_COMMAND
+        self._commanded = False
         quantities, now = self._reported.quantities, self._now_ns
         q, qdot = quantities["measured_q"], quantities["measured_qdot"]
         if self._controller is not None:
@@ -415,7 +409,7 @@ class LockstepFlight:
         velocity = source.quantity == "velocity"
         values = setpoint.velocity if velocity else np.zeros(len(setpoint.velocity))
         self._offer_command(source, values, stamp_ns, (setpoint.position, setpoint.velocity))
-        self._moment = _DecisionState.AFTER_COMMAND
+        self._commanded = True
 
     def _send_reference(self, stamp_ns: int) -> None:
         """Pass the planner's setpoint to the controller."""
@@ -435,7 +429,7 @@ class LockstepFlight:
             if source.quantity == "velocity":
                 values = np.zeros(len(effort))
             self._offer_command(source, values, now)
-        self._moment = _DecisionState.AFTER_COMMAND
+        self._commanded = True
 
     def _offer_command(
         self,
@@ -445,7 +439,7 @@ class LockstepFlight:
         setpoint: tuple[Array, Array] | None = None,
     ) -> None:
         self.log.add_command(source.topic, self._tick, values, setpoint)
-        if self._decided is _DecisionState.BEFORE_COMMAND:
+        if self._decided_before_command:
             return
         refusal = self._commands.accept_or_refuse(source, now, values, now)
         if refusal is not None:
@@ -457,7 +451,7 @@ class LockstepFlight:
     # -- plant status -------------------------------------------------------------------------
 
     def _report_plant_status(self, activity: PlantState) -> None:
-        self._injected_seen, self._moment = self._plant.injected, _DecisionState.AFTER_COMMAND
+        self._injected_seen, self._commanded = self._plant.injected, True
         before = self._monitor.status
         self.log.events += self._events_until(activity)
         status = self._monitor.status
@@ -513,11 +507,11 @@ class LockstepFlight:
         self._statuses[name] = StatusRecord.of(f"/{name}", status, status.state.level)
         if isinstance(status, PlannerStatus) is not self.has_planner:
             return
-        if self._decided is not None:
+        if self._decided_before_command is not None:
             return
         self._status = status
         if self._follower.update(status):
-            self._decided = self._moment
+            self._decided_before_command = not self._commanded
 
     def take_event(self, node: str, event: Event) -> None:
         """Store a commander event; its time defaults to the current time."""

@@ -75,10 +75,9 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
         notes += ["since the reset"] * bool(flight.resets)
         rows.append(("Propellant", f"{1e3 * propellant:.3g} g", "; ".join(notes)))
     if capture := flight.capture:
-        about = flight.capture_measures
-        done = f"at {about.time:.4g} s" if capture["captured"] else "no"
-        off = f"{quantity(about.distance, 'm')} from the grapple"
-        nearest = "" if math.isnan(about.distance) else off
+        distance = flight.capture_metrics.get("capture_distance_m")
+        done = f"at {capture['time_s']:.4g} s" if capture["captured"] else "no"
+        nearest = "" if distance is None else f"{quantity(distance, 'm')} from the grapple"
         rows.append(("Target captured", done, nearest))
     if len(time := flight.time) > 1:
         ticks = f"{time[-1] - time[0]:.6g} s, ticks of {flight.tick:.4g} s"

@@ -19,7 +19,6 @@ from spacerobot_ros.campaign.report import metric_label
 from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.measures import (
     METRICS,
-    CaptureMeasures,
     Measures,
     Outcome,
     metrics_of_each,
@@ -45,17 +44,17 @@ FLOWN = Measures(
     plan_time=0.75,
     wall_time=1.5,
     clearance=-0.03125,
-    capture=CaptureMeasures(
-        captured=1.0,
-        placed=0.0,
-        time=30.5,
-        distance=0.0025,
-        impulse=0.375,
-        angular_impulse=0.0125,
-        joint_impulse=0.21875,
-        detumbling_time=2.75,
-        detumbling_bound=0.34375,
-    ),
+    capture={
+        "captured": 1.0,
+        "placed": 0.0,
+        "capture_time_s": 30.5,
+        "capture_distance_m": 0.0025,
+        "capture_impulse_Ns": 0.375,
+        "capture_angular_impulse_Nms": 0.0125,
+        "capture_joint_impulse": 0.21875,
+        "detumbling_time_s": 2.75,
+        "detumbling_bound_s": 0.34375,
+    },
 )
 """Of sliders that move 2.5 m to both sides, 0.7 m/s fast and with up to 50 N."""
 

@@ -181,7 +181,7 @@ def prints(flight: str, parameters: Mapping[str, Any]) -> dict[str, str]:
     series = {"pose": flown.pose, "twist": flown.twist, "q": flown.q, "qdot": flown.qdot}
     series |= {"effort": flown.effort, "momentum": flown.momentum, **flown.quantities}
     found |= series
-    found |= {topic: (c.tick, c.values) for topic, c in flown.commands.items()}
+    found |= {topic: (c.time, c.values) for topic, c in flown.commands.items()}
     return {name: _fingerprint(value) for name, value in found.items()}
 
 
