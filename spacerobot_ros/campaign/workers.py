@@ -23,7 +23,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from multiprocessing import resource_tracker
@@ -345,11 +345,11 @@ def open_workers(flights: int, workers: int, scheduler: str = "") -> Iterator[Wo
 
 @dataclass(frozen=True)
 class _SubmittedTask:
-    """Draw numbers of a task that a worker is flying, the engine name, and whether the task is a
-    single flight, repeated alone after the death of a worker.
+    """Draws of a task that a worker is flying, the engine name, and whether the task is a single
+    flight, repeated alone after the death of a worker.
     """
 
-    numbers: list[int]
+    draws: list[Draw]
     engine: str
     runs_alone: bool
 
@@ -387,12 +387,10 @@ class TaskDistributor:
             for name in (engine, FLIGHTS)
         }
         """Number of flights per task, by engine."""
-        self._fallbacks: deque[int] = deque()
-        """Numbers of draws that wait for engine ``flights``."""
-        self._passed_on: dict[int, Draw] = {}
-        """Draws that the engine has passed on to engine ``flights``, by number."""
+        self._fallbacks: deque[Draw] = deque()
+        """Draws that the engine has passed on to engine ``flights``."""
         self._running: dict[_Task, _SubmittedTask] = {}
-        self._retry_alone: deque[int] = deque()
+        self._retry_alone: deque[Draw] = deque()
         """Draws in tasks whose worker has died."""
 
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
@@ -420,19 +418,20 @@ class TaskDistributor:
             self._submit_task([self._retry_alone.popleft()], self._engine, alone=True)
         alone = self._retry_alone or any(task.runs_alone for task in self._running.values())
         while not alone and (self._fallbacks or waiting) and len(self._running) < most:
-            queue, engine = (
-                (self._fallbacks, FLIGHTS) if self._fallbacks else (waiting, self._engine)
-            )
+            engine = FLIGHTS if self._fallbacks else self._engine
+            left = len(self._fallbacks or waiting)
             # The last tasks are smaller, so that all workers finish at about the same time.
-            share = max(engine_by_name(engine).efficient_flights, len(queue) / workers)
-            count = min(len(queue), max(1, round(min(self._sizes[engine], share))))
-            self._submit_task([queue.popleft() for _ in range(count)], engine)
+            share = max(engine_by_name(engine).efficient_flights, left / workers)
+            count = range(min(left, max(1, round(min(self._sizes[engine], share)))))
+            if self._fallbacks:
+                draws = [self._fallbacks.popleft() for _ in count]
+            else:
+                draws = [self._draws[waiting.popleft()] for _ in count]
+            self._submit_task(draws, engine)
 
-    def _submit_task(self, numbers: list[int], engine: str, *, alone: bool = False) -> None:
-        passed_on = self._passed_on
-        draws = [passed_on[n] if n in passed_on else self._draws[n] for n in numbers]
+    def _submit_task(self, draws: list[Draw], engine: str, *, alone: bool = False) -> None:
         task = self._workers.submit(self._packed, this_code(), draws, engine, alone)
-        self._running[task] = _SubmittedTask(numbers, engine, alone)
+        self._running[task] = _SubmittedTask(draws, engine, alone)
 
     def _collect_rows(self, ended: _Task) -> list[Row]:
         """Return the rows of a task; if its worker died, that of a flight that was alone. The
@@ -442,14 +441,12 @@ class TaskDistributor:
             made = self._workers.result(ended)
         except WorkerDeath:
             if not task.runs_alone:
-                self._retry_alone += task.numbers
+                self._retry_alone += task.draws
                 return []
-            draw = self._draws[task.numbers[0]]
+            draw = replace(task.draws[0], fallback="")
             return [Row(draw, KILLED, "Its process died 2 times.", engine=self._engine)]
         rows = [each for each in made if isinstance(each, Row)]
-        passed_on = {each.number: each for each in made if isinstance(each, Draw)}
-        self._passed_on |= passed_on
-        self._fallbacks += passed_on
+        self._fallbacks += (each for each in made if isinstance(each, Draw))
         if not task.runs_alone and rows:
             took = sum(row.wall_time for row in rows if not math.isnan(row.wall_time))
             if took > 0:

@@ -22,11 +22,10 @@ from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
+    attitude_errors,
     matrices_from_quaternions,
-    quaternion_inverse,
     quaternion_multiply,
     quaternions_from_rotvecs,
-    rotvecs_from_quaternions,
 )
 from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
@@ -298,9 +297,7 @@ class Reorient(_DrawnTogether):
 
     def remaining(self, states: RobotStates, goals: Array) -> Array:
         """Return the rotation vectors (N, 3), rad, from base to goal attitudes, in B."""
-        return rotvecs_from_quaternions(
-            quaternion_multiply(quaternion_inverse(states.pose[:, 3:]), goals)
-        )
+        return attitude_errors(states.pose[:, 3:], goals)
 
     def goal_of(self, scenario: Scenario) -> Array:
         """Return the base's goal attitude."""

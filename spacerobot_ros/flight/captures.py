@@ -21,13 +21,12 @@ from spacerobot_ros.model.payload_estimation import (
     momentum_regressor,
 )
 from spacerobot_ros.model.rotations import (
+    attitude_errors,
     matrices_from_quaternions,
     matrix_from_quaternion,
-    quaternion_inverse,
     quaternion_multiply,
     quaternions_from_rotvecs,
     relative_pose,
-    rotvecs_from_quaternions,
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.wheels import ReactionWheels
@@ -235,7 +234,7 @@ def _impulses(flight: Flight, states: Signal, about: Array) -> Array:
     step = np.diff(states.time)[:, np.newaxis]
     r, q, twist = (states.values[:, part] for part in (slice(3), slice(3, 7), slice(7, 13)))
     R = matrices_from_quaternions(q)
-    turn = rotvecs_from_quaternions(quaternion_multiply(quaternion_inverse(q[:-1]), q[1:]))
+    turn = attitude_errors(q[:-1], q[1:])
     omega = twist[:, 3:]
     turn_to_middle = turn / 2 + step * (omega[:-1] - omega[1:]) / 8
     middle = matrices_from_quaternions(

@@ -27,12 +27,7 @@ from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import Array, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
-from spacerobot_ros.model.rotations import (
-    matrices_from_quaternions,
-    quaternion_inverse,
-    quaternion_multiply,
-    rotvecs_from_quaternions,
-)
+from spacerobot_ros.model.rotations import attitude_errors, matrices_from_quaternions
 from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.core.goal import (
     Controlled,
@@ -377,9 +372,8 @@ class FlightData:
         if self.goal is None or not self.goal.base:
             return np.empty((0, 2))
         gaps = self.goal.position - self.pose[:, :3]
-        turns = quaternion_multiply(quaternion_inverse(self.pose[:, 3:]), self.goal.quaternion)
-        norms = [np.linalg.norm(each, axis=1) for each in (gaps, rotvecs_from_quaternions(turns))]
-        return np.column_stack(norms)
+        turns = attitude_errors(self.pose[:, 3:], self.goal.quaternion)
+        return np.column_stack([np.linalg.norm(each, axis=1) for each in (gaps, turns)])
 
     @property
     def end_effector_error(self) -> PoseError | None:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import RobotMotion
-from spacerobot_ros.model.rotations import attitude_error
+from spacerobot_ros.model.rotations import attitude_errors
 from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.effort_plant import EffortPlant
 from spacerobot_ros.simulation.loads import PlantLoads
@@ -139,12 +139,7 @@ class EngineFlight:
         rows = rows[known]
         own = np.array(self._poses)[rows]
         place = np.linalg.norm(own[:, :3] - poses[known, :3], axis=1)
-        turn = np.array(
-            [
-                np.linalg.norm(attitude_error(a, b))
-                for a, b in zip(own[:, 3:], poses[known, 3:], strict=True)
-            ]
-        )
+        turn = np.linalg.norm(attitude_errors(own[:, 3:], poses[known, 3:]), axis=1)
         bend = np.abs(np.array(self._shapes)[rows] - shapes[known]).max(axis=1, initial=0.0)
         worst = int(np.argmax(np.maximum(np.maximum(place, turn), bend)))
         return EngineComparison(

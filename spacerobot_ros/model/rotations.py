@@ -163,6 +163,11 @@ def attitude_error(quaternion: npt.ArrayLike, target: npt.ArrayLike) -> Array:
     return rotvec_from_quaternion(quaternion_multiply(quaternion_inverse(quaternion), target))
 
 
+def attitude_errors(quaternions: Array, targets: Array) -> Array:
+    """Return :func:`attitude_error` (N, 3) for attitudes (N, 4); either may be a single one."""
+    return rotvecs_from_quaternions(quaternion_multiply(quaternion_inverse(quaternions), targets))
+
+
 def compose_poses(outer: Array, inner: Array) -> Array:
     """Return the composition (7,) of two poses; ``inner`` is relative to ``outer``."""
     position = outer[:3] + matrix_from_quaternion(outer[3:]) @ inner[:3]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,6 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.report.scene import Body
 
 Image = npt.NDArray[np.float32]
-Floats = npt.NDArray[np.floating[Any]]
 
 EDGE_COLOUR = "#3d4450"
 MAX_MESH_FACES = 1500
@@ -27,6 +25,8 @@ _EDGE_WIDTH = 3
 """Edge width, in pixels before averaging."""
 
 _MIN_FACING_COSINE = 1e-6
+_MIN_FACE_AREA = 1e-6
+"""Twice the smallest area of a face that is filled, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ class Canvas:
         for solid in solids:
             for corners, normal in zip(solid.corners, solid.normals, strict=True):
                 if normal @ self._view.viewing_direction > _MIN_FACING_COSINE:
-                    self._fill_face(corners, normal, self._view.shade(solid.fill, normal))
+                    self._fill_face(corners, self._view.shade(solid.fill, normal))
         for solid in solids:
             seen = solid.edge_normals @ self._view.viewing_direction > _MIN_FACING_COSINE
             for ends in solid.edges[seen.any(axis=1)]:
@@ -156,39 +156,23 @@ class Canvas:
         at = (self._view(points) - self._low) * self._scale
         return np.column_stack([at, points @ self._view.viewing_direction])
 
-    def _fill_face(self, face: Array, normal: Array, fill: Array) -> None:
+    def _fill_face(self, face: Array, fill: Array) -> None:
         corners = self._to_pixels(face)
-        rows, columns = self._depth.shape
-        bottom = max(math.ceil(float(corners[:, 1].min()) - 0.5), 0)
-        top = min(math.floor(float(corners[:, 1].max()) - 0.5) + 1, rows)
-        if bottom >= top:
+        ends = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+        limits = np.array(self._depth.shape[::-1])
+        (left, bottom), (right, top) = np.clip(np.round(ends), 0, limits).astype(int)
+        triangle = np.vstack([corners[:, :2].T, np.ones(3)])
+        if left >= right or bottom >= top or abs(np.linalg.det(triangle)) < _MIN_FACE_AREA:
             return
-        # A convex face covers one run of pixels in each row.
-        y = np.arange(bottom, top) + 0.5
-        left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
-        for (ax, ay, _), (bx, by, _) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            if ay != by:
-                met = (y >= min(ay, by)) & (y <= max(ay, by))
-                x = ax + (y[met] - ay) * ((bx - ax) / (by - ay))
-                left[met] = np.minimum(left[met], x)
-                right[met] = np.maximum(right[met], x)
-        first = np.ceil(np.clip(left - 0.5, 0, columns)).astype(int)
-        last = np.floor(np.clip(right - 0.5, -1, columns - 1)).astype(int)
-        counts = np.maximum(last - first + 1, 0)
-        row = np.repeat(np.arange(bottom, top), counts)
-        column = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts - first, counts)
-        depth = self._plane_depth(face[0], normal, column + 0.5, row + 0.5)
-        nearer = depth > self._depth[row, column]
-        row, column = row[nearer], column[nearer]
-        self._depth[row, column] = depth[nearer]
-        self._pixels[row, column] = [*fill, 1.0]
-
-    def _plane_depth(self, place: Array, normal: Array, x: Floats, y: Floats) -> Array:
-        """Nearness of the plane through a point, at pixel coordinates."""
-        across, up = self._view.paper_axes @ normal
-        offset = float(normal @ place) - self._low @ (across, up)
-        depth = offset - (across * x + up * y) / self._scale
-        return np.asarray(depth / float(normal @ self._view.viewing_direction))
+        x, y = np.arange(left, right) + 0.5, np.arange(bottom, top)[:, np.newaxis] + 0.5
+        # Shares of the three corners at the centre of each pixel: the point is in the face unless
+        # one is negative.
+        weights = np.array([a * x + b * y + c for a, b, c in np.linalg.inv(triangle)])
+        depth = np.tensordot(corners[:, 2], weights, axes=1)
+        part = self._depth[bottom:top, left:right]
+        shown = (weights >= 0.0).all(axis=0) & (depth > part)
+        part[shown] = depth[shown]
+        self._pixels[bottom:top, left:right][shown] = [*fill, 1.0]
 
     def _draw_edge(
         self, ends: Array, color: str = EDGE_COLOUR, pixels_nearer: float = 2.0 * _EDGE_WIDTH
