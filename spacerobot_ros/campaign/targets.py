@@ -220,26 +220,70 @@ def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
     ParameterError
         There is no such target; the message suggests a similar name.
     """
-    kind, dot, rest = name.partition(".")
+    kind, _, rest = name.partition(".")
     if kind in CONFIGS:
         return [_parameter_target(name, kind, rest, scenario)]
-    if kind in ("mass", "inertia"):
-        return _mass_property_targets(kind, dot, rest, scenario)
-    if kind == "com":
-        return _center_targets(rest, scenario)
-    if kind == "target":
-        return [_floating_target(name, rest, scenario)]
-    if kind in _POSE_TARGET_NAMES:
-        return [_pose_target(name, kind, rest, scenario)]
     match = _FAULT_NAME_PATTERN.fullmatch(name)
     if match is not None:
         return [_fault_target(name, int(match[1]), match[2], scenario)]
+    if kind == "target" and not scenario.plant.target.given:
+        raise ParameterError(
+            f"'{name}': there is no target: the scenario '{scenario.name}' has no "
+            "plant.target.robot."
+        )
+    if kind == "end_effector_goal" and scenario.end_effector_goal is None:
+        raise ParameterError(f"'{name}': the scenario has no goal for the end-effector.")
+    available = _targets_by_name(kind, scenario)
+    pattern = re.compile(re.escape(name).replace(r"\*", ".+"))
+    if found := [target for each, target in available.items() if pattern.fullmatch(each)]:
+        return found
+    if available:
+        raise ParameterError(
+            f"'{name}' is not one of {', '.join(available)}.{suggestion(name, available)}"
+        )
     known = [f"{node}.{p.name}" for node in CONFIGS for p in declared(CONFIGS[node])]
     known += ["mass", "inertia", "com", "target.mass", "target.inertia", "target.com.x"]
     known += [*_POSE_TARGET_NAMES, "faults[0].at", "faults[0].until"]
     raise ParameterError(
         f"'{name}' cannot be dispersed; available: {_TARGET_NAMES}.{suggestion(name, known)}"
     )
+
+
+def _targets_by_name(kind: str, scenario: Scenario) -> dict[str, DispersionTarget]:
+    """Return all targets of a kind that is neither a node nor a fault; none for another kind."""
+    bodies = [body.name for body in description_of(scenario).bodies]
+    found: list[DispersionTarget] = []
+    match kind:
+        case "mass" | "inertia":
+            every = list(range(len(bodies)))
+            chosen = {kind: every, **{f"{kind}.{name}": [k] for k, name in enumerate(bodies)}}
+            found = [
+                _mass_property_target(kind, name, places, bodies) for name, places in chosen.items()
+            ]
+        case "com":
+            found = [
+                _center_target(k, column, f"com.{name}.{axis}")
+                for k, name in enumerate(bodies)
+                for column, axis in enumerate(AXES)
+            ]
+        case "target":
+            found = [
+                _floating_target(part)
+                for part in ("mass", "inertia", *(f"com.{axis}" for axis in AXES))
+            ]
+        case _ if kind in _POSE_TARGET_NAMES:
+            found = [
+                _pose_target(kind, part, column, scenario)
+                for part in ("position", "rotvec")
+                for column in range(3)
+            ]
+            if kind == "initial":
+                start = _declared("plant")["initial_joint_positions"]
+                found += [
+                    _entry_target(f"initial.joints.{joint}", "plant", start, k, is_offset=True)
+                    for k, joint in enumerate(description_of(scenario).joint_names)
+                ]
+    return {target.name: target for target in found}
 
 
 def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> DispersionTarget:
@@ -348,53 +392,18 @@ def _start_positions(scenario: Scenario) -> list[float]:
     return [float(x) for x in np.clip(zero, robot.limits("lower"), robot.limits("upper"))]
 
 
-def _find_bodies(name: str, scenario: Scenario) -> list[tuple[int, str]]:
-    names = [body.name for body in description_of(scenario).bodies]
-    if name == "*":
-        return list(enumerate(names))
-    if name not in names:
-        raise ParameterError(
-            f"the robot has no body '{name}'; it has {', '.join(names)}.{suggestion(name, names)}"
-        )
-    return [(names.index(name), name)]
-
-
 def _unchanged(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
     return flight
 
 
-def _mass_property_targets(
-    kind: str, dot: str, rest: str, scenario: Scenario
-) -> list[DispersionTarget]:
-    def target(bodies: Sequence[tuple[int, str]], name: str) -> DispersionTarget:
-        indices = [index for index, _ in bodies]
+def _mass_property_target(
+    kind: str, name: str, places: Sequence[int], bodies: Sequence[str]
+) -> DispersionTarget:
+    def weigh(factors: MassFactors, drawn: Array) -> None:
+        getattr(factors, kind)[:, places] *= drawn[:, np.newaxis]
 
-        def weigh(factors: MassFactors, drawn: Array) -> None:
-            getattr(factors, kind)[:, indices] *= drawn[:, np.newaxis]
-
-        sets = frozenset(f"{kind}.{body}" for _, body in bodies)
-        return DispersionTarget(name, _unchanged, "1", False, sets, weigh)
-
-    if not dot:
-        return [target(_find_bodies("*", scenario), kind)]
-    return [target([body], f"{kind}.{body[1]}") for body in _find_bodies(rest, scenario)]
-
-
-def _center_targets(rest: str, scenario: Scenario) -> list[DispersionTarget]:
-    body, dot, axis = rest.rpartition(".")
-    if rest == "*":
-        body, dot, axis = "*", ".", "*"
-    if not dot or axis not in (*AXES, "*"):
-        raise ParameterError(
-            f"'{f'com.{rest}'.rstrip('.')}' must be com.BODY.x, y, z or *, or com.*; the bodies "
-            f"are {', '.join(name for _, name in _find_bodies('*', scenario))}."
-        )
-    return [
-        _center_target(index, column, f"com.{name}.{letter}")
-        for index, name in _find_bodies(body, scenario)
-        for column, letter in enumerate(AXES)
-        if axis in (letter, "*")
-    ]
+    sets = frozenset(f"{kind}.{bodies[k]}" for k in places)
+    return DispersionTarget(name, _unchanged, "1", False, sets, weigh)
 
 
 def _center_target(index: int, column: int, name: str) -> DispersionTarget:
@@ -404,16 +413,8 @@ def _center_target(index: int, column: int, name: str) -> DispersionTarget:
     return DispersionTarget(name, _unchanged, "m", False, frozenset({name}), weigh)
 
 
-def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarget:
-    if load_target(scenario.plant.target) is None:
-        raise ParameterError(
-            f"'{name}': there is no target: the scenario '{scenario.name}' has no "
-            "plant.target.robot."
-        )
-    known = ["mass", "inertia", *(f"com.{axis}" for axis in AXES)]
-    if part not in known:
-        names = [f"target.{each}" for each in known]
-        raise ParameterError(f"'{name}' is not one of {', '.join(names)}.{suggestion(name, names)}")
+def _floating_target(part: str) -> DispersionTarget:
+    name = f"target.{part}"
     column = AXES.index(part[-1]) if part.startswith("com") else -1
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
@@ -431,18 +432,8 @@ def _floating_target(name: str, part: str, scenario: Scenario) -> DispersionTarg
     return DispersionTarget(name, apply, "m" if column >= 0 else "1", False, frozenset({name}))
 
 
-def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> DispersionTarget:
-    part, _, axis = rest.partition(".")
-    if kind == "initial" and part == "joints":
-        return _initial_joint_target(name, axis, scenario)
-    if part not in ("position", "rotvec") or axis not in AXES:
-        known = [f"{kind}.{p}.{a}" for p in ("position", "rotvec") for a in AXES]
-        if kind == "initial":
-            known += [f"initial.joints.{joint}" for joint in description_of(scenario).joint_names]
-        raise ParameterError(f"'{name}' is not one of {', '.join(known)}.{suggestion(name, known)}")
-    if kind == "end_effector_goal" and scenario.end_effector_goal is None:
-        raise ParameterError(f"'{name}': the scenario has no goal for the end-effector.")
-    column = AXES.index(axis)
+def _pose_target(kind: str, part: str, column: int, scenario: Scenario) -> DispersionTarget:
+    name = f"{kind}.{part}.{AXES[column]}"
     if kind == "initial" and part == "position":
         places = "initial_position", "initial_center_of_mass"
         declaration = _declared("plant")[places[bool(scenario.plant.initial_center_of_mass)]]
@@ -470,17 +461,6 @@ def _pose_target(name: str, kind: str, rest: str, scenario: Scenario) -> Dispers
 
     unit = "m" if part == "position" else "rad"
     return DispersionTarget(name, apply, unit, False, frozenset({name}))
-
-
-def _initial_joint_target(name: str, joint: str, scenario: Scenario) -> DispersionTarget:
-    joints = list(description_of(scenario).joint_names)
-    if joint not in joints:
-        raise ParameterError(
-            f"'{name}': the robot has no joint '{joint}'; it has {', '.join(joints)}."
-            f"{suggestion(joint, joints)}"
-        )
-    start = _declared("plant")["initial_joint_positions"]
-    return _entry_target(name, "plant", start, joints.index(joint), is_offset=True)
 
 
 def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> DispersionTarget:

@@ -45,7 +45,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"set": {"tick_rate": 1}}, "'tick_rate' is not a parameter"),
     ({"set": {"plant.time_mode": "realtime"}}, "campaigns are flown in lockstep"),
     ({"disperse": {"mas": NORM}}, "'mas' cannot be dispersed.*Did you mean 'mass'"),
-    ({"disperse": {"mass.mass_7": NORM}}, "no body 'mass_7'.*Did you mean 'mass_"),
+    ({"disperse": {"mass.mass_7": NORM}}, "'mass.mass_7' is not one of.*Did you mean 'mass.mass_"),
     ({"disperse": {"mass": {"nrom": {}}}}, "no distribution 'nrom'.*Did you mean 'norm'"),
     (
         {"disperse": {"mass": {"norm": {"scal": 1}}}},
@@ -64,7 +64,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mass": 1.0}}, "must have one distribution"),
     ({"disperse": {"mass": NORM, "mass.mass_1": NORM}}, "set the same values"),
     ({"disperse": {"mass.mass_1": NORM, "mass": NORM}}, "'mass.mass_1' and 'mass' set the same"),
-    ({"disperse": {"mass.": NORM}}, "the robot has no body ''"),
+    ({"disperse": {"mass.": NORM}}, "'mass.' is not one of mass, mass.base_link"),
     ({"disperse": 0}, "'disperse' must map names to values"),
     ({"criteria": []}, "'criteria' must map names to values"),
     ({"disperse": {"mass": {"gaussian": {}}}}, "Did you mean 'norm'"),
@@ -115,7 +115,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"plant.robot": {"choice": ["dual_arm"]}}}, "the same in all flights"),
     ({"disperse": {"plant.time_mode": {"choice": ["realtime"]}}}, "the same in all flights"),
     ({"disperse": {"initial.joint.slider_1": NORM}}, "Did you mean 'initial.joints.slider_1'"),
-    ({"disperse": {"com.x": NORM}}, "'com.x' must be com.BODY.x.*the bodies are base_link"),
+    ({"disperse": {"com.x": NORM}}, "'com.x' is not one of com.base_link.x, com.base_link.y"),
     ({"disperse": {"initial.position.x": NORM, "plant.initial_position[0]": NORM}}, "same values"),
     (
         {
@@ -131,7 +131,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"plant.linear_momentum": NORM}}, "name an element of the list"),
     ({"disperse": {"plant.tick_rate[0]": NORM}}, "it is not a list"),
     ({"disperse": {"plant.initial_orientation[0]": NORM}}, "disperse initial.rotvec"),
-    ({"disperse": {"initial.joints.slider": NORM}}, "no joint 'slider'.*Did you mean 'slider_"),
+    (
+        {"disperse": {"initial.joints.slider": NORM}},
+        "is not one of.*Did you mean 'initial.joints.slider_",
+    ),
     ({"disperse": {"goal.position.u": NORM}}, "is not one of goal.position.x"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
     ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 faults"),
@@ -169,7 +172,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"seed": 2**63}, "'seed' is 9223372036854775808; it must be a whole number from 0 to 9"),
     ({"criteria": {"duration_s": {"min": "a"}}}, "'duration_s: min' is 'a'; it must be a finite"),
     ({"disperse": {"plant.tf_links": NORM}}, "is neither a number nor a string"),
-    ({"disperse": {"com.mass_1.w": NORM}}, "must be com.BODY.x"),
+    ({"disperse": {"com.mass_1.w": NORM}}, "is not one of.*Did you mean 'com.mass_1"),
     ({"disperse": {"initial.velocity.x": NORM}}, "initial.position.x, initial.position.y"),
     (
         {"disperse": {"faults[0].value": NORM}, "set": {"plant.faults": ["joint_stuck slider_1"]}},
