@@ -387,11 +387,9 @@ class Dataset:
                 "is used. Remove any files that were copied there."
             )
         table = table.take(first)
-        return (
-            table
-            if columns is None
-            else table.select([name for name in columns if name in table.column_names])
-        )
+        if columns is not None:
+            table = table.select([name for name in columns if name in table.column_names])
+        return table
 
     def _row_files(self) -> Sequence[Path]:
         return sorted((self.folder / _FLIGHTS_FOLDER).glob("part-*.parquet"))
@@ -419,17 +417,10 @@ def _damaged_file_error(path: Path, error: Exception) -> ParameterError:
 
 
 def _row_schema(campaign: Campaign) -> Any:
-    arrow = require_module("pyarrow")
-    real, text = arrow.float64(), arrow.string()
-    fields = [("flight", arrow.int64()), ("seed", arrow.int64()), ("passed", arrow.bool_())]
-    fields += [("outcome", text), ("reason", text)]
-    for each in campaign.dispersions:
-        fields.append((f"{DRAW_PREFIX}{each.name}", text if each.target.is_text else real))
+    values = {x.name: "" if x.target.is_text else 0.0 for x in campaign.dispersions}
     metrics = [*metric_names(description_of(campaign.scenario).joint_names), *campaign.own_metrics]
-    fields += [(name, real) for name in metrics]
-    fields += [("wall_time_s", real), ("plan_time_s", real), ("engine", text)]
-    fields += [("fallback", text), ("versions", text)]
-    return arrow.schema(fields)
+    row = Row(Draw(0, 0, values), "", "", dict.fromkeys(metrics, 0.0))
+    return require_module("pyarrow").Table.from_pylist([row.record()]).schema
 
 
 def _fingerprint_of(campaign: Campaign) -> str:

@@ -192,10 +192,7 @@ class Results:
         if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
             names = list(self.drawn_numbers)
             indices = {name: sobol_indices(names, values) for name, values in metrics.items()}
-            for place, each in enumerate(found):
-                if known := indices[each.metric].get(each.cause):
-                    first, total = known[:2], known[2:]
-                    found[place] = replace(each, first_order_index=first, total_order_index=total)
+            found = [replace(each, **indices[each.metric].get(each.cause, {})) for each in found]
         return sorted(found, key=lambda each: -each.strength)
 
     def drawn_by_influence(self, found: Sequence[Influence]) -> list[str]:

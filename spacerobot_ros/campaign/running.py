@@ -57,11 +57,8 @@ class Progress:
     @property
     def seconds_left(self) -> float:
         """Estimated remaining wall time, s; infinite until the first flight has finished."""
-        return (
-            (self.total - self.flown) / self.flights_per_second
-            if self.flights_per_second
-            else float("inf")
-        )
+        rate = self.flights_per_second
+        return (self.total - self.flown) / rate if rate else math.inf
 
 
 def run_campaign(

@@ -226,10 +226,8 @@ def corrected_for_multiple_tests(found: Sequence[Influence]) -> list[Influence]:
     ]
 
 
-def sobol_indices(
-    names: Sequence[str], values: Array
-) -> dict[str, tuple[float, float, float, float]]:
-    """Return first-order and total Sobol indices with their intervals, by dispersion name.
+def sobol_indices(names: Sequence[str], values: Array) -> dict[str, dict[str, Any]]:
+    """Return the Sobol indices of :class:`Influence` by their names, by dispersion name.
 
     ``values`` (N,) are in Saltelli sample order. The result is empty if the metric is
     missing for a flight.
@@ -241,8 +239,11 @@ def sobol_indices(
         problem, values, calc_second_order=False, seed=1
     )
     keys = ("S1", "S1_conf", "ST", "ST_conf")
-    columns = zip(*(np.asarray(result[key]).tolist() for key in keys), strict=True)
-    return {name: (a, b, c, d) for name, (a, b, c, d) in zip(names, columns, strict=True)}
+    rows = np.array([result[key] for key in keys]).T.tolist()
+    return {
+        name: {"first_order_index": (a, b), "total_order_index": (c, d)}
+        for name, (a, b, c, d) in zip(names, rows, strict=True)
+    }
 
 
 def percentiles(values: Array) -> list[float]:

@@ -278,13 +278,12 @@ def _marker_maker(
 
 def topic_quantities(flight: FlightData) -> dict[str, Array]:
     """Return all quantities by their names in the topic table."""
-    true = {"pose": flight.pose, "twist": flight.twist, "q": flight.q, "qdot": flight.qdot}
     found = {**flight.quantities, "effort": flight.effort, "momentum": flight.momentum}
-    erred = "measured_pose" in flight.quantities
-    for name, values in true.items():
-        found.setdefault(f"measured_{name}", values)
-        if erred:
+    for name in ("pose", "twist", "q", "qdot"):
+        values = flight.signal(name).values
+        if "measured_pose" in flight.quantities:
             found[f"true_{name}"] = values
+        found.setdefault(f"measured_{name}", values)
     return {**found, "pose": flight.pose}
 
 
