@@ -158,7 +158,7 @@ def _changed_scenario(
 ) -> Scenario:
     from spacerobot_ros.scenario import scenario_or_robot
 
-    scenario = goal.apply_to(scenario_or_robot(name))
+    scenario = goal(scenario_or_robot(name))
     if method is not None:
         scenario = scenario.with_method(method)
     if realtime is not None:

@@ -7,7 +7,6 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
 from functools import cached_property, partial, wraps
 from importlib import import_module
 from itertools import takewhile
@@ -223,32 +222,21 @@ def _is_number(text: str) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class GoalOptions:
-    """Goal from command line options.
+GoalOptions = Callable[["Scenario"], "Scenario"]
+"""Changes the goal of a scenario to that of the :func:`goal_options`."""
 
-    Attributes
-    ----------
-    pose
-        (7,) position (m) and quaternion, or (3,) position, if given.
-    rotvec, rpy_deg
-        (3,) attitude in radians or in degrees, if given.
-    end_effectors
-        Goals of end-effectors.
-    """
 
-    pose: tuple[float, ...] | None
-    rotvec: tuple[float, ...] | None
-    rpy_deg: tuple[float, ...] | None
-    end_effectors: Sequence[EndEffectorGoal] = ()
-
-    def apply_to(self, scenario: Scenario) -> Scenario:
-        """Return a scenario with this goal; warn about a rotation that looks like degrees."""
-        if self.rotvec is not None:
-            warn_of_large_angles(self.rotvec, "--goal-rpy-deg")
-        return scenario.with_goal(
-            self.pose, self.rotvec, self.rpy_deg, end_effectors=self.end_effectors
-        )
+def with_goal(
+    scenario: Scenario,
+    pose: Sequence[float] | None,
+    rotvec: Sequence[float] | None,
+    rpy_deg: Sequence[float] | None,
+    end_effectors: Sequence[EndEffectorGoal] = (),
+) -> Scenario:
+    """Return a scenario with a goal from options; warn about a rotation that looks like degrees."""
+    if rotvec is not None:
+        warn_of_large_angles(rotvec, "--goal-rpy-deg")
+    return scenario.with_goal(pose, rotvec, rpy_deg, end_effectors=end_effectors)
 
 
 def end_effector_goals(
@@ -305,17 +293,17 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options for base and end-effector goals to a command, as its argument ``goal``."""
 
     @wraps(command)
-    def with_goal(*words: Any, goal: Any, position: Any, **options: Any) -> None:
+    def with_options(*words: Any, goal: Any, position: Any, **options: Any) -> None:
         if goal is not None and position is not None:
             raise click.UsageError("The goal is given twice, as a pose and as a position.")
         rotvec, rpy_deg, *hands = (
             options.pop(name)
             for name in ("rotvec", "rpy_deg", "poses", "positions", "links", "paths")
         )
-        chosen = GoalOptions(goal or position, rotvec, rpy_deg, end_effector_goals(*hands))
-        command(*words, goal=chosen, **options)
+        goals = goal or position, rotvec, rpy_deg, end_effector_goals(*hands)
+        command(*words, goal=lambda scenario: with_goal(scenario, *goals), **options)
 
-    with_poses = _position_option(_pose_option(_attitude_options("goal-")(with_goal)))
+    with_poses = _position_option(_pose_option(_attitude_options("goal-")(with_options)))
     return end_effector_options(cast("Callable[..., None]", with_poses))
 
 

@@ -98,7 +98,7 @@ def plan_command(
         node, _, _ = parse_setting(text)
         if node not in ("plant", "planner"):
             raise ParameterError(f"'{text}' sets a parameter of {node}, which does not plan.")
-    chosen = goal.apply_to(scenario_or_robot(scenario).with_settings(settings))
+    chosen = goal(scenario_or_robot(scenario).with_settings(settings))
     problem = PlanningProblem.of(chosen)
     method = method or problem.config.method
     if count is not None:

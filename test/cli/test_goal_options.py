@@ -32,6 +32,7 @@ from spacerobot_ros.cli.options import (
     end_effector_goals,
     goal_options,
     warn_of_large_angles,
+    with_goal,
 )
 from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
@@ -58,7 +59,7 @@ def test_beside_goals_of_end_effectors_the_base_has_what_is_asked(
     pose: Any, rotvec: Any, rpy_deg: Any, base: list[str]
 ) -> None:
     hands = end_effector_goals((), (HAND,), ("link_7",))
-    goal = GoalOptions(pose, rotvec, rpy_deg, hands).apply_to(load_scenario("reach")).goal
+    goal = with_goal(load_scenario("reach"), pose, rotvec, rpy_deg, hands).goal
     assert ([hand.link for hand in goal.end_effectors], sorted(goal.base)) == (["link_7"], base)
     if pose is not None:
         np.testing.assert_array_equal(goal.position, pose[:3])
@@ -120,7 +121,7 @@ def test_a_rotation_of_more_than_a_turn_is_noted(
     warn_of_large_angles(rotvec, "--here")
     assert capsys.readouterr() == ("", said)
     if said:
-        GoalOptions(None, rotvec, None).apply_to(load_scenario("reach"))
+        with_goal(load_scenario("reach"), None, rotvec, None)
         assert capsys.readouterr().err == said.replace("--here", "--goal-rpy-deg")
 
 
@@ -191,7 +192,7 @@ def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) ->
     @click.argument("scenario")
     @goal_options
     def fly(scenario: str, goal: GoalOptions) -> None:
-        found.append(goal.apply_to(load_scenario(scenario)).goal)
+        found.append(goal(load_scenario(scenario)).goal)
 
     result = CliRunner().invoke(fly, ["sliding_masses", "--goal", *words])
     assert result.exit_code == 0, result.output
