@@ -27,6 +27,9 @@ _EDGE_WIDTH = 3
 _MIN_FACING_COSINE = 1e-6
 _MIN_FACE_AREA = 1e-6
 """Twice the smallest area of a face that is filled, pixels."""
+_ROUNDING = 1e-9
+"""Rounding of shares and of nearness, m: faces leave no gap at a common edge, and of faces in one
+plane the first is visible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +173,7 @@ class Canvas:
         weights = np.array([a * x + b * y + c for a, b, c in np.linalg.inv(triangle)])
         depth = np.tensordot(corners[:, 2], weights, axes=1)
         part = self._depth[bottom:top, left:right]
-        shown = (weights >= 0.0).all(axis=0) & (depth > part)
+        shown = (weights >= -_ROUNDING).all(axis=0) & (depth > part + _ROUNDING)
         part[shown] = depth[shown]
         self._pixels[bottom:top, left:right][shown] = [*fill, 1.0]
 
