@@ -407,8 +407,9 @@ def test_what_is_behind_is_hidden() -> None:
     def square(nearness: float, half: float, fill: list[float], facing: float = 1.0) -> PlacedSolid:
         corners = [x * right + y * up for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
         normal = view.viewing_direction
-        placed = half * np.array([corners]) + nearness * normal
-        return PlacedSolid(placed, facing * normal[np.newaxis], none, none, np.array(fill))
+        triangles = np.array([corners[:3], [*corners[2:], corners[0]]])
+        placed, normals = half * triangles + nearness * normal, facing * np.array([normal] * 2)
+        return PlacedSolid(placed, normals, none, none, np.array(fill))
 
     near, far = square(1.0, 0.5, [1.0, 0.0, 0.0]), square(0.0, 1.0, [0.0, 0.0, 1.0])
     backwards = square(2.0, 0.5, [0.0, 1.0, 0.0], facing=-1.0)
