@@ -49,7 +49,7 @@ from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.messages import message_class
-from spacerobot_ros.nodes.common.node import STREAM, FlightNode
+from spacerobot_ros.nodes.common.node import STREAM, UNKNOWN_NODE, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.watchdog import Role
@@ -84,9 +84,6 @@ _PARAMETER_RECORD_BY_TOPIC = {
 """Name of the record with the parameters of a node, by a topic that the node publishes.
 
 A node that publishes such a topic is configured, so its parameters are fixed."""
-
-_UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-"""Node name that rmw_dds_common gives to a publisher discovered before its node."""
 
 _QUEUE_DEPTH = 2000
 """Queue depth of subscriptions; above 5000 the events executor stops responding."""
@@ -309,7 +306,7 @@ class RecorderNode(FlightNode):
             own = self.get_namespace().rstrip("/")
             if topic == f"{own}/{name}":
                 record = f"parameters/{title}"
-            if owner.node_name == _UNKNOWN_NODE:
+            if owner.node_name == UNKNOWN_NODE:
                 self._topics_without_owner.add(topic)
                 continue
             self._topics_without_owner.discard(topic)

@@ -25,7 +25,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.builders import goal_messages
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.nodes.common.messages import shape_message
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM, UNKNOWN_NODE
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
@@ -150,12 +150,13 @@ class MissionClient:
     def has_goal_commander(self) -> bool:
         """Whether a commander that publishes its status and subscribes to goals is connected.
 
-        A recorder also subscribes to goals, and may be discovered first.
+        A recorder also subscribes to goals, and may be discovered first, before its node's name.
         """
         if not self._status_topic.get_publisher_count():
             return False
         deciders = self.node.get_publishers_info_by_topic(self._status_topic.topic_name)
-        return bool(_names_of(deciders) & self._readers(self._goal_topic))
+        named = [each for each in deciders if each.node_name != UNKNOWN_NODE]
+        return bool(_names_of(named) & self._readers(self._goal_topic))
 
     def knows_commander(self) -> bool:
         """Whether a publisher of the commander's status has been discovered."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +25,8 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes.common.messages import path_poses
+from spacerobot_ros.nodes.common.node import endpoints_of
+from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
@@ -238,6 +243,60 @@ def test_a_recorder_that_reads_goals_is_no_commander(harness: Harness) -> None:
     harness.spin_until(lambda: client.has_goal_commander() and client.is_connected(2))
     client.send(GOAL)
     harness.spin_until(lambda: commander.count("goal_pose"), "the goal")
+
+
+NAMELESS = """
+import sys
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+rclpy.init()
+planner, recorder = rclpy.create_node("planner"), rclpy.create_node("recorder")
+latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+status = planner.create_publisher(DiagnosticStatus, "planner/status", latched)
+goals = recorder.create_subscription(PoseStamped, "goal_pose", print, 10)
+sys.stdin.read()
+"""
+"""A planner that reads no goals yet, and a recorder that does."""
+
+WITHOUT_NAMES = """<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <profiles>
+    <data_writer profile_name="ros_discovery_info">
+      <qos><ownership><kind>EXCLUSIVE</kind></ownership></qos>
+    </data_writer>
+  </profiles>
+</dds>
+"""
+"""Fast DDS settings with which no other process learns which node an endpoint belongs to."""
+
+
+def test_nodes_whose_names_have_not_come_yet_are_no_commander(
+    harness: Harness, ros_domain: int, tmp_path: Path
+) -> None:
+    """The planner and the recorder would pass for one node, and the goal would be lost."""
+    settings = tmp_path / "fastdds.xml"
+    settings.write_text(WITHOUT_NAMES, "utf-8")
+    environment = {
+        **os.environ,
+        **dict.fromkeys(FASTDDS_FILE_VARIABLES, str(settings)),
+        "ROS_DOMAIN_ID": str(ros_domain),
+    }
+    client = MissionClient("planner", "world", lambda: NOW, GOAL, context=harness.context)
+    harness.add(client.node)
+    words = [sys.executable, "-c", NAMELESS]
+    with subprocess.Popen(words, env=environment, stdin=subprocess.PIPE) as nodes:
+        harness.spin_until(
+            lambda: (
+                {"/goal_pose", "/planner/status"}
+                <= {end.topic for end in endpoints_of(client.node) if end.matched}
+            )
+        )
+        assert not client.has_goal_commander()
+        nodes.communicate()
 
 
 def test_a_path_of_an_end_effector_is_sent_on_its_topic(harness: Harness) -> None:

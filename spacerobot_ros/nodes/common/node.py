@@ -74,6 +74,9 @@ _STATES_THAT_CAN_SHUT_DOWN = (
 
 _MIDDLEWARE_TOPICS = ("/rosout", "/parameter_events")
 
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
+"""Node name that rmw_dds_common gives to an endpoint discovered before its node."""
+
 
 class Endpoint(NamedTuple):
     """A publisher or subscription of a node, and the number of endpoints matched with it."""
