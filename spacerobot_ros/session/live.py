@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import secrets
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -206,6 +207,8 @@ def send_goal(
     with ros():
         executor = EventsExecutor()
         clocks = {"own": 0, "global": 0}
+        # Goals with the same stamp would be one goal, and other senders have read the same clock.
+        offset = secrets.randbelow(SECOND // 1000)
 
         def on_clock(message: Clock, which: str) -> None:
             clocks[which] = stamp_to_ns(message.clock)
@@ -214,7 +217,7 @@ def send_goal(
             MissionClient(
                 decider,
                 "",
-                lambda: clocks["own"] or clocks["global"] or time.time_ns(),
+                lambda: (clocks["own"] or clocks["global"] or time.time_ns()) + offset,
                 goal,
                 namespace=namespace,
                 name=f"goal_{decider}",
@@ -316,7 +319,7 @@ def _find_goal_commander(
             show(f"Waiting for a planner or a controller on {topics}, up to {patience:g} s.")
         for client in clients:
             if not (client.is_connected() and client.has_goal_commander()):
-                if client.knows_commander() and now < began + _LONGEST_STATUS_WAIT:
+                if client.knows_commander():
                     break  # A planner is being connected; its controller follows references.
                 continue
             latest = time.monotonic() + _LONGEST_STATUS_WAIT

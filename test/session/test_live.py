@@ -11,20 +11,23 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from rosgraph_msgs.msg import Clock
 from support.nodes_apart import NodeProcess
 from support.raw_messages import iterate_raw
-from support.ros_harness import Harness
+from support.ros_harness import LATCHED, Harness
 from support.warm_python import WarmProcess, WarmPython
 
 from spacerobot_ros.bag import read_bag
@@ -35,6 +38,7 @@ from spacerobot_ros.nodes.common.process import free_domain
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.execution.executive import Executive
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.live import ros, send_goal
 from spacerobot_ros.session.processes import MultiProcessStack, checked_namespace
@@ -238,6 +242,66 @@ def test_a_goal_that_nobody_takes_is_one_sentence(spacerobot: Command) -> None:
         assert run.stderr.count("\n") == 1
         assert f"within {seconds} s" in run.stderr
         assert "spacerobot up" in run.stderr
+
+
+@dataclass
+class Listener:
+    """A planner that only listens to goals, beside a clock that stands still."""
+
+    harness: Harness
+
+    def __post_init__(self) -> None:
+        self.node = self.harness.probe({}, name="planner")
+        self._status = self.node.create_publisher(DiagnosticStatus, "planner/status", LATCHED)
+        clock = self.node.create_publisher(Clock, "/clock", 10)
+        time = Clock(clock=Time(sec=5))
+        self.node.create_timer(0.01, lambda: clock.publish(time))
+
+    def decide(self, goal: PoseStamped) -> None:
+        """Report that a goal is reached."""
+        status = PlannerStatus(PlannerState.REACHED, "Reached.", goal_id=goal_id(goal))
+        self._status.publish(
+            DiagnosticStatus(
+                message=status.message,
+                values=[KeyValue(key=k, value=v) for k, v in status.to_values().items()],
+            )
+        )
+
+
+def goal_id(goal: PoseStamped) -> str:
+    return f"{goal.header.stamp.sec}.{goal.header.stamp.nanosec:09d}"
+
+
+def test_a_goal_waits_for_a_planner_that_is_known_rather_than_for_its_controller(
+    spacerobot: Command, harness: Harness
+) -> None:
+    """A controller leaves the goals to the planner and says nothing about them."""
+    planner = Listener(harness)
+    controller = harness.probe({"goal_pose": PoseStamped}, name="coordinated_control")
+    controller.create_publisher(DiagnosticStatus, "controller/status", LATCHED)
+    with spacerobot.start("goal", "1", "0", "0", "--timeout", "30") as goal:
+        assert goal.stdout is not None
+        next(line for line in iter(goal.stdout.readline, "") if line.startswith("Waiting for a"))
+        planner.node.react["goal_pose"] = planner.decide
+        planner.node.watch("goal_pose", PoseStamped)
+        harness.spin_until(lambda: goal.poll() is not None, timeout=PATIENCE)
+        assert goal.wait(PATIENCE) == 0, goal.stdout.read()
+
+
+def test_goals_that_two_commands_send_at_the_same_simulated_time_are_two(
+    spacerobot: Command, harness: Harness
+) -> None:
+    planner = Listener(harness)
+    planner.node.watch("goal_pose", PoseStamped)
+    goals = planner.node.messages["goal_pose"]
+    words = ("goal", "1", "0", "0", "--timeout", "30")
+    with spacerobot.start(*words) as first, spacerobot.start(*words) as second:
+        harness.spin_until(lambda: len(goals) == 2, timeout=PATIENCE)
+        for goal in goals:
+            planner.decide(goal)
+        harness.spin_until(lambda: None not in (first.poll(), second.poll()), timeout=PATIENCE)
+        assert (first.wait(), second.wait()) == (0, 0)
+    assert len(set(map(goal_id, goals))) == 2
 
 
 @pytest.mark.parametrize(
