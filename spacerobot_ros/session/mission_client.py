@@ -43,6 +43,9 @@ _LONGEST_DELIVERY = 5.0  # wall s
 
 _SHAPE = "goal_joint_states"
 
+_VERDICTS = {f"goal_{each.value}": each.value for each in Outcome}
+"""State of a status by the kind of the event with the same verdict."""
+
 
 class MissionClient:
     """A node that sends the goals of one flight and waits for their outcome.
@@ -87,6 +90,9 @@ class MissionClient:
         self.decider = decider
         """The commander that decides."""
         self._done = rclpy.task.Future(executor=None)
+        self._decision: Status | None = None
+        """The verdict in an event. The status with the verdict may be lost: latched topics keep one
+        message for a busy reader, and that may be about a later goal."""
         self._frame, self._now = world_frame, now
         self._joint_names = joint_names
         self._sent = 0
@@ -182,7 +188,7 @@ class MissionClient:
         self._sent += 1
         time_ns = self._now() + self._sent
         self._follower = GoalFollower(GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND)))
-        self.message = ""
+        self.message, self._decision = "", None
         if self._joint_names is not None:
             self._sends[_SHAPE].publish(shape_message(goal, self._joint_names))
         for topic, aim in goal_messages(goal, end_effector, self._frame, time_ns).items():
@@ -218,6 +224,8 @@ class MissionClient:
             except SpaceRobotError as error:
                 failures.append(error)
                 stop = True
+            if self._decision is not None:
+                self._take(self._decision)
             if stop:
                 self._end(Outcome.INTERRUPTED)
 
@@ -236,12 +244,21 @@ class MissionClient:
 
     def _on_event(self, received: DiagnosticStatus) -> None:
         event = read_status(received)
-        if event.values.get("event") == EventKind.FAILED.value:
-            self.failures[event.name.rpartition("/")[2]] = event.message
+        kind, node = event.values.get("event", ""), event.name.rpartition("/")[2]
+        if kind == EventKind.FAILED.value:
+            self.failures[node] = event.message
+        elif node == self.decider and kind in _VERDICTS:
+            values = {"state": _VERDICTS[kind], "goal_id": event.values.get("goal_id", "")}
+            decision = self._read(values, event.message)
+            if self._follower.is_about_goal(decision):
+                self._decision = decision
 
     def _on_status(self, received: DiagnosticStatus) -> None:
         message = read_status(received)
-        self.status = self._read(dict(message.values), message.message)
+        self._take(self._read(dict(message.values), message.message))
+
+    def _take(self, status: Status) -> None:
+        self.status = status
         if self.outcome is None and not self._is_about_another_goal(self.status):
             self.message = self.status.message
             self.on_message(self.message)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from nav_msgs.msg import Path as PathMessage
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from support.hand_motion import end_of_motion
-from support.ros_harness import LATCHED, Harness, Probe
+from support.ros_harness import LATCHED, TIMEOUT, Harness, Probe
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
@@ -141,6 +142,29 @@ def test_the_end_of_a_replaced_goal_counts_though_the_next_status_comes_at_once(
     harness.spin_until(lambda: mission.client.status == statuses[-1])
     assert mission.client.outcome is Outcome.ABORTED
     assert mission.client.message == replaced
+
+
+@pytest.mark.parametrize("decider", STATUS)
+def test_a_verdict_whose_status_is_lost_is_known_from_its_event(
+    harness: Harness, decider: str
+) -> None:
+    """As when a later goal's status replaces it before a busy client has received it."""
+    mission = Mission(harness, decider)
+    events = mission.commander.create_publisher(DiagnosticStatus, "events", 10)
+    harness.spin_until(events.get_subscription_count)
+    goal_id = mission.send(GOAL)
+    for node, kind, identity in (
+        ("/other", "goal_failed", goal_id),
+        (f"/{decider}", "goal_failed", "12.9"),
+        (f"/{decider}", "goal_accepted", goal_id),
+        (f"/{decider}", "goal_reached", goal_id),
+    ):
+        values = [KeyValue(key="event", value=kind), KeyValue(key="goal_id", value=identity)]
+        events.publish(DiagnosticStatus(name=node, message=f"{kind}.", values=values))
+    late = time.monotonic() + TIMEOUT
+    outcome = mission.client.follow(harness.executor, lambda: time.monotonic() > late, 0.01)
+    assert outcome is Outcome.REACHED
+    assert mission.client.message == "goal_reached."
 
 
 def test_every_goal_has_an_id_of_its_own_though_time_stands_still(harness: Harness) -> None:
