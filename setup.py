@@ -71,6 +71,7 @@ setup(
         NAME: [
             "py.typed",
             "batch/*.hpp",
+            "nodes/common/*.xml",
             "report/*.css",
             "report/*.js",
             "viewer/*.js",
