@@ -632,11 +632,10 @@ class _Search:
             return found
         self._best, self._is_clearing = math.inf, True
         paths = itertools.chain([(found.solution, 1.0)], self._other_paths(kept, found.solution))
-        if not self._clears_coarsely:
-            paths = itertools.islice(paths, 1 + _MAX_FULL_GRID_STARTS)
+        most = None if self._clears_coarsely else 1 + _MAX_FULL_GRID_STARTS
         good, enough = _GOOD_TIME_FACTOR * found.duration, _ENOUGH_CLEAR_PATHS
         clear: list[tuple[Trajectory, KeptDistances]] = []
-        for path, reach in paths:
+        for path, reach in itertools.islice(paths, most):
             if reach <= 1 and any(path.duration >= each.duration for each, _ in clear):
                 continue
             beside, slower = kept.beside(path), _CLEARING_TIME_FACTOR
