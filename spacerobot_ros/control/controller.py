@@ -17,9 +17,9 @@ from spacerobot_ros.control.detumbling import Detumbling
 from spacerobot_ros.control.laws.law import ControlLaw, Gains
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.limits import (
+    REFERENCE_SHARE,
     ActuatorLimits,
     JointRateLimits,
-    MotionLimits,
     Saturated,
 )
 from spacerobot_ros.control.outputs import OutputDistance, OutputSelection
@@ -65,6 +65,9 @@ from spacerobot_ros.planning.methods.thrust.problem import Grapple
 
 _LONGEST_MOTION = 1e9
 """Longest duration of a reference, s, equal to that of the longest flights."""
+
+_EFFORT_SAMPLES = 21
+"""Number of times at which the joint efforts of a reference are computed."""
 
 _BRAKE_RATE = 2.0
 """Decay rate of joint motion if the base state is unknown, 1/s."""
@@ -223,23 +226,37 @@ class CoordinatedController:
         here = Reference.present(
             self.law.robot, state, self.law.outputs.selection.end_effector_link
         )
-        motion = self._motion_within_limits(state)
-        duration = self._profile_type(here, goals, motion).duration
+        duration = self._profile(state, here, goals).duration
         if duration > _LONGEST_MOTION:
             raise PlanningError(
                 f"The reference to the goal would take {duration:.3g} s, and the longest is "
                 f"{_LONGEST_MOTION:g} s: choose a nearer goal, or raise motion.speed, "
-                "motion.acceleration or the thruster limits."
+                "motion.acceleration or the limits of thrusters and joint efforts."
             )
 
-    def _motion_within_limits(self, state: ControlState) -> MotionLimits:
-        motion = self._motion.within_thruster_limits(self.limits, self.law.robot, state.q)
-        return motion if self.wheels is None else self.wheels.limits_with_wheels(motion, state.q)
+    def _profile(
+        self, state: ControlState, start: Reference, goal: Reference, *, carries: bool = False
+    ) -> ReferenceProfile:
+        """Return the motion to a goal that thrusters, wheels and joint motors can follow."""
+        robot, actuators = self.law.robot, self.limits
+        motion = self._motion.within_thruster_limits(actuators, robot, state.q)
+        if self.wheels is not None:
+            motion = self.wheels.limits_with_wheels(motion, state.q)
+        profile = self._profile_type(start, goal, motion, carries=carries)
+        # Efforts are inversely proportional to the square of the duration.
+        has_motor, share = actuators.effort > 0, 1.0
+        for time in np.linspace(0.0, profile.duration, _EFFORT_SAMPLES):
+            base = profile.at(time).base
+            if base is not None:
+                efforts = self.joint_rate_limits.holding_efforts(state.q, base)
+                shares = np.abs(efforts[has_motor] / actuators.effort[has_motor])
+                share = max(share, shares.max(initial=0.0) / REFERENCE_SHARE)
+        profile.duration *= math.sqrt(share)
+        return profile
 
     def _begin_motion(self, time: float, state: ControlState, motion: GoalMotion) -> None:
         start, goal, carries, _ = motion
-        limits = self._motion_within_limits(state)
-        self.begin(time, self._profile_type(start, goal, limits, carries=carries))
+        self.begin(time, self._profile(state, start, goal, carries=carries))
 
     @contextmanager
     def _failures_of_law(self, time: float) -> Iterator[None]:

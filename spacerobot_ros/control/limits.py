@@ -15,15 +15,17 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.control.state import Actuation, ControlState
+from spacerobot_ros.control.state import Actuation, ControlState, PoseReference
 from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.parameters import parameter
 
-_REFERENCE_THRUST_SHARE = 0.5
-"""Fraction of the thrust available to references; feedback and mass errors need the rest."""
+REFERENCE_SHARE = 0.5
+"""Fraction of thrust and joint efforts available to references; feedback and mass errors need the
+rest."""
 
 
 _MIN_PERIODS_TO_LIMIT = 2
@@ -59,7 +61,7 @@ class MotionLimits:
         thrusters can also balance the torque of their force if the centre of mass is not at the
         base origin. Without thrusters, the limits are unchanged.
         """
-        force, torque = (_REFERENCE_THRUST_SHARE * x for x in (actuators.force, actuators.torque))
+        force, torque = (REFERENCE_SHARE * x for x in (actuators.force, actuators.torque))
         lever = float(np.linalg.norm(robot.center_of_mass(q)))
         accelerations = [self.acceleration, force / robot.total_mass]
         if lever > 0:
@@ -212,6 +214,18 @@ class JointRateLimits:
         rest = np.zeros(3)
         Js, Fs, _ = self._evaluate_dynamics(ControlState(rest, rest, rest, rest, q, qdot))
         return np.asarray(Js @ qddot + Fs)
+
+    def holding_efforts(self, q: Array, base: PoseReference) -> Array:
+        """Return the efforts (n,) that hold joints at rest at ``q`` (n,) as the base moves."""
+        R_BW, still = matrix_from_quaternion(base.quaternion).T, np.zeros(3)
+        omega, alpha = R_BW @ base.angular_velocity, R_BW @ base.angular_acceleration
+        r, inertia = self._robot.center_of_mass(q), self._robot.inertia_matrix(q)[3:6, 3:6]
+        turning = np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
+        force = self._robot.total_mass * (R_BW @ base.acceleration + turning)
+        torque = inertia @ alpha + np.cross(omega, inertia @ omega) + np.cross(r, force)
+        rest = ControlState(still, still, still, omega, q, np.zeros_like(q))
+        _, Fs, G = self._evaluate_dynamics(rest)
+        return np.asarray(Fs - G @ np.concatenate([force, torque]))
 
     def _evaluate_dynamics(self, state: ControlState) -> tuple[Array, Array, Array]:
         inputs = self._dynamics.inputs

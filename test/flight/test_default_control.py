@@ -106,6 +106,15 @@ def test_an_end_effector_is_brought_to_the_goal_of_the_caller_by_a_law() -> None
             fly(scenario, **given)
 
 
+def test_weak_motors_hold_an_arm_while_its_base_turns() -> None:
+    """An arm of 15 m on a station: the turn takes as long as its motors need to carry it along."""
+    turned = fly("station_arm", rotvec=(0.0, 0.08, 0.0), method="transposed_jacobian")
+    assert turned.succeeded
+    limits = SpaceRobot.from_file(robot_file("station_arm")).effort_limit
+    assert np.abs(turned.effort / limits).max() < 0.9
+    assert np.abs(turned.q - turned.q[0]).max() < 0.05
+
+
 def test_a_part_that_is_not_asked_for_is_kept() -> None:
     """Where the base is at the start, by a law and by a gait method."""
     attitude = [0.0, 0.6, 0.0, 0.8]
