@@ -20,7 +20,8 @@ from spacerobot_ros.nodes import NODE_TYPES, FlightNode
 from spacerobot_ros.nodes.common.node import endpoints_of, topics_without_all_matches
 from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.scenario import COMMANDERS, NO_GOAL, scenario_or_robot
+from spacerobot_ros.resources import suggestion
+from spacerobot_ros.scenario import COMMANDERS, NO_GOAL, Scenario, scenario_or_robot
 from spacerobot_ros.scenario_files import changed_goal
 from spacerobot_ros.session.mission_client import MissionClient
 
@@ -75,6 +76,11 @@ class Stack:
         for name in COMMANDERS:
             scenario = scenario.with_overrides(name, {"plan_in_background": False})
         for name, values in parameters.items():
+            if name not in nodes:
+                raise SpaceRobotError(
+                    f"'parameters' names node '{name}', which is not in 'nodes'."
+                    f"{suggestion(name, [each for each in nodes if isinstance(each, str)])}"
+                )
             scenario = scenario.with_overrides(name, values)
         self._world, self._timeout, self._sent = scenario.plant.world_frame, timeout, 0
         self.nodes: dict[str, Node] = {}
@@ -87,19 +93,41 @@ class Stack:
             self.executor = EventsExecutor(context=self.context)
             closing.callback(self.executor.shutdown)
             for each in nodes:
-                if isinstance(each, str):
-                    own = scenario.parameters(each)
-                    given = [Parameter(key, value=value) for key, value in own.items()]
-                    options = {"parameter_overrides": given, "context": self.context}
-                    node: Node = NODE_TYPES[each](each, autostart=False, **options)
-                else:
-                    node = each(self.context)
+                node = self._packaged(each, scenario) if isinstance(each, str) else self._own(each)
                 closing.callback(node.destroy_node)
+                if node.get_name() in self.nodes:
+                    raise SpaceRobotError(
+                        f"Two of the nodes are named '{node.get_name()}': rename one of them."
+                    )
                 self.nodes[node.get_name()] = node
                 self.executor.add_node(node)
             for node in self._flight_nodes:
                 node.require_transition(node.trigger_configure)
             self.close = closing.pop_all().close
+
+    def _packaged(self, name: str, scenario: Scenario) -> Node:
+        if name not in NODE_TYPES:
+            raise SpaceRobotError(
+                f"This package has no node '{name}'.{suggestion(name, NODE_TYPES)} "
+                f"Its nodes are {', '.join(NODE_TYPES)}."
+            )
+        own = scenario.parameters(name)
+        given = [Parameter(key, value=value) for key, value in own.items()]
+        options = {"parameter_overrides": given, "context": self.context}
+        return NODE_TYPES[name](name, autostart=False, **options)
+
+    def _own(self, make: Callable[[rclpy.Context], Node]) -> Node:
+        node = make(self.context)
+        name = getattr(make, "__name__", repr(make))
+        if not isinstance(node, Node):
+            raise SpaceRobotError(f"'{name}' returned {node!r}: let it return its rclpy node.")
+        if node.context is not self.context:
+            node.destroy_node()
+            raise SpaceRobotError(
+                f"The node that '{name}' returned is in another rclpy context: create it with "
+                "the context that the function is given."
+            )
+        return node
 
     def __enter__(self) -> Stack:
         return self
@@ -153,7 +181,13 @@ class Stack:
             timer = client.node.create_timer(1e-3, lambda: self._launch(client, goal), clock=clock)
             self.spin_until(lambda: client.goal_id is not None)
             client.node.destroy_timer(timer)
-            self.spin_until(lambda: client.outcome is not None)
+            self._spin_until(
+                lambda: client.outcome is not None,
+                lambda: (
+                    "The goal has no outcome: "
+                    f"{client.message or 'No planner or controller has reported on it.'} "
+                ),
+            )
             return Arrival(client.outcome or Outcome.INTERRUPTED, client.message)
         finally:
             self.executor.remove_node(client.node)
@@ -171,13 +205,19 @@ class Stack:
 
     def spin_until(self, condition: Callable[[], bool]) -> None:
         """Spin until a condition is true; raises SpaceRobotError on failure or timeout."""
+        self._spin_until(condition, lambda: "")
+
+    def _spin_until(self, condition: Callable[[], bool], pending: Callable[[], str]) -> None:
+        """Spin; ``pending`` returns the first sentence of the error after a timeout."""
         end = time.monotonic() + self._timeout
         while not condition():
             for node in self._flight_nodes:
                 if node.fault is not None:
                     raise node.fault
             if time.monotonic() > end:
-                raise SpaceRobotError(f"This took more than {self._timeout:g} s of wall time.")
+                raise SpaceRobotError(
+                    f"{pending()}This took more than {self._timeout:g} s of wall time."
+                )
             self.executor.spin_once(timeout_sec=0.05)
 
     @property

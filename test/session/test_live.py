@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -646,6 +647,46 @@ def test_what_does_not_happen_in_time_is_an_error() -> None:
         pytest.raises(SpaceRobotError, match=r"more than 0\.5 s"),
     ):
         stack.spin_until(lambda: False)
+
+
+def test_a_goal_without_an_outcome_says_what_is_missing() -> None:
+    with (
+        Stack("sliding_masses", ["planner"], timeout=3.0) as stack,
+        pytest.raises(SpaceRobotError, match=r"no outcome: .*'joint_states'.* more than 3 s"),
+    ):
+        stack.fly_to(x=0.05)
+    with (
+        Stack("planar_manipulator", ["plant"], timeout=1.0) as stack,
+        pytest.raises(SpaceRobotError, match=r"No planner or controller has reported on it\."),
+    ):
+        stack.fly_to(x=0.05)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "parameters", "named"),
+    [
+        (["plant", "planer"], {}, "no node 'planer'. Did you mean 'planner'"),
+        (["plant", "planner"], {"planer": {"method": "optimal"}}, "'planer', which is not in"),
+        (["plant", "plant", "planner"], {}, "Two of the nodes are named 'plant'"),
+        (["plant", Recorder, Recorder], {}, "Two of the nodes are named 'positions'"),
+        (["plant", lambda context: None], {}, "returned None"),
+    ],
+)
+def test_mistakes_in_the_nodes_of_a_stack_are_named(
+    nodes: list[Any], parameters: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(SpaceRobotError, match=re.escape(named)):
+        Stack("sliding_masses", nodes, parameters)
+
+
+def test_a_node_in_another_context_is_refused() -> None:
+    other = rclpy.Context()
+    rclpy.init(context=other)
+    try:
+        with pytest.raises(SpaceRobotError, match="another rclpy context"):
+            Stack("sliding_masses", ["plant", lambda _: rclpy.node.Node("mine", context=other)])
+    finally:
+        rclpy.shutdown(context=other)
 
 
 def test_two_stacks_have_domains_of_their_own() -> None:
