@@ -589,6 +589,15 @@ def test_plans_have_the_period_of_the_plant(rate: float, other: float) -> None:
     assert rig.host.statuses[-1].state.value == "executing"
 
 
+def test_a_goal_that_comes_before_the_rate_is_not_called_planned_again() -> None:
+    rig = RateRig("planner")
+    rig.goal()
+    rig.plant_says(tick_rate_hz=20.0, time_mode="lockstep")
+    assert [status.message for status in rig.host.statuses[1:]] == [
+        "The plant's rate is known: the motion is planned."
+    ]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_plant_of_other_commands_is_named_once_and_goals_are_refused(kind: str) -> None:
     rig = RateRig(kind)

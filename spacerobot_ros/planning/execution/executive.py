@@ -242,10 +242,13 @@ class Executive:
 
         Either the robot has different mass properties, or ``config`` has a different plant rate.
         """
-        what = (
-            "The robot has a different mass" if config is None else "The plant has a different rate"
-        )
-        self._plan_again(f"{what} now: the motion is replanned.")
+        if config is None:
+            what = "The robot has a different mass now: the motion is replanned."
+        elif self.config.tick_rate:
+            what = "The plant has a different rate now: the motion is replanned."
+        else:
+            what = "The plant's rate is known: the motion is planned."
+        self._plan_again(what)
         self._worker.close()
         self._robot, self._worker = robot, worker
         self._average = StateAverage(robot, self.config.averaging, self.config.rest_tolerance)
