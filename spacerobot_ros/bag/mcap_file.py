@@ -10,6 +10,7 @@ import errno
 import fcntl
 import io
 import os
+import shlex
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from spacerobot_ros.bag.mcap_reading import require_regular
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.errors import RecordingError, counted
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.messages.definitions import message_definition
 from spacerobot_ros.times import SECOND
@@ -347,7 +348,8 @@ class McapFile(Writer):
             self.message_counts = self._counts_in_file
             raise RecordingError(
                 f"Cannot write the bag {self.path}: {error.strerror or error}; "
-                f"the {self.message_counts.total()} messages already written are safe."
+                f"'spacerobot salvage {shlex.quote(str(self.path))}' recovers the "
+                f"{counted(self.message_counts.total(), 'message')} already written."
             ) from error
         self.size += len(data)
         if data[:1] == _CHUNK:

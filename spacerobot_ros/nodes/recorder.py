@@ -217,8 +217,9 @@ class RecorderNode(FlightNode):
             question.close()
         if self.recording is not None:
             self.recording.close()
-            path, count = self.recording.writer.path, self.recording.messages
-            self.get_logger().info(f"{count} messages are recorded in {path}.")
+            if self.failure is None:
+                path, count = self.recording.writer.path, self.recording.messages
+                self.get_logger().info(f"{count} messages are recorded in {path}.")
 
     # -- contents ------------------------------------------------------------------------------
 

@@ -241,7 +241,8 @@ def test_a_disk_that_refuses_a_message_is_reported_once(
         recording.record(channel, b"x" * 70_000)
     assert recording.state.value == "failed"
     (failure,) = map(str, failures)
-    assert failure.endswith("No space left on device; the 0 messages already written are safe.")
+    assert "No space left on device; " in failure
+    assert failure.endswith("recovers the 0 messages already written.")
     assert recording.messages == 0
     recording.close()
 
