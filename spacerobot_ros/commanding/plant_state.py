@@ -490,7 +490,9 @@ class InputWatch:
             return ""
         if self._plant.status.state is PlantState.INACTIVE:
             return "the plant, which is inactive: activate it"
-        if self._plant.paused or self._plant.in_lockstep:
+        if self._plant.paused:
+            return "the plant, which is paused: resume it"
+        if self._plant.in_lockstep:
             return ""
         return f"states on 'joint_states'{refused or ', which have ceased'}"
 

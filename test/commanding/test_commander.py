@@ -121,6 +121,23 @@ def test_while_the_plant_is_paused_no_jump_is_accepted(planner: Rig) -> None:
     assert planner.host.commands == [0, 1]
 
 
+def test_a_goal_for_a_paused_plant_says_that_it_is_paused(planner: Rig) -> None:
+    planner.state(0)
+    planner.state(1)
+    planner.commander.receive_plant_status(PlantStatus(PlantState.PAUSED, "Time stands still."))
+    planner.goal()
+    for _ in range(20):
+        planner.wall += 0.1
+        planner.commander.take_accepted_jump()
+    waiting = planner.host.statuses[-1]
+    assert waiting.message == (
+        "Waiting for the plant, which is paused: resume it. The goal is then pursued."
+    )
+    planner.commander.receive_plant_status(PlantStatus(PlantState.RUNNING, "A test."))
+    planner.state(2)
+    assert planner.host.statuses[-1].state.value == "executing"
+
+
 def test_ignored_states_are_reported_once_a_second(planner: Rig) -> None:
     planner.state(0)
     planner.state(1)
