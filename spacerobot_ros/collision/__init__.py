@@ -1,7 +1,13 @@
 """Distances between a robot's bodies: solids, pairs, exact checks, and solver functions."""
 
 from spacerobot_ros.collision.distances import Solid
-from spacerobot_ros.collision.geometry import BasePoses, CollisionGeometry, LinkPair, ObstaclePair
+from spacerobot_ros.collision.geometry import (
+    BasePoses,
+    CollisionGeometry,
+    LinkPair,
+    ObstaclePair,
+    unread_mesh_notes,
+)
 from spacerobot_ros.collision.nearest import Approach, nearest_approach, nearest_approaches
 
 __all__ = [
@@ -13,4 +19,5 @@ __all__ = [
     "Solid",
     "nearest_approach",
     "nearest_approaches",
+    "unread_mesh_notes",
 ]

@@ -9,7 +9,7 @@ it, or if its solids touch in all of 1000 random configurations (a modelling art
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from spacerobot_ros.collision.distances import (
     distance_function,
 )
 from spacerobot_ros.collision.rounded_box import RoundedBox, nearest_points
-from spacerobot_ros.errors import MeshError
+from spacerobot_ros.errors import MeshError, enumeration
 from spacerobot_ros.model.description import Array, Joint, JointKind, Pose, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
@@ -112,10 +112,18 @@ class UnreadMesh:
     reason: str
     is_collision_shape: bool
 
-    @property
-    def note(self) -> str:
-        """A one-sentence warning for the user."""
-        return f"Some contacts of link '{self.link}' are not detected: {self.reason}"
+
+def unread_mesh_notes(meshes: Sequence[UnreadMesh]) -> list[str]:
+    """Return a one-sentence warning for each reason why meshes cannot be read."""
+    links: dict[str, list[str]] = {}
+    for each in meshes:
+        links.setdefault(each.reason, []).append(each.link)
+    notes = []
+    for reason, named in links.items():
+        quoted = enumeration(f"'{name}'" for name in dict.fromkeys(named))
+        which = "link" if len(set(named)) == 1 else "links"
+        notes.append(f"Some contacts of {which} {quoted} are not detected: {reason}")
+    return notes
 
 
 Poses = tuple[Array, Array]
@@ -166,7 +174,7 @@ class CollisionGeometry:
             self.solids += tuple(_solid_in_world(each, frames[each.link][1]) for each in obstacles)
             self.notes += notes
             self.unread_meshes += unread
-        self.notes += tuple(each.note for each in self.unread_meshes)
+        self.notes += tuple(unread_mesh_notes(self.unread_meshes))
         self.ignored_pairs: dict[LinkPair, str] = {}
         links = self._kinematics.links
         self._link_of = np.array(

@@ -354,6 +354,9 @@ def _named_elements(root: Element, kind: str) -> dict[str, Element]:
 def _name_limits_not_read(root: Element) -> None:
     given = {name for limit in root.iterfind("joint/limit") for name in limit.attrib}
     ignored = [name for name in _LIMITS_NOT_READ if name in given]
+    soft = {name for each in root.iterfind("joint/safety_controller") for name in each.attrib}
+    if soft & {"soft_lower_limit", "soft_upper_limit"}:
+        ignored.append("safety_controller")
     if ignored:
         warn_once(
             f"The limits of {enumeration(ignored)} in the URDF of '{root.get('name', '')}' are "

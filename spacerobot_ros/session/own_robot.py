@@ -126,16 +126,17 @@ def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]
 
 
 def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
-    missing = [
-        shape.resource
+    meshes = {
+        shape.resource: None
         for link in robot.links
         for shape in link.shapes
-        if shape.kind == "mesh" and mesh_file(shape.resource) is None
-    ]
+        if shape.kind == "mesh"
+    }
+    missing = [each for each in meshes if mesh_file(each) is None]
     if missing:
-        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         yield (
-            f"The mesh '{missing[0]}'{more} was not found: give a path relative to the URDF, or "
+            f"The mesh '{missing[0]}' was not found{more}: give a path relative to the URDF, or "
             "source the workspace of its package. Only pictures need it."
         )
     if not any(link.shapes for link in robot.links):

@@ -240,8 +240,8 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
         (to_stops(-1.0, 20.0, "prismatic"), None),
         ([("</robot>", PLATE)], "The inertia of link 'plate' is not physical"),
         ([meshes("a.stl")], "The mesh 'a.stl' was not found"),
-        ([meshes("b.stl", "a.stl")], "The mesh 'b.stl' and 1 more was not found"),
-        ([meshes("c.stl", "b.stl", "a.stl")], "The mesh 'c.stl' and 2 more was not found"),
+        ([meshes("b.stl", "a.stl", "b.stl")], "The mesh 'b.stl' was not found (and 1 more)"),
+        ([meshes("c.stl", "b.stl", "a.stl")], "The mesh 'c.stl' was not found (and 2 more)"),
         ([("<visual>", "<!--"), ("</visual>", "-->")], "No link has a <visual>"),
     ],
 )

@@ -167,6 +167,15 @@ def test_a_mesh_that_is_missing_is_named() -> None:
     assert [each.link for each in geometry.solids] == ["a", "c"]
 
 
+def test_links_of_one_missing_mesh_are_named_together() -> None:
+    mesh = solid("visual", '<mesh filename="package://nowhere/arm.stl"/>')
+    other = solid("visual", '<mesh filename="package://nowhere/tool.stl"/>')
+    geometry = CollisionGeometry(parse_robot(chain((mesh,), (mesh,), (other,))))
+    together, alone = (each for each in geometry.notes if "not detected" in each)
+    assert together.startswith("Some contacts of links 'a' and 'b' are not detected: ")
+    assert alone.startswith("Some contacts of link 'c' are not detected: ")
+
+
 def test_a_tilted_flat_mesh_lies_where_its_corners_are(tmp_path: Path) -> None:
     """Its hull is the parallelogram of the corners: the distance from a ball by least squares."""
     corners = np.array([[0, 0, 0], [2, 0, 0.8], [2, 1, 0.8], [0, 1, 0]])

@@ -410,12 +410,16 @@ def test_what_other_programs_have_written_is_passed_over(tmp_path: Path) -> None
 def test_limits_that_motions_do_not_keep_are_named_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    text = urdf(limit=LIMIT.replace("<limit", '<limit acceleration="1" jerk="2"'))
+    soft = '<safety_controller soft_lower_limit="-0.1" soft_upper_limit="0.1" k_velocity="1"/>'
+    text = urdf(limit=LIMIT.replace("<limit", '<limit acceleration="1" jerk="2"') + soft)
     file = file_with(tmp_path, text.replace('name="probe"', 'name="jerky"'))
     for _ in range(2):
         load_robot(file)
     (line,) = caplog.messages
-    assert line.startswith("The limits of acceleration and jerk in the URDF of 'jerky' are ignored")
+    named = (
+        "The limits of acceleration, jerk and safety_controller in the URDF of 'jerky' are ignored"
+    )
+    assert line.startswith(named)
 
 
 def test_limits_of_a_follower_that_leave_its_leader_no_range_are_ignored(

@@ -16,6 +16,7 @@ from spacerobot_ros.collision import (
     LinkPair,
     ObstaclePair,
     nearest_approaches,
+    unread_mesh_notes,
 )
 from spacerobot_ros.errors import (
     ParameterError,
@@ -181,7 +182,8 @@ class Clearance:
                     f"Contacts of link '{each.link}' cannot be checked: {each.reason} Or disable "
                     f"its pairs in an SRDF (planner.srdf), or set {self._parameter} to 0."
                 )
-            warn_once(each.note)
+        for note in unread_mesh_notes(self.geometry.unread_meshes):
+            warn_once(note)
 
     def _warn(self, links: LinkPair, text: str) -> None:
         if links.subject not in self._warned:
