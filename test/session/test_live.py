@@ -689,6 +689,18 @@ def test_a_node_in_another_context_is_refused() -> None:
         rclpy.shutdown(context=other)
 
 
+@pytest.mark.parametrize(
+    ("trigger", "state"), [("cleanup", "unconfigured"), ("shutdown", "finalized")]
+)
+def test_a_goal_for_a_node_that_cannot_be_activated_names_its_state(
+    trigger: str, state: str
+) -> None:
+    with Stack("sliding_masses") as stack:
+        getattr(stack.nodes["planner"], f"trigger_{trigger}")()
+        with pytest.raises(SpaceRobotError, match=f"'planner' cannot activate: .*'{state}'"):
+            stack.fly_to(x=0.05)
+
+
 def test_two_stacks_have_domains_of_their_own() -> None:
     with Stack("sliding_masses") as one, Stack("sliding_masses") as other:
         assert one.domain != other.domain

@@ -185,11 +185,18 @@ class FlightNode(LifecycleNode):
             The transition failed; the message, which is not logged, states the reason.
         """
         self._raising = True
+        transition = trigger.__name__.split("_")[-1]
         try:
             if trigger() is not TransitionCallbackReturn.SUCCESS:
                 raise self.fault or SpaceRobotError(
-                    f"Node '{self.get_name()}' refused to {trigger.__name__.split('_')[-1]}."
+                    f"Node '{self.get_name()}' refused to {transition}."
                 )
+        except RCLError as error:
+            machine: Any = self._state_machine
+            raise SpaceRobotError(
+                f"Node '{self.get_name()}' cannot {transition}: "
+                f"its state is '{machine.current_state[1]}'."
+            ) from error
         finally:
             self._raising = False
 
