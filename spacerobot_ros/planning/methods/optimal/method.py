@@ -627,7 +627,7 @@ class OptimalGait(GaitMethod):
         there = self._later(task, coast, end)
         at_rest = replace(there.boundary, angular_momentum=np.zeros(3))
         few = replace(task.options, starts=min(task.options.starts, _STARTS_BEFORE_COASTING))
-        free = self._begin_now(replace(there, boundary=at_rest, options=few))
+        free = self._begin_now(replace(there, boundary=at_rest, options=few, keeps_clear=False))
         takes = len(free.held.positions) - 1
         begin = max(0, end - takes)
         later = self._later(task, coast, begin).within_time(_MAX_DURATION_RATIO * takes * h)
@@ -648,10 +648,9 @@ class OptimalGait(GaitMethod):
         try:
             found = self._begin_now(replace(task, options=budget))
         except NotFoundError as refusal:
-            # The current manoeuvre continues if its goal is only replanned; a drifting base would
-            # have to pass its goal later.
-            rests = not (task.boundary.drifts or len(self._wheels))
-            if again or chosen.duration > 0 or not rests or not motion.velocity.any():
+            # The current manoeuvre continues if its goal is only replanned.
+            rests = not len(self._wheels) and motion.velocity.any()
+            if again or chosen.duration > 0 or not rests:
                 raise
             return self._plan_with_braking(task, motion, refusal)
         return self._found(task, found)

@@ -172,8 +172,8 @@ _REACH_FROM_GUESS = 4.0
 
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION = 16, 1
 """Largest number of guesses whose solutions are searched nearby for clear manoeuvres: in motion,
-unless the base drifts, only the rest of the motion: from rest, after braking, others are found
-sooner. With 8 guesses, a plan for a quadruped took 40 % longer."""
+only the rest of the motion, as others are found sooner from rest. With 8 guesses, a plan for a
+quadruped took 40 % longer."""
 
 _REPORT_PERIOD = 1.0
 """Wall time, s, after which a solver reports that it is still busy."""
@@ -213,11 +213,9 @@ class Manoeuvre:
     @property
     def positions(self) -> Array:
         """Shapes (N + 1, n) at all ticks."""
-        return (
-            np.vstack([self.coasting, self.held.positions])
-            if len(self.coasting)
-            else self.held.positions
-        )
+        if not len(self.coasting):
+            return self.held.positions
+        return np.vstack([self.coasting, self.held.positions])
 
 
 @dataclass(frozen=True)
@@ -262,6 +260,8 @@ class SearchProblem:
         The wall time of the plan, and its cancellation.
     max_failed_starts
         Number of guesses without any solution after which the search ends.
+    keeps_clear
+        Whether links keep apart; a manoeuvre that need not only tells how long one takes.
     """
 
     request: PlanRequest
@@ -271,6 +271,7 @@ class SearchProblem:
     clock: SearchClock
     cancellation: Cancellation = NEVER
     max_failed_starts: int = sys.maxsize
+    keeps_clear: bool = True
 
     @property
     def motion(self) -> InitialMotion | None:
@@ -363,7 +364,7 @@ class ManoeuvreSearch:
             velocity = _initial_velocity(problem.motion, problem.limits, model.control_period)
             problem = replace(problem, boundary=replace(problem.boundary, velocity=velocity))
         kept, knows_turn = None, len(model.axes) == 3
-        if model.distances is not None:
+        if model.distances is not None and problem.keeps_clear:
             kept = model.distances.begin(problem.boundary, turn_is_known=knows_turn)
         search = _Search(model, problem, self._solver)
         found, refusal = search.search_from_guesses(), NotFoundError
@@ -481,10 +482,8 @@ class _Search:
         yield from source.generate(boundary, limits, is_clear)
 
     def _source(self, grid: _Grid) -> InitialGuesses:
-        boundary, curvature = (
-            self._problem.boundary,
-            self._model.robot.function("curvature", compile=False),
-        )
+        boundary = self._problem.boundary
+        curvature = self._model.robot.function("curvature", compile=False)
         L_0 = boundary.angular_momentum if boundary.drifts else None
         turn = self._solver(grid, boundary, ()).turn
         return InitialGuesses(turn, curvature, grid.intervals, L_0)
@@ -662,11 +661,10 @@ class _Search:
         that keep clear, but do not end at the goal.
         """
         problem = self._problem
-        if problem.boundary.drifts and problem.motion is None:
-            # A drifting robot finds others sooner after coasting.
+        if problem.boundary.drifts and not (problem.motion is not None and len(self._wheels)):
+            # A drifting robot finds others sooner after braking and coasting.
             return
-        brakes = problem.motion is not None and not problem.boundary.drifts
-        most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
+        most = _MAX_CLEAR_STARTS if problem.motion is None else _MAX_CLEAR_STARTS_IN_MOTION
         starts = min(problem.options.starts, most)
         guesses = itertools.islice(self._guesses(self._coarse, kept.is_clear), starts)
         clear = (each for each in guesses if kept.is_clear(each))
