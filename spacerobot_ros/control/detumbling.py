@@ -92,9 +92,7 @@ def _grasp_wrench(robot: SpaceRobot, payload: Payload) -> ca.Function:
     N = 6 + robot.n
     q, z, zdot = ca.SX.sym("q", robot.n), ca.SX.sym("z", N), ca.SX.sym("zdot", N)
     J = robot.function(f"jacobian:{payload.link}", compile=False)(q)
-    R_BL, _ = robot.function("link_poses", compile=False)(q)
-    index = robot.link_names.index(payload.link)
-    R = R_BL[:, 3 * index : 3 * index + 3]
+    R, _ = robot.function(f"link_pose:{payload.link}", compile=False)(q)
     twist = J @ z
     # The rate of the twist in B, whose axes rotate with the base.
     rate = J @ zdot + ca.jtimes(twist, q, z[6:])

@@ -151,6 +151,10 @@ class ModelFunctions:
                 index = self.link_index(argument)
                 J = point_jacobian(self._kin, argument)
                 return self._function_of(f"jacobian_{index}", "q", result=J)
+            case "link_pose":
+                R, r, _ = self._kin.frame(argument)
+                name = f"link_pose_{self.link_index(argument)}"
+                return self._function_of(name, "q", R_BL=R, r_BL_B=r)
             case "curvature":
                 return self._curvature()
             case "shape_equations" | "loaded_shape_equations":

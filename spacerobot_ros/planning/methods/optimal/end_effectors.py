@@ -137,16 +137,14 @@ class EndEffectorRows:
         X, q = ca.SX.sym("X", 4), ca.SX.sym("q", self.robot.n)
         parameters = ca.SX.sym("p", self.parameters)
         center = self.robot.function("center_of_mass", compile=False)(q)
-        R_all, r_all = self.robot.function("link_poses", compile=False)(q)
         R_X, rows = symbolic_matrix_from_quaternion(X), [ca.SX(0, 1)]
         by_link = ca.vertsplit(parameters, _PARAMETERS_PER_LINK)
         for each, goal in zip(self.directions, by_link, strict=True):
-            index = self.robot.link_names.index(each.link)
-            r_CE = R_X @ (r_all[:, index] - center)
+            R_BE, r_BE = self.robot.function(f"link_pose:{each.link}", compile=False)(q)
+            r_CE = R_X @ (r_BE - center)
             rows.append(ca.DM(each.displacements) @ (r_CE - goal[:3]))
             if len(each.rotations):
-                R_E = R_X @ R_all[:, 3 * index : 3 * index + 3]
-                turned = R_E @ symbolic_matrix_from_quaternion(goal[3:]).T
+                turned = R_X @ R_BE @ symbolic_matrix_from_quaternion(goal[3:]).T
                 rows.append(ca.DM(each.rotations) @ half_angle_vector(turned))
         return ca.Function("end_effectors", [X, q, parameters], [ca.vertcat(*rows)])
 
