@@ -159,16 +159,18 @@ class ApproachPlan:
         """Time at which the end-effector reaches the grapple frame, s."""
         return self.closing_time + self.path_to_contact.duration
 
-    def relative(self, times: Array) -> RelativeMotionOverTime:
-        """Return the motion relative to the grapple frame at times (K,) from the start."""
+    def hand(self, grapple: FrameMotion, times: Array) -> FrameMotion:
+        """Return the motion of the end-effector at times (K,) since planning, given the motion of
+        the grapple frame."""
         out = self.path_to_standoff.at(times - self.start)
         inward = self.path_to_contact.at(np.maximum(times - self.closing_time, 0.0))
         late = (times >= self.closing_time)[:, np.newaxis]
-        return RelativeMotionOverTime(
+        relative = RelativeMotionOverTime(
             np.where(late, inward.values, out.values),
             np.where(late, inward.rates, out.rates),
             np.where(late, inward.accelerations, out.accelerations),
         )
+        return grapple.with_relative_motion(relative)
 
 
 class ArmReach:
@@ -277,7 +279,7 @@ def plan_approach(
             plan = ApproachPlan(start, outward, closing, options.standoff_time)
             last = first + math.ceil((plan.contact - start) / _SAMPLE_PERIOD) + 1
             times, rows = _SAMPLE_PERIOD * np.arange(first, last), slice(first, last)
-            motion = grapple.rows(rows).with_relative_motion(plan.relative(times))
+            motion = plan.hand(grapple.rows(rows), times)
             share = _largest_limit_share(motion, limits, axes)
             if share[0] > 1.0:
                 sentence = (

@@ -494,7 +494,9 @@ class ControlExecutive:
     def _follow_goals(self, time: float, state: ControlState) -> None:
         """Continue the tasks before the pending goals, and start towards the goals after them."""
         servicing = self.servicing
-        if self._pending and not self._planning.is_for(self._pending):
+        # Goals are checked once before the tasks, and once after them.
+        waits = servicing.task is not None and self._latest_id() == self._goal_id
+        if self._pending and not (waits or self._planning.is_for(self._pending)):
             self._refuse_goals_by_state(state)
         if self._requested is not None:
             self._begin_tasks(time, self._requested)
@@ -509,6 +511,8 @@ class ControlExecutive:
         if servicing.task is None:
             return
         progress = servicing.step(time, state, self.controller)
+        if progress.state is TaskState.DONE:
+            self._refuse_goals_by_state(state)
         match progress.state:
             case TaskState.ACTIVE:
                 pass

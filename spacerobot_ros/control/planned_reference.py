@@ -25,7 +25,7 @@ from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
-from spacerobot_ros.model.target_motion import RelativeMotionOverTime
+from spacerobot_ros.model.target_motion import FrameMotion, RelativeMotionOverTime
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.methods.thrust.motion import Samples, ThrustMotion
@@ -63,6 +63,8 @@ class PlannedReference(ReferenceProfile):
         self._ends = np.cumsum([leg.duration for leg in legs]).tolist()
         """Times since the start at which the legs end, s."""
         self.duration = self._ends[-1]
+        self._latest: tuple[float, Reference] | None = None
+        """Latest reference, which is read twice per state, and its time since the start, s."""
 
     def _leg_at(self, time: float) -> tuple[ThrustMotion, float]:
         """Return the leg at a time since the start, s, and its beginning."""
@@ -102,6 +104,11 @@ class PlannedReference(ReferenceProfile):
         """Return the reference at ``time`` s after the start."""
         if time >= self.duration:
             return self.goal
+        if self._latest is None or self._latest[0] != time:
+            self._latest = time, self._sampled(time)
+        return self._latest[1]
+
+    def _sampled(self, time: float) -> Reference:
         leg, begins = self._leg_at(time)
         sample = leg.at(time - begins)
         base, hand = PoseReference(*sample.base), PoseReference(*sample.end_effector)
@@ -162,11 +169,12 @@ class GrappleReference(PlannedReference):
         beside, still = RelativeMotionOverTime.between(frame, base.motion), np.zeros((1, 6))
         self._base = RelativeMotionOverTime(beside.values, still, still)
 
-    def relative(self, times: Array) -> RelativeMotionOverTime:
-        """Return the motion of the end-effector relative to the grapple frame at one time, (1,)."""
+    def hand(self, grapple: FrameMotion, times: Array) -> FrameMotion:
+        """Return the motion of the end-effector at one time (1,) beside a measured grapple frame,
+        as planned beside the predicted one."""
         hand = self.at(float(times[0])).end_effector
         assert hand is not None
-        return RelativeMotionOverTime.between(self.grapple.motion.grapple(times), hand.motion)
+        return grapple.with_motion_beside(self.grapple.motion.grapple(times), hand.motion)
 
     def at(self, time: float) -> Reference:
         """Return the reference at ``time`` s after the start."""

@@ -23,6 +23,7 @@ from spacerobot_ros.control.approach import (
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
+from spacerobot_ros.control.laws.law import ControlLaw
 from spacerobot_ros.control.planned_reference import (
     PLANNING_TIME,
     GrappleReference,
@@ -40,7 +41,7 @@ from spacerobot_ros.model.grasp import (
     TargetBody,
     frame_motion,
 )
-from spacerobot_ros.model.target_motion import TorqueFreeMotion
+from spacerobot_ros.model.target_motion import FrameMotion, TorqueFreeMotion
 from spacerobot_ros.planning.core.cancellation import PlanningJob
 from spacerobot_ros.planning.methods.thrust.problem import Grapple
 
@@ -121,7 +122,7 @@ class MeasuredTarget:
 
     def forget_momenta(self) -> None:
         """Average the momenta from the next measurement on, because they have changed."""
-        self._count, self._momenta = 0, np.zeros(6)
+        self._count, self._momenta, self._scatter = 0, np.zeros(6), np.zeros(6)
 
     def describe(self, target: RobotDescription, grapple_frame: str) -> None:
         """Set the target description."""
@@ -140,21 +141,35 @@ class MeasuredTarget:
             self._count += 1
             change = np.concatenate(self.motion.momenta(self.body.inertia)) - self._momenta
             self._momenta += change / min(self._count, _AVERAGED)
+            if self._count > 1:
+                self._scatter = np.maximum(self._scatter, np.abs(change))
 
     @property
     def has_new_average(self) -> bool:
         """Whether the last measurement completes an average."""
         return self._count > 0 and self._count % _AVERAGED == 0
 
-    def free_motion(self) -> TorqueFreeMotion:
-        """Return the predicted motion of a described target from the last measurement on."""
+    def is_averaged(self, horizon: float) -> bool:
+        """Whether the momenta are averages, or measured without noise that would matter in
+        predictions for a given time, s."""
+        assert self.body is not None
+        scale = np.repeat([self.body.inertia.mass, self.body.least_inertia], 3)
+        off = horizon * float(np.max(self._scatter / scale))
+        return self._count >= (_AVERAGED if off > _PREDICTION_TOLERANCE else 2)
+
+    def free_motion(self, time: float) -> TorqueFreeMotion:
+        """Return the predicted motion of a described target from a given time (s) on."""
         assert self.body is not None
         assert self.motion is not None
-        if self._count < 2:
-            return TorqueFreeMotion(self.body, self.motion)
-        averaged = self.motion.with_momenta(self.body.inertia, self._momenta)
-        return TorqueFreeMotion(self.body, averaged)
+        motion = self.motion
+        if self._count > 1:
+            motion = motion.with_momenta(self.body.inertia, self._momenta)
+        free = TorqueFreeMotion(self.body, motion)
+        return free.later(time - self.time) if time > self.time else free
 
+
+_LONGEST_AVERAGING = 2.0
+"""Longest time, s, for which a planned approach waits for the averages of noisy momenta."""
 
 _LATEST_BEGIN = 0.1
 """Longest start delay of a motion, s."""
@@ -185,7 +200,8 @@ class ApproachTask:
         self._predicted: TorqueFreeMotion | None = None
         self._planned_at = 0.0
         self._began: float | None = None
-        self._out_of_reach: RelativeMotion | None = None
+        self._seen: tuple[ControlLaw, ControlState, FrameMotion] | None = None
+        """Law, and the last states of the robot and the grapple frame."""
         self._remaining = math.inf
         """Time until contact, s."""
         self._job: PlanningJob[GrappleReference] | None = None
@@ -201,7 +217,7 @@ class ApproachTask:
     ) -> TaskProgress:
         """Set the controller's reference for a state."""
         options = self.config.target
-        target, link = self.target, controller.law.outputs.selection.end_effector_link
+        target = self.target
         if not controller.law.outputs.selection.end_effector:
             return self._ended(f"the law '{controller.law.name}' does not control an end-effector")
         self._began = time if self._began is None else self._began
@@ -215,7 +231,12 @@ class ApproachTask:
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
-        deviation = self._deviation(target.motion) if self._job is None else _Deviation.NONE
+        if self._predicted is None and controller.planner is not None:
+            waits = time - self._began < _LONGEST_AVERAGING
+            if waits and not target.is_averaged(options.horizon):
+                return _ACTIVE
+        grapple = TorqueFreeMotion(target.body, target.motion).grapple([max(age, 0.0)])
+        deviation = _Deviation.NONE if self._job is not None else self._deviation(time, grapple)
         if deviation is not _Deviation.NONE:
             self._reason = deviation
         try:
@@ -235,22 +256,14 @@ class ApproachTask:
         if self._plan is None:
             return _ACTIVE
         plan, now = self._plan, time - self._planned_at
-        grapple = TorqueFreeMotion(target.body, target.motion).grapple([max(age, 0.0)])
-        motion = RobotMotion(
-            np.concatenate([state.r_WB, state.quaternion_WB]),
-            np.concatenate([state.v_WB_B, state.omega_WB_B]),
-            state.q,
-            state.qdot,
-        )
-        hand = frame_motion(controller.law.robot, link, motion)
-        self._out_of_reach = RelativeMotion.between(hand, grapple.body_motion())
+        self._seen = controller.law, state.copied(), grapple
         if now > self._contact + options.patience:
             return self._ended(
                 f"the target is missed: at contact, the end-effector is {self._distance_text}, and "
                 f"it was not captured within {options.patience:g} s"
             )
         if now >= self._start:
-            moving = grapple.with_relative_motion(plan.relative(np.array([now])))
+            moving = plan.hand(grapple, np.array([now]))
             controller.follow(Reference(end_effector=PoseReference.of_motion(moving)))
         self._remaining = self._contact - now
         return _ACTIVE
@@ -264,7 +277,7 @@ class ApproachTask:
     @property
     def message(self) -> str:
         """Sentence on the approach."""
-        if self._out_of_reach is None:
+        if self._seen is None:
             return "Approaching the target."
         left = self._remaining
         when = f"contact in {left:.3g} s" if left > 0 else "in contact"
@@ -272,8 +285,16 @@ class ApproachTask:
 
     @property
     def _distance_text(self) -> str:
-        far = self._out_of_reach
-        assert far is not None
+        assert self._seen is not None
+        law, state, grapple = self._seen
+        motion = RobotMotion(
+            np.concatenate([state.r_WB, state.quaternion_WB]),
+            np.concatenate([state.v_WB_B, state.omega_WB_B]),
+            state.q,
+            state.qdot,
+        )
+        hand = frame_motion(law.robot, law.outputs.selection.end_effector_link, motion)
+        far = RelativeMotion.between(hand, grapple.body_motion())
         return (
             f"{quantity(far.distance, 'm')}, {quantity(far.angle, 'rad')}, "
             f"{quantity(far.speed, 'm/s')} and {quantity(far.rate, 'rad/s')} from the grapple frame"
@@ -284,21 +305,19 @@ class ApproachTask:
             return TaskProgress(TaskState.REFUSED, f"The approach is refused: {why}.")
         return TaskProgress(TaskState.FAILED, f"The approach is aborted: {why}.")
 
-    def _deviation(self, measured: BodyMotion) -> _Deviation:
+    def _deviation(self, time: float, grapple: FrameMotion) -> _Deviation:
+        """Return the deviation of the grapple frame, given its measured motion at a time, s."""
         if self._predicted is None:
             return _Deviation.NOW
-        assert self.target.body is not None
-        elapsed = max(self.target.time - self._planned_at, 0.0)
-        expected = self._predicted.grapple([elapsed]).body_motion()
-        if _is_off(expected, measured.at(self.target.body.grapple)):
+        now = time - self._planned_at
+        if _is_off(self._predicted.grapple([now]), grapple):
             self.target.forget_momenta()
             return _Deviation.NOW
         ahead = self._looks_ahead and self.target.has_new_average
-        if not ahead or self._contact <= elapsed:
+        if not ahead or self._contact <= now:
             return _Deviation.NONE
-        expected = self._predicted.grapple([self._contact]).body_motion()
-        later = self.target.free_motion().grapple([self._contact - elapsed])
-        is_off = _is_off(expected, later.body_motion())
+        later = self.target.free_motion(time).grapple([self._contact - now])
+        is_off = _is_off(self._predicted.grapple([self._contact]), later)
         return _Deviation.AT_CONTACT if is_off else _Deviation.NONE
 
     def _start_job(
@@ -311,7 +330,7 @@ class ApproachTask:
         """Start planning the base and the arm together."""
         options, target = self.config.target, self.target
         grapple = Grapple(
-            target.free_motion().later(max(time - target.time, 0.0)),
+            target.free_motion(time),
             target.description,
             options.clearance,
             options.horizon,
@@ -377,7 +396,7 @@ class ApproachTask:
                 body.grapple,
                 options.clearance,
             )
-        target, rates = self.target.free_motion(), controller.joint_rate_limits.rates
+        target, rates = self.target.free_motion(time), controller.joint_rate_limits.rates
         axes = outputs.end_effector
         reach = ArmReach(law.robot, outputs.end_effector_link, axes, state, rates)
         plan = plan_approach(target, held, options, self.config.motion, reach, axes, clearance)
@@ -400,9 +419,11 @@ class ApproachTask:
         self._report_event(Event(EventKind.APPROACH_STARTED, message, about=about | (more or {})))
 
 
-def _is_off(expected: BodyMotion, found: BodyMotion) -> bool:
-    off = RelativeMotion.between(expected, found)
-    return off.distance > _PREDICTION_TOLERANCE or off.angle > _PREDICTION_TOLERANCE
+def _is_off(expected: FrameMotion, found: FrameMotion) -> bool:
+    distance = np.linalg.norm(found.r - expected.r)
+    # Matrices differ by the square root of 2 times a small angle.
+    angle = np.linalg.norm(found.R - expected.R) / math.sqrt(2)
+    return bool(max(distance, angle) > _PREDICTION_TOLERANCE)
 
 
 class DetumblingTask:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -109,6 +110,19 @@ class TargetBody:
 
     inertia: Inertia
     grapple: Pose
+
+    @cached_property
+    def least_inertia(self) -> float:
+        """Smallest principal moment of inertia, kg m^2."""
+        return float(np.linalg.eigvalsh(self.inertia.about_com)[0])
+
+    @cached_property
+    def numbers(self) -> Array:
+        """Mass, inertia (6,) about the centre of mass by rows of its upper triangle, and the
+        grapple frame's position (3,) relative to that point and quaternion (4,), in T."""
+        inertia, grapple = self.inertia, self.grapple
+        about, arm = inertia.about_com[np.triu_indices(3)], grapple.r - inertia.com
+        return np.concatenate([[inertia.mass], about, arm, quaternion_from_matrix(grapple.R)])
 
     @classmethod
     def of(cls, target: RobotDescription, grapple_frame: str) -> TargetBody:

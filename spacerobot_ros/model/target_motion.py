@@ -11,14 +11,17 @@ All quantities are arrays over times (K,): positions (K, 3) and attitudes (K, 3,
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
+from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.grasp import BodyMotion, TargetBody
@@ -27,14 +30,13 @@ from spacerobot_ros.model.rotations import (
     hat,
     matrices_from_quaternions,
     quaternion_from_matrix,
-    quaternion_multiply,
     quaternions_from_rotvecs,
     rotvec_from_quaternion,
 )
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
-_STEP_ANGLE = 0.05  # rad, of the target in one step
-_LONGEST_STEP = 1.0  # s, of Runge-Kutta
+_STEP_ANGLE = 0.2  # rad, of the target between nodes
+_LONGEST_STEP = 4.0  # s, between nodes
 _SMALL_ANGLE = 1e-3  # rad; below it, functions of an angle are series
 
 
@@ -69,14 +71,29 @@ class FrameMotion:
 
     def with_relative_motion(self, path: RelativeMotionOverTime) -> FrameMotion:
         """Return the motion of a frame that moves relative to this frame."""
-        R, omega, alpha = self.R, self.omega, self.alpha
-        arm, v_rel, a_rel = (
-            _rotate_vectors(R, each[:, :3])
-            for each in (path.values, path.rates, path.accelerations)
+        parts = *(x[:, :3] for x in (path.values, path.rates, path.accelerations)), *path.rotation
+        R_rel = matrices_from_quaternions(quaternions_from_rotvecs(path.values[:, 3:]))
+        return self._composed(self.R @ R_rel, *(_rotate_vectors(self.R, each) for each in parts))
+
+    def with_motion_beside(self, frame: FrameMotion, moving: FrameMotion) -> FrameMotion:
+        """Return the motion of a frame that moves relative to this frame as ``moving`` does
+        relative to ``frame``."""
+        turn = self.R @ np.swapaxes(frame.R, 1, 2)
+        parts = (
+            *frame.relative_translation(moving.r, moving.v, moving.a),
+            moving.omega - frame.omega,
+            moving.alpha - frame.alpha - cross(frame.omega, moving.omega),
         )
-        w_rel, wdot_rel = (_rotate_vectors(R, each) for each in path.rotation)
+        return self._composed(turn @ moving.R, *(_rotate_vectors(turn, each) for each in parts))
+
+    def _composed(
+        self, R: Array, arm: Array, v_rel: Array, a_rel: Array, w_rel: Array, wdot_rel: Array
+    ) -> FrameMotion:
+        """Return the motion of a frame with attitudes ``R`` and a motion (K, 3) relative to this
+        frame, in W."""
+        omega, alpha = self.omega, self.alpha
         return FrameMotion(
-            R @ matrices_from_quaternions(quaternions_from_rotvecs(path.values[:, 3:])),
+            R,
             self.r + arm,
             self.v + cross(omega, arm) + v_rel,
             omega + w_rel,
@@ -256,27 +273,24 @@ class TorqueFreeMotion:
     """
 
     def __init__(self, body: TargetBody, motion: BodyMotion) -> None:
-        self._body = body
-        inertia, R = body.inertia, motion.R_WT
-        self._arm = R @ inertia.com
-        self._r = motion.r_WT + self._arm
-        self.velocity = motion.v + cross(motion.omega, self._arm)
+        self._body, inertia, R = body, body.inertia, motion.R_WT
+        arm = R @ inertia.com
+        self._r = motion.r_WT + arm
+        self.velocity = motion.v + cross(motion.omega, arm)
         self.arm_length = float(np.linalg.norm(body.grapple.r - inertia.com))
         self._L = R @ inertia.about_com @ R.T @ motion.omega
-        self._inverse = np.linalg.inv(inertia.about_com)
-        fastest = float(np.linalg.norm(self._L) * np.linalg.eigvalsh(self._inverse)[-1])
+        fastest = float(np.linalg.norm(self._L)) / body.least_inertia
         self._step = min(_LONGEST_STEP, _STEP_ANGLE / fastest if fastest > 0 else _LONGEST_STEP)
-        self._nodes = [quaternion_from_matrix(R)]
+        self._nodes = [self._numbers(0.0, quaternion_from_matrix(R))]
 
     def numbers(self, time: float) -> Array:
         """Return the parameters of the motion from a given time on, for
         :class:`TargetExpression`."""
-        inertia, grapple = self._body.inertia, self._body.grapple
-        at = self._quaternions(np.array([time]))[0]
-        r, v = self.center_of_mass(time), self.velocity
-        about = inertia.about_com[np.triu_indices(3)]
-        arm, turn = grapple.r - inertia.com, quaternion_from_matrix(grapple.R)
-        return np.concatenate([[time], at, self._L, r, v, [inertia.mass], about, arm, turn])
+        return self._numbers(time, self._at(np.array([time]))[0, :4])
+
+    def _numbers(self, time: float, quaternion: Array) -> Array:
+        r = self.center_of_mass(time)
+        return np.concatenate([[time], quaternion, self._L, r, self.velocity, self._body.numbers])
 
     def center_of_mass(self, time: float) -> Array:
         """Return the centre of mass (3,) in W, m."""
@@ -291,64 +305,35 @@ class TorqueFreeMotion:
     def body_poses(self, times: npt.ArrayLike) -> tuple[Array, Array]:
         """Return quaternions (K, 4) and positions (K, 3), m, of the root link frame in W."""
         t = np.asarray(times, dtype=float)
-        X = self._quaternions(t)
+        X = self._at(t)[:, :4]
         arm = matrices_from_quaternions(X) @ self._body.inertia.com
         return X, self._r + t[:, np.newaxis] * self.velocity - arm
 
     def later(self, elapsed: float) -> TorqueFreeMotion:
         """Return the same motion starting at a later time."""
         X, r = self.body_poses([elapsed])
-        R = matrices_from_quaternions(X)
-        omega = R[0] @ self._rates(R)[0]
-        v = self.velocity - cross(omega, R[0] @ self._body.inertia.com)
-        return TorqueFreeMotion(self._body, BodyMotion(R[0], r[0], v, omega))
+        R, omega = matrices_from_quaternions(X)[0], self.grapple([elapsed]).omega[0]
+        v = self.velocity - cross(omega, R @ self._body.inertia.com)
+        return TorqueFreeMotion(self._body, BodyMotion(R, r[0], v, omega))
 
     def grapple(self, times: npt.ArrayLike) -> FrameMotion:
         """Return the motion of the grapple frame at times (K,), s since the measured state."""
-        t = np.asarray(times, dtype=float)
-        R = matrices_from_quaternions(self._quaternions(t))
-        inertia, grapple = self._body.inertia, self._body.grapple
-        omega_T = self._rates(R)
-        spin = cross(omega_T, omega_T @ inertia.about_com)
-        omega, alpha = _rotate_vectors(R, omega_T), _rotate_vectors(R, -spin @ self._inverse)
-        arm = R @ (grapple.r - inertia.com)
-        return FrameMotion(
-            R @ grapple.R,
-            self._r + t[:, np.newaxis] * self.velocity + arm,
-            self.velocity + cross(omega, arm),
-            omega,
-            cross(alpha, arm) + cross(omega, cross(omega, arm)),
-            alpha,
-        )
+        found = self._at(np.asarray(times, dtype=float))
+        vectors = (found[:, k : k + 3] for k in range(13, 28, 3))
+        return FrameMotion(found[:, 4:13].reshape(-1, 3, 3), *vectors)
 
-    def _rates(self, R: Array) -> Array:
-        """Return the angular velocities (K, 3) in T at attitudes (K, 3, 3)."""
-        return np.asarray((self._L @ R) @ self._inverse)
-
-    def _quaternions(self, t: Array) -> Array:
-        index = np.floor(t / self._step).astype(int)
-        while len(self._nodes) <= index.max(initial=0):
-            last = self._nodes[-1][np.newaxis]
-            self._nodes.append(self._advance(last, np.array([self._step]))[0])
-        nodes = np.array(self._nodes)[index]
-        return self._advance(nodes, t - index * self._step)
-
-    def _advance(self, q: Array, h: Array) -> Array:
-        """Return quaternions (K, 4) after steps (K,), s, by Runge-Kutta 4."""
-        if not h.any():
-            return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
-        h = h[:, np.newaxis]
-        k1 = self._derivative(q)
-        k2 = self._derivative(q + h / 2 * k1)
-        k3 = self._derivative(q + h / 2 * k2)
-        k4 = self._derivative(q + h * k3)
-        q = q + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return np.asarray(q / np.linalg.norm(q, axis=1, keepdims=True))
-
-    def _derivative(self, q: Array) -> Array:
-        unit = q / np.linalg.norm(q, axis=1, keepdims=True)
-        omega_T = self._rates(matrices_from_quaternions(unit))
-        return quaternion_multiply(q, np.hstack([omega_T / 2, np.zeros((len(q), 1))]))
+    def _at(self, t: Array) -> Array:
+        """Return the attitudes (K, 4), and the grapple frames (K, 24) as in
+        :class:`FrameMotion`."""
+        target = _target_function(threading.get_ident())
+        found = np.empty((len(t), 28))
+        for row, time in enumerate(t.tolist()):
+            index = int(time // self._step)
+            for k in range(len(self._nodes), index + 1):
+                X = target(self._nodes[-1], k * self._step)[0][:4]
+                self._nodes.append(self._numbers(k * self._step, X))
+            (found[row],) = target(self._nodes[index], time)
+        return found
 
 
 TARGET_SIZE = 28
@@ -359,15 +344,18 @@ _EXPRESSION_STEPS = 4
 
 
 class TargetExpression(NamedTuple):
-    """A target at one time, in W: its grapple frame's attitude (3, 3), position, velocity and
-    angular velocity (3,); its mass; the position and velocity of its centre of mass, and the
-    angular momentum about that point (3,).
+    """A target at one time, in W: the quaternion (4,) of its root link; its grapple frame's
+    attitude (3, 3), position, velocity, angular velocity and their accelerations (3,); its mass;
+    the position and velocity of its centre of mass, and the angular momentum about that point (3,).
     """
 
+    X: ca.SX
     R: ca.SX
     r: ca.SX
     v: ca.SX
     omega: ca.SX
+    a: ca.SX
+    alpha: ca.SX
     mass: ca.SX
     center: ca.SX
     center_velocity: ca.SX
@@ -396,19 +384,35 @@ class TargetExpression(NamedTuple):
             second = rate(X + h / 2 * first)
             third = rate(X + h / 2 * second)
             X = X + h / 6 * (first + 2 * second + 2 * third + rate(X + h * third))
-        R = matrix_from_quaternion(X / ca.norm_2(X))
+        X = X / ca.norm_2(X)
+        R = matrix_from_quaternion(X)
         omega, center = R @ solve_positive_definite(J, R.T @ L), r + elapsed * v
+        alpha = R @ solve_positive_definite(J, R.T @ ca.cross(L, omega))
         to_grapple = R @ arm
+        turning = ca.cross(omega, to_grapple)
         return cls(
+            X,
             R @ matrix_from_quaternion(turn),
             center + to_grapple,
-            v + ca.cross(omega, to_grapple),
+            v + turning,
             omega,
+            ca.cross(alpha, to_grapple) + ca.cross(omega, turning),
+            alpha,
             mass,
             center,
             v,
             L,
         )
+
+
+@lru_cache
+def _target_function(thread: int) -> BufferedFunction:
+    """Return the function of ``numbers`` and a time that returns the first seven parts (28,) of
+    the expression, attitudes by rows; each thread has its own memory."""
+    numbers, time = ca.SX.sym("numbers", TARGET_SIZE), ca.SX.sym("time")
+    X, R, *vectors = TargetExpression.at(numbers, time)[:7]
+    found = {"found": ca.vertcat(X, ca.vec(R.T), *vectors)}
+    return BufferedFunction(dense_function("target", {"numbers": numbers, "time": time}, found))
 
 
 def _rotate_vectors(R: Array, vectors: Array) -> Array:

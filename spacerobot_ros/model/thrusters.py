@@ -16,6 +16,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -422,7 +423,8 @@ class ThrusterModulator:
         """Remaining time of minimum pulses (m,), s."""
         self._open = np.zeros(count, dtype=np.bool_)
         """Whether each thruster (m,) remains open from the last period into the next."""
-        self._excluded: list[str] = []
+        self._excluded: tuple[str, ...] = ()
+        self._missing = cache(table.missing)
         for name in excluded:
             self.exclude(name)
         self.unmet = np.zeros(6)
@@ -441,7 +443,7 @@ class ThrusterModulator:
     def missing(self) -> str:
         """Names of the wrenches that the thrusters in use cannot produce; empty if they can produce
         all."""
-        return self.table.missing(self._excluded)
+        return self._missing(self._excluded)
 
     @property
     def propellant(self) -> float:
@@ -457,7 +459,7 @@ class ThrusterModulator:
             There is no thruster with that name.
         """
         self.allocation.exclude(self.table.index(name))
-        self._excluded.append(name)
+        self._excluded += (name,)
 
     def reset(self) -> None:
         """Close all thrusters and drop the pending impulse; counters are kept."""

@@ -87,18 +87,18 @@ def test_an_approach_sets_out_at_once_and_keeps_all_limits_to_contact() -> None:
     length = math.hypot(0.2, 0.05)
     assert made.contact - made.closing_time == pytest.approx(15 / 8 * length / 0.05)
     times = np.linspace(0.0, made.contact + 1.0, 2000)
-    hand = motion.grapple(times).with_relative_motion(made.relative(times))
+    hand = made.hand(motion.grapple(times), times)
     np.testing.assert_allclose(hand.r[0], TIP, atol=1e-12)
     np.testing.assert_allclose(hand.v[0], 0.0, atol=1e-12)
     speed, acceleration = (np.linalg.norm(each, axis=1).max() for each in (hand.v, hand.a))
     assert 0.02 < speed <= 0.3
     assert 0.01 < acceleration <= 0.1 * 1.01
     waiting = motion.grapple([made.closing_time - 0.4])
-    beside = waiting.with_relative_motion(made.relative(np.array([made.closing_time - 0.4])))
+    beside = made.hand(waiting, np.array([made.closing_time - 0.4]))
     offset = waiting.R[0].T @ (beside.r[0] - waiting.r[0])
     np.testing.assert_allclose(offset, OPTIONS.standoff, atol=1e-12)
     met = motion.grapple([made.contact])
-    last = met.with_relative_motion(made.relative(np.array([made.contact])))
+    last = made.hand(met, np.array([made.contact]))
     for name in ("r", "R", "v", "omega"):
         np.testing.assert_allclose(getattr(last, name), getattr(met, name), atol=1e-12)
 
@@ -167,7 +167,7 @@ def test_a_hand_that_moves_sets_out_at_once_or_not() -> None:
     moving = PoseReference(TIP, UPRIGHT, np.array([0.05, -0.02, 0.0]))
     made = plan(target((1.7, -0.5)), held=moving)
     assert made.start == 0.0
-    first = target((1.7, -0.5)).grapple([0.0]).with_relative_motion(made.relative(np.array([0.0])))
+    first = made.hand(target((1.7, -0.5)).grapple([0.0]), np.array([0.0]))
     np.testing.assert_allclose(first.v[0], moving.velocity, atol=1e-12)
     assert "out of reach" in refusal(target((3.9, -0.5), (-0.06, 0.0)), held=moving)
 

@@ -234,12 +234,26 @@ def test_a_target_that_cannot_be_met_is_refused_with_the_sentence_of_the_plan() 
     assert_one_sentence(refused.message, "The approach is refused: the target is out of reach")
 
 
+def test_base_and_arm_are_planned_once_the_rates_of_a_noisy_target_are_averaged() -> None:
+    planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
+    loop = Meeting(**planned, **{"target.detumble": "none", "target.horizon": 9.0})
+    loop.executive.plan_at_once()
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.seen, rng, pose = False, np.random.default_rng(2), np.concatenate([NEAR, UPRIGHT])
+    for _ in range(110):
+        time, noise = (loop.tick + 1) * PERIOD, 0.02 * rng.normal(size=6)
+        loop.executive.servicing.target.measure(time, pose, noise)
+        loop.answer()
+    assert loop.kinds() == ["goal_accepted", "approach_started"]
+    assert float(loop.events[-1].about["starts_s"]) == pytest.approx(100 * PERIOD)
+
+
 def test_a_start_beside_the_corridor_of_a_target_is_refused() -> None:
     planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
     loop = Meeting(**planned, **{"target.corridor_length": 3.0, "target.corridor_angle": 0.2})
     loop.executive.plan_at_once()
     loop.aim(base=goal_at(AIM, "5"))
-    loop.answer()
+    loop.answer(2)
     (refused,) = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
     values = "corridor_angle = 0.2 rad", "corridor_length = 3 m"
     assert_one_sentence(refused.message, "The approach is refused: at the start", *values)
@@ -448,13 +462,13 @@ def test_a_noisy_target_is_predicted_from_the_average_of_its_momenta() -> None:
     for k in range(200):
         twist = np.concatenate([Rotation.from_quat(X[k]).inv().apply(free.v), rates[k]])
         target.measure(times[k], np.concatenate([r[k], X[k]]), twist + 1e-3 * rng.normal(size=6))
-        (there,), (place,) = target.free_motion().body_poses([30.0])
+        (there,), (place,) = target.free_motion(target.time).body_poses([30.0])
         turn = Rotation.from_quat(X[k + 3000]).inv() * Rotation.from_quat(there)
         late.append([np.linalg.norm(place - r[k + 3000]), turn.magnitude()])
     assert np.min(late[0]) > 0.015, "the test is sharp"
     assert np.max(late[100:]) < 0.01
     target.forget_momenta()
-    (_,), (place,) = target.free_motion().body_poses([30.0])
+    (_,), (place,) = target.free_motion(target.time).body_poses([30.0])
     assert np.linalg.norm(place - r[3199]) > 0.02
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -9,6 +10,7 @@ import numpy as np
 
 from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.grasp import combined_momenta
@@ -103,6 +105,13 @@ class MotionFunctions:
         self.step = runge_kutta_step(rate, attitude=slice(4))
         self.interval = self.step.mapaccum(EXACT_STEPS)
         self.sample = ca.Function("sample", [x, controls], [ca.densify(each) for each in sample])
+        x, controls, h = (
+            ca.MX.sym(*each) for each in (("x", *x.shape), ("u", *controls.shape), "h")
+        )
+        later = self.step(x, controls, h)
+        self.sample_after = ca.Function(
+            "sample_after", [x, controls, h], [later, *self.sample(later, controls)]
+        )
 
 
 def base_poses(robot: SpaceRobot, X: Array, r: Array, q: Array) -> BasePoses:
@@ -181,12 +190,17 @@ class ThrustMotion:
         t = self.step / EXACT_STEPS
         row = min(int(time / t), len(self._grid) - 2)
         controls = self._controls[row // EXACT_STEPS]
-        state = self._functions.step(self._grid[row], controls, time - row * t).full().ravel()
-        *frames, tau = (x.full().ravel() for x in self._functions.sample(state, controls))
-        base, hand = (FrameSample(*np.split(each, [3, 7, 10, 13, 16])) for each in frames)
-        *_, q, qdot = state_parts(state)
-        qddot, wrench = np.split(controls, [len(q)])
-        return MotionSample(base, hand, q, qdot, qddot, wrench, tau)
+        state, *frames, tau = self._sample_after(self._grid[row], controls, time - row * t)
+        base, hand = (
+            FrameSample(f[:3], f[3:7], f[7:10], f[10:13], f[13:16], f[16:]) for f in frames
+        )
+        q, qdot = np.split(state[13:], 2)
+        return MotionSample(base, hand, q, qdot, controls[:-6], controls[-6:], tau)
+
+    @cached_property
+    def _sample_after(self) -> BufferedFunction:
+        # Not shared with other motions, which other threads may plan.
+        return BufferedFunction(self._functions.sample_after)
 
     def effort_share(self, limit: Array) -> float:
         """Return the largest ratio of a joint effort to its limit (n,)."""
