@@ -175,16 +175,6 @@ _LATEST_BEGIN = 0.1
 """Longest start delay of a motion, s."""
 
 
-class _Deviation(Enum):
-    """When a target deviates from the motion predicted for the current plan."""
-
-    NONE = "none"
-    NOW = "now"
-    """It deviates now, or there is no plan yet."""
-    AT_CONTACT = "at contact"
-    """It would deviate at contact, according to its average momenta, but does not now."""
-
-
 class ApproachTask:
     """An approach, planned at its first state and replanned if the target deviates from its
     predicted motion.
@@ -200,15 +190,13 @@ class ApproachTask:
         self._predicted: TorqueFreeMotion | None = None
         self._planned_at = 0.0
         self._began: float | None = None
-        self._seen: tuple[ControlLaw, ControlState, FrameMotion] | None = None
-        """Law, and the last states of the robot and the grapple frame."""
-        self._remaining = math.inf
-        """Time until contact, s."""
+        self._seen: tuple[float, ControlLaw, ControlState, FrameMotion] | None = None
+        """Time until contact, s, law, and the last states of the robot and the grapple frame."""
         self._job: PlanningJob[GrappleReference] | None = None
         """The job that plans an approach."""
         self._lead = PLANNING_TIME
-        self._reason = _Deviation.NOW
-        """Reason for the latest plan."""
+        self._is_forecast = False
+        """Whether the latest plan is for a deviation at contact, predicted from average momenta."""
         self._looks_ahead = True
         """Whether deviations at contact count: not after planning for one has failed."""
 
@@ -216,8 +204,7 @@ class ApproachTask:
         self, time: float, state: ControlState, controller: CoordinatedController
     ) -> TaskProgress:
         """Set the controller's reference for a state."""
-        options = self.config.target
-        target = self.target
+        options, target, planner = self.config.target, self.target, controller.planner
         if not controller.law.outputs.selection.end_effector:
             return self._ended(f"the law '{controller.law.name}' does not control an end-effector")
         self._began = time if self._began is None else self._began
@@ -231,24 +218,21 @@ class ApproachTask:
         age = time - target.time
         if age > options.timeout:
             return self._ended(f"the target is lost: its odometry is {age:.3g} s old")
-        if self._predicted is None and controller.planner is not None:
+        if self._predicted is None and planner is not None:
             waits = time - self._began < _LONGEST_AVERAGING
             if waits and not target.is_averaged(options.horizon):
                 return _ACTIVE
         grapple = TorqueFreeMotion(target.body, target.motion).grapple([max(age, 0.0)])
-        deviation = _Deviation.NONE if self._job is not None else self._deviation(time, grapple)
-        if deviation is not _Deviation.NONE:
-            self._reason = deviation
         try:
-            if controller.planner is None:
-                if deviation is not _Deviation.NONE:
+            if self._job is None and self._deviates(time, grapple):
+                if planner is None:
                     self._make_plan(time, state, controller, target.body)
-            else:
-                if deviation is not _Deviation.NONE:
-                    self._start_job(time, state, controller, controller.planner)
-                self._take_plan(time, controller, controller.planner)
+                else:
+                    self._start_job(time, state, controller, planner)
+            if planner is not None:
+                self._take_plan(time, controller, planner)
         except PlanningError as error:
-            if self._reason is not _Deviation.AT_CONTACT:
+            if not self._is_forecast:
                 why = str(error).rstrip(".")
                 return self._ended(f"{why[0].lower()}{why[1:]}")
             # The target is where it was predicted to be: the robot continues with the current plan.
@@ -256,7 +240,7 @@ class ApproachTask:
         if self._plan is None:
             return _ACTIVE
         plan, now = self._plan, time - self._planned_at
-        self._seen = controller.law, state.copied(), grapple
+        self._seen = self._contact - now, controller.law, state.copied(), grapple
         if now > self._contact + options.patience:
             return self._ended(
                 f"the target is missed: at contact, the end-effector is {self._distance_text}, and "
@@ -265,7 +249,6 @@ class ApproachTask:
         if now >= self._start:
             moving = plan.hand(grapple, np.array([now]))
             controller.follow(Reference(end_effector=PoseReference.of_motion(moving)))
-        self._remaining = self._contact - now
         return _ACTIVE
 
     def close(self) -> None:
@@ -279,14 +262,14 @@ class ApproachTask:
         """Sentence on the approach."""
         if self._seen is None:
             return "Approaching the target."
-        left = self._remaining
+        left, *_ = self._seen
         when = f"contact in {left:.3g} s" if left > 0 else "in contact"
         return f"Approaching the target: the end-effector is {self._distance_text}; {when}."
 
     @property
     def _distance_text(self) -> str:
         assert self._seen is not None
-        law, state, grapple = self._seen
+        _, law, state, grapple = self._seen
         motion = RobotMotion(
             np.concatenate([state.r_WB, state.quaternion_WB]),
             np.concatenate([state.v_WB_B, state.omega_WB_B]),
@@ -305,20 +288,21 @@ class ApproachTask:
             return TaskProgress(TaskState.REFUSED, f"The approach is refused: {why}.")
         return TaskProgress(TaskState.FAILED, f"The approach is aborted: {why}.")
 
-    def _deviation(self, time: float, grapple: FrameMotion) -> _Deviation:
-        """Return the deviation of the grapple frame, given its measured motion at a time, s."""
+    def _deviates(self, time: float, grapple: FrameMotion) -> bool:
+        """Whether there is no plan, or the target deviates from the motion predicted for it, now or
+        at contact; ``grapple`` is the measured motion of its grapple frame at this time, s."""
+        self._is_forecast = False
         if self._predicted is None:
-            return _Deviation.NOW
+            return True
         now = time - self._planned_at
         if _is_off(self._predicted.grapple([now]), grapple):
             self.target.forget_momenta()
-            return _Deviation.NOW
-        ahead = self._looks_ahead and self.target.has_new_average
-        if not ahead or self._contact <= now:
-            return _Deviation.NONE
+            return True
+        if not (self._looks_ahead and self.target.has_new_average and now < self._contact):
+            return False
+        self._is_forecast = True
         later = self.target.free_motion(time).grapple([self._contact - now])
-        is_off = _is_off(self._predicted.grapple([self._contact]), later)
-        return _Deviation.AT_CONTACT if is_off else _Deviation.NONE
+        return _is_off(self._predicted.grapple([self._contact]), later)
 
     def _start_job(
         self,
