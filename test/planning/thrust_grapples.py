@@ -89,22 +89,26 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
         axis = rng.normal(size=2)
         omega = np.append(0.0, np.deg2rad(rate) * axis / np.linalg.norm(axis))
         began = time.process_time()
-        flight = fly(
-            "servicing",
-            seed=seed + number,
-            parameters={
-                **{f"plant.sensors.{name}_noise": 3e-4 for name in SENSORS},
-                **{f"plant.target.sensors.{name}_noise": 5e-4 for name in SENSORS},
-                "plant.target.angular_velocity": omega.tolist(),
-                "coordinated_control.profile": profile,
-                "coordinated_control.plan.thrusters": "urdf",
-                "coordinated_control.target.horizon": 60.0,
-                "coordinated_control.plan.duration": 60.0,
-                "coordinated_control.target.detumble": detumble,
-                # Flights end soon after the grasp: the time for detumbling is over.
-                "coordinated_control.time_limit": 0.1,
-            },
-        )
+        try:
+            flight = fly(
+                "servicing",
+                seed=seed + number,
+                parameters={
+                    **{f"plant.sensors.{name}_noise": 3e-4 for name in SENSORS},
+                    **{f"plant.target.sensors.{name}_noise": 5e-4 for name in SENSORS},
+                    "plant.target.angular_velocity": omega.tolist(),
+                    "coordinated_control.profile": profile,
+                    "coordinated_control.plan.thrusters": "urdf",
+                    "coordinated_control.target.horizon": 60.0,
+                    "coordinated_control.plan.duration": 60.0,
+                    "coordinated_control.target.detumble": detumble,
+                    # Flights end soon after the grasp: the time for detumbling is over.
+                    "coordinated_control.time_limit": 0.1,
+                },
+            )
+        except PlanningError as refusal:
+            print(f"{number}: {refusal}", flush=True)
+            continue
         cpu.append(time.process_time() - began)
         capture = flight.capture
         if not capture["captured"]:
@@ -118,9 +122,9 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
     if took:
         line += (
             f" after {np.median(took):.1f} s with {1e3 * np.median(propellant):.1f} g, "
-            f"{np.median(left):.3f} N m s left"
+            f"{np.median(left):.3f} N m s left; {np.median(cpu):.1f} s of CPU"
         )
-    return f"{line}; {np.median(cpu):.1f} s of CPU"
+    return line
 
 
 def main() -> None:
