@@ -56,6 +56,12 @@ class InitialMotion:
     velocity: Array
     remaining: Array
 
+    def mean_velocity(self, period: float) -> Array:
+        """Return the mean of the velocities (n,) held before and after the start."""
+        if len(self.remaining) < 2:
+            return self.velocity
+        return (self.velocity + (self.remaining[1] - self.remaining[0]) / period) / 2
+
 
 @dataclass(frozen=True)
 class PlanRequest:

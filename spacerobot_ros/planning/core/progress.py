@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 from spacerobot_ros.model.compilation import announcement_listeners
@@ -54,6 +55,36 @@ class SearchProgress:
         starts = f"start {self.starts} of at most {self.max_starts}, "
         counted = self.phase is SearchPhase.SEARCHING and self.max_starts > 0
         return f"{self.phase.value}, {starts * counted}{best}"
+
+
+_BUDGET_FACTOR_WITHOUT_RESULT = 5.0
+"""As ``optimal.time_budget`` is documented."""
+
+
+@dataclass(frozen=True)
+class SearchClock:
+    """Wall time allowed for a plan, shared by all searches for the plan.
+
+    Attributes
+    ----------
+    budget
+        s; 0: no limit.
+    began
+        ``time.monotonic()``, s, at the start.
+    """
+
+    budget: float = 0.0
+    began: float = field(default_factory=lambda: time.monotonic())
+
+    @property
+    def elapsed(self) -> float:
+        """s."""
+        return time.monotonic() - self.began
+
+    def is_over(self, *, found: bool) -> bool:
+        """Whether the wall time is used up; ``found``: whether there is a manoeuvre."""
+        factor = 1.0 if found else _BUDGET_FACTOR_WITHOUT_RESULT
+        return self.budget > 0 and self.elapsed > factor * self.budget
 
 
 _listeners: list[Callable[[SearchProgress], None]] = []

@@ -32,6 +32,7 @@ from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import sliders_of
 from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
+from spacerobot_ros.planning.core.progress import SearchClock
 from spacerobot_ros.planning.core.schedule import GaitSchedule, HeldMotion, Notes
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorSpecification
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
@@ -55,7 +56,6 @@ from spacerobot_ros.planning.methods.optimal.search import (
     Manoeuvre,
     ManoeuvreSearch,
     NoClearPathError,
-    SearchClock,
     SearchProblem,
 )
 from spacerobot_ros.version import __version__

@@ -13,8 +13,6 @@
    searched for near these commands, then near other solutions, then near guesses; these paths are
    then made faster.
 
-Each step consists of a few methods of :class:`ManoeuvreSearch`.
-
 J. Schulman et al., "Motion planning with sequential convex optimization and convex collision
 checking", International Journal of Robotics Research 33, 2014, make paths collision-free in steps,
 each of which is a quadratic program; here, each step is the full problem of the manoeuvre.
@@ -26,7 +24,6 @@ import itertools
 import logging
 import math
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -42,7 +39,12 @@ from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import InitialMotion, PlanRequest
-from spacerobot_ros.planning.core.progress import SearchPhase, SearchProgress, log_progress
+from spacerobot_ros.planning.core.progress import (
+    SearchClock,
+    SearchPhase,
+    SearchProgress,
+    log_progress,
+)
 from spacerobot_ros.planning.methods.optimal.held_commands import HeldCommands, ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.initial_guesses import InitialGuesses
 from spacerobot_ros.planning.methods.optimal.kept_distances import (
@@ -84,9 +86,6 @@ _GENTLE_DURATION_FACTOR = 4.0
 """A gentle manoeuvre is the path of least effort in this multiple of its guess's duration, then
 made as fast as the limits allow."""
 
-_BUDGET_FACTOR_WITHOUT_SOLUTION = 5.0
-"""As ``optimal.time_budget`` is documented."""
-
 _COARSE_GRID_RATIO, _MIN_COARSE_INTERVALS = 5, 8
 """Ratio of the full grid to the coarse grid, and the smallest number of intervals of a coarse grid;
 with fewer, there is no coarse grid."""
@@ -121,12 +120,12 @@ _CLEARING_TIME_FACTOR, _RESAMPLED_TIME_FACTOR, _RECLEARED_TIME_FACTOR = 2.0, 1.2
 of a clear path on a coarse grid: slow joints leave room to move around obstacles."""
 
 _MAX_CLEARING_ITERATIONS = 80
-"""Largest number of solver steps between paths for which planes are computed: more steps
-diverge."""
+"""Largest number of solver steps between paths with new planes: more steps diverge."""
 
-_MAX_CLEARING_ROUNDS, _MAX_SHORTENING_ROUNDS = 20, 10
-"""Largest number of paths on the way to a clear path, and on the way to a fast one: most searches
-take a few, but with 15 a path for two arms lacked 0.1 mm at the end."""
+_MAX_CLEARING_ROUNDS, _MIN_SHORTENING_ROUNDS, _MAX_SHORTENING_ROUNDS = 20, 5, 10
+"""Largest number of paths on the way to a clear path, and smallest and largest number on the way to
+a fast one: with 15 of the first, a path for two arms lacked 0.1 mm at the end; with 3 or 6 of the
+second, plans for two arms took 10 instead of 8 or 31 instead of 28 s of CPU."""
 
 _NEAR = 0.1
 """Distance beyond the required one, m, up to which pairs beside a clear path are kept apart while
@@ -146,10 +145,6 @@ same plan."""
 _MAX_STALLED_ROUNDS, _STALLED_SHARE = 3, 0.9
 """Number of successive paths, on the way to a clear path, that still lack more than this
 fraction of the smallest previous lack: a path for two arms lacked 55 mm in twelve rounds."""
-
-_MIN_SHORTENING_ROUNDS = 5
-"""Number of paths that are always tried on the way to a fast path. With 6, the longest of 300 plans
-took 31 instead of 28 s of CPU; with 3, a plan for two arms took 10 instead of 8 s."""
 
 _NO_LACK = 1e-3
 """Missing clearance below which all planes are kept, m."""
@@ -219,32 +214,6 @@ class Manoeuvre:
 
 
 @dataclass(frozen=True)
-class SearchClock:
-    """Wall time allowed for a plan, shared by all searches for the plan.
-
-    Attributes
-    ----------
-    budget
-        s; 0: no limit.
-    began
-        ``time.monotonic()``, s, at the start.
-    """
-
-    budget: float = 0.0
-    began: float = field(default_factory=lambda: time.monotonic())
-
-    @property
-    def elapsed(self) -> float:
-        """s."""
-        return time.monotonic() - self.began
-
-    def is_over(self, *, found: bool) -> bool:
-        """Whether the wall time is used up; ``found``: whether there is a manoeuvre."""
-        factor = 1.0 if found else _BUDGET_FACTOR_WITHOUT_SOLUTION
-        return self.budget > 0 and self.elapsed > factor * self.budget
-
-
-@dataclass(frozen=True)
 class SearchProblem:
     """Problem of a search.
 
@@ -277,11 +246,6 @@ class SearchProblem:
     def motion(self) -> InitialMotion | None:
         """Motion of the joints at the start; None: at rest."""
         return self.request.motion
-
-    @property
-    def velocity(self) -> Array | float:
-        """Joint velocities (n,) held before the start."""
-        return self.boundary.velocity if self.motion is None else self.motion.velocity
 
     @property
     def is_timed(self) -> bool:
@@ -361,7 +325,8 @@ class ManoeuvreSearch:
                 f"{model.control_period:g} s, more than optimal.longest = {options.longest:g} s."
             )
         if problem.motion is not None:
-            velocity = _initial_velocity(problem.motion, problem.limits, model.control_period)
+            most = problem.limits.velocity
+            velocity = np.clip(problem.motion.mean_velocity(model.control_period), -most, most)
             problem = replace(problem, boundary=replace(problem.boundary, velocity=velocity))
         kept, knows_turn = None, len(model.axes) == 3
         if model.distances is not None and problem.keeps_clear:
@@ -409,15 +374,6 @@ class ManoeuvreSearch:
         return self._solvers[key]
 
 
-def _initial_velocity(motion: InitialMotion, limits: MotionLimits, period: float) -> Array:
-    """Return the initial velocities (n,): the mean of those held before and after."""
-    between = motion.velocity
-    if len(motion.remaining) > 1:
-        after = (motion.remaining[1] - motion.remaining[0]) / period
-        between = (motion.velocity + after) / 2
-    return np.clip(between, -limits.velocity, limits.velocity)
-
-
 class _Search:
     """One search.
 
@@ -454,6 +410,9 @@ class _Search:
             # In motion, a single answer is requested for the rest of a manoeuvre, which is short.
             if problem.motion is not None and problem.options.answers == 1:
                 self._full = coarse
+        # A timed motion is too inaccurate on a coarse grid: joints overrun in long intervals.
+        is_coarse = self._coarse != self._full
+        self._clears_coarsely = problem.hastens and is_coarse and not problem.is_timed
         self.starts, self.rejection = 0, ""
         self._phase, self._reported = SearchPhase.SEARCHING, 0.0
         # Of the clear paths, once paths in collision have been found.
@@ -572,10 +531,10 @@ class _Search:
         UnusableCandidateError if none reach the goal within the constraints.
         """
         problem, model = self._problem, self._model
-        fixed = problem.options.duration > 0
         if problem.is_timed:
             held = self._hold_in_whole_ticks(trajectory, kept)
         else:
+            fixed = problem.options.duration > 0
             held = model.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
         if held is None:
             raise UnusableCandidateError(_NO_HELD_COMMANDS)
@@ -604,7 +563,8 @@ class _Search:
             near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
         grid = _Grid(len(trajectory.shapes) - 1)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
-        guess, aim = trajectory, problem.boundary
+        guess, boundary, motion = trajectory, problem.boundary, problem.motion
+        aim, before = boundary, boundary.velocity if motion is None else motion.velocity
         # If the duration is given, only the first one is possible.
         longer = [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES]
         for more in [*_ADDITIONAL_TICKS, *longer][: 2 if problem.options.duration > 0 else None]:
@@ -613,12 +573,10 @@ class _Search:
                 guess = self._solve(grid, guess, T, aim=aim, limits=limits, kept=kept, near=near)
             except UnusableCandidateError:
                 continue
-            held = self._model.hold(
-                guess, problem.boundary, problem.limits, fixed=True, before=problem.velocity
-            )
+            held = self._model.hold(guess, boundary, problem.limits, fixed=True, before=before)
             if held is not None:
                 return held
-            aim = self._model.corrected_end(guess, problem.boundary, ticks + more)
+            aim = self._model.corrected_end(guess, boundary, ticks + more)
         return None
 
     # -- 5. clear ---------------------------------------------------------------------------------
@@ -687,12 +645,6 @@ class _Search:
             if all(abs(cost - other) > _SAME_COST_TOLERANCE * other for other in costs):
                 costs.append(cost)
                 yield solution
-
-    @property
-    def _clears_coarsely(self) -> bool:
-        # A timed motion is too inaccurate on a coarse grid: joints overrun in long intervals.
-        problem = self._problem
-        return problem.hastens and self._coarse != self._full and not problem.is_timed
 
     def _refine_best_clear(self, clear: list[tuple[Trajectory, KeptDistances]]) -> Manoeuvre | None:
         """Return a clear manoeuvre from the fastest path that is clear on the coarse grid, or from
@@ -899,16 +851,14 @@ class _Search:
         return max(round(self._problem.options.duration / self._period), 1) * self._period
 
     def _is_over(self, *, found: bool, share: float = 1.0) -> bool:
-        """Whether the wall time or the work on clear paths is used up; ``found``: whether there is
-        such a path."""
+        """Whether the time, or the work on clear paths, is used up; ``found``: if there is one."""
         most = share * _MAX_WORK_PER_ITERATION * self._problem.options.iterations
         if not found:
             most *= _WORK_FACTOR_WITHOUT_PATH
         return self._work > most or self._problem.clock.is_over(found=found)
 
     def _stop_rule(self, *, found: bool, work: int) -> StopRule:
-        """Return the solver's stop conditions in the current phase; ``work`` is the work per
-        step."""
+        """Return the solver's stop conditions in this phase; ``work`` is the work per step."""
         problem, iterations = self._problem, self._problem.options.iterations
         if self._is_clearing and work:
             iterations = min(iterations, _MAX_CLEARING_ITERATIONS)
