@@ -248,6 +248,11 @@ class SearchProblem:
         return self.request.motion
 
     @property
+    def velocity(self) -> Array | float:
+        """Joint velocities (n,) held before the start."""
+        return self.boundary.velocity if self.motion is None else self.motion.velocity
+
+    @property
     def is_timed(self) -> bool:
         """Whether the end of the motion depends on its duration."""
         return self.boundary.is_timed or self.motion is not None
@@ -416,8 +421,7 @@ class _Search:
         self.starts, self.rejection = 0, ""
         self._phase, self._reported = SearchPhase.SEARCHING, 0.0
         # Of the clear paths, once paths in collision have been found.
-        self._best, self._is_clearing = math.inf, False
-        self._work = 0.0
+        self._best, self._is_clearing, self._work = math.inf, False, 0.0
         self._coarse_solutions: list[Trajectory | None] = []
 
     # -- 1. guesses -------------------------------------------------------------------------------
@@ -538,8 +542,7 @@ class _Search:
             held = model.hold(trajectory, problem.boundary, problem.limits, fixed=fixed)
         if held is None:
             raise UnusableCandidateError(_NO_HELD_COMMANDS)
-        start = problem.request.state.quaternion
-        attitudes = quaternion_multiply(start, held.quaternions)
+        attitudes = quaternion_multiply(problem.request.state.quaternion, held.quaternions)
         model.constraints.check(held.positions, attitudes, self._period)
         duration = (len(held.positions) - 1) * self._period
         self._report(f"manoeuvre of {duration:.6g} s")
@@ -563,8 +566,7 @@ class _Search:
             near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
         grid = _Grid(len(trajectory.shapes) - 1)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
-        guess, boundary, motion = trajectory, problem.boundary, problem.motion
-        aim, before = boundary, boundary.velocity if motion is None else motion.velocity
+        guess, boundary, aim = trajectory, problem.boundary, problem.boundary
         # If the duration is given, only the first one is possible.
         longer = [math.ceil(share * ticks) for share in _ADDITIONAL_SHARES]
         for more in [*_ADDITIONAL_TICKS, *longer][: 2 if problem.options.duration > 0 else None]:
@@ -573,7 +575,9 @@ class _Search:
                 guess = self._solve(grid, guess, T, aim=aim, limits=limits, kept=kept, near=near)
             except UnusableCandidateError:
                 continue
-            held = self._model.hold(guess, boundary, problem.limits, fixed=True, before=before)
+            held = self._model.hold(
+                guess, boundary, problem.limits, fixed=True, before=problem.velocity
+            )
             if held is not None:
                 return held
             aim = self._model.corrected_end(guess, boundary, ticks + more)
@@ -656,8 +660,7 @@ class _Search:
             with self._attempt():
                 path = path.stretched(_RESAMPLED_TIME_FACTOR)
                 path, made = self._shorten(kept, self._full, path, None, reach)
-                # From a path that is nearly clear, larger steps lead away: one plan took twice as
-                # long.
+                # From a nearly clear path, larger steps lead away: one plan took twice as long.
                 return made or self._clear_on_full_grid(kept, path, reach, _RECLEARED_TIME_FACTOR)
         return None
 
