@@ -132,9 +132,9 @@ _NEAR = 0.1
 the path is made faster. Pairs that were only in the way of earlier paths are dropped: with all 20,
 two arms took up to six times the solver steps, each of twice the time."""
 
-_LARGEST_LACK = 0.15
-"""Distance by which links on the way to a clear path may be closer than required, m. With 0.3, a
-quadruped's plan took 1.75 instead of 1.00 s."""
+_NO_LACK, _LARGEST_LACK = 1e-3, 0.15
+"""Missing clearance, m, below which all planes are kept, and the largest one on the way to a clear
+path: with 0.3, a quadruped's plan took 1.75 instead of 1.00 s."""
 
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
@@ -146,14 +146,10 @@ _MAX_STALLED_ROUNDS, _STALLED_SHARE = 3, 0.9
 """Number of successive paths, on the way to a clear path, that still lack more than this
 fraction of the smallest previous lack: a path for two arms lacked 55 mm in twelve rounds."""
 
-_NO_LACK = 1e-3
-"""Missing clearance below which all planes are kept, m."""
-
 _GOOD_TIME_FACTOR, _ENOUGH_CLEAR_PATHS, _SHARE_OF_CHOICE = 1.1, 3, 0.25
 """Duration of a path that is clear on the coarse grid, relative to the one in collision, up to
-which it is refined at once. Otherwise, the fastest of this number of clear paths is refined, fewer
-if this fraction of the work is used up: of 55 manoeuvres of a servicer and a quadruped, 15 became
-shorter, by up to 19 %, and two longer, for 1.2 and 1.6 times the CPU time."""
+which it is refined at once. Otherwise, the fastest of this number is, of fewer if this fraction of
+the work is used up: 15 of 55 manoeuvres became shorter, by up to 19 %, and two longer."""
 
 _MIN_GAIN = 0.01
 """Relative time gain below which a clear path is no longer made faster, at the full reach."""
