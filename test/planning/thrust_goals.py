@@ -42,7 +42,7 @@ def measure(name: str, count: int, boxes: int, seed: int) -> str:
     free = SpaceRobot.from_file(robot_file(name))
     folded = np.zeros(free.n)
     if name.startswith("servicer"):
-        folded[:6] = FOLDED  # Its wheels come after the arm.
+        folded[-6:] = FOLDED  # After its wheels.
     far, size = (8.0, 0.7) if name.startswith("servicer") else (3.0, 0.35)
     table = "" if name == "free_flyer" else "urdf"
     options = ThrustOptions(clearance=0.01 if boxes else 0.0, thrusters=table)
