@@ -149,7 +149,7 @@ class FlightBag(RecordedRobot):
     # -- signals ------------------------------------------------------------------------------
 
     def signal(
-        self, name: str, fields: Sequence[str], width: int, joints: Sequence[str] = ()
+        self, name: str, fields: Sequence[str], width: int, joints: Sequence[str] | None = None
     ) -> Signal:
         """Return fields of a topic over time, omitting messages that lack a field.
 
@@ -162,14 +162,14 @@ class FlightBag(RecordedRobot):
         width
             Number of columns.
         joints
-            Names of the joints or thrusters, in the order of the columns; by default, those in the
-            first message.
+            Names of the joints or thrusters, in the order of the columns; None: those in the first
+            message.
         """
         series = self.get(name)
         if series is None:
             return Signal.empty(width)
         if topic_named(name).type == TOPICS["joint_states"].type:
-            names = joints or self.names(name)
+            names = self.names(name) if joints is None else joints
             values = np.hstack([series.of_joints(path, names) for path in fields])
         else:
             values = series.table(fields, width)

@@ -94,11 +94,12 @@ class FlightReport(Flight):
 
     @property
     def efforts(self) -> Signal:
-        """Commanded joint efforts (N, n)."""
-        commands = self.commands.get("joint_commands")
-        if commands is None or self.scenario.plant.actuation == "velocity":
+        """Commanded joint efforts (N, n), in the order of the joint names."""
+        # Without the plant's parameters, only the messages tell velocities from efforts.
+        if self.parameter("plant", "actuation") == "velocity":
             return Signal.empty(len(self.joint_names))
-        return commands
+        width = len(self.joint_names)
+        return self.bag.signal("joint_commands", ["effort"], width, self.joint_names)
 
     @cached_property
     def planned(self) -> list[Array]:

@@ -527,6 +527,26 @@ def test_efforts_are_those_of_the_joints_by_their_names(tmp_path: Path) -> None:
     assert len(found.efforts) == 0
 
 
+@pytest.mark.parametrize("urdf", [URDF, ""])
+def test_efforts_are_read_from_a_bag_without_parameters(tmp_path: Path, urdf: str) -> None:
+    """As other recorders write it; joints without states are those of the description."""
+
+    def more(say: Any, time: float, k: int) -> None:
+        command = JointState(name=NAMES[::-1], effort=[2.0 * k, 1.0 * k])
+        say("/joint_commands", stamped(command, time), time)
+
+    found = flight(tmp_path, more=more, urdf=urdf)
+    np.testing.assert_array_equal(found.efforts.values[-1], [3.0, 6.0])
+    with made_bag(tmp_path / "stateless.mcap") as (bag, say):
+        if urdf:
+            bag.add_attachment("robot_description.urdf", urdf.encode(), "application/xml", 0)
+        for k in range(4):
+            say("/odom", odometry(float(k), *GOAL, *STILL), float(k))
+            more(say, float(k), k)
+    efforts = read_report(tmp_path / "stateless.mcap").efforts
+    assert efforts.values[-1].tolist() == ([3.0, 6.0] if urdf else [])
+
+
 # -- the page ---------------------------------------------------------------------------------
 
 
