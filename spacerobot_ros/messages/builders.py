@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,11 +54,14 @@ def transform_messages(frames: Frames, times_ns: NDArray[np.int64], poses: Array
     poses
         (m, k, 7) poses of the child frames in their parents, m.
     """
-    columns = {f"transforms[{i}].transform.translation.x": poses[:, i] for i in range(len(frames))}
-    return _transform_template(frames).copies(times_ns, columns)
+    return _transform_template(frames).copies(times_ns, _transform_columns(poses))
 
 
-@lru_cache(maxsize=64)
+def _transform_columns(poses: Array) -> dict[str, Array]:
+    """Return poses (m, k, 7) by the path of their first number in a message."""
+    return {f"transforms[{i}].transform.translation.x": poses[:, i] for i in range(poses.shape[1])}
+
+
 def _transform_template(frames: Frames) -> MessageTemplate:
     transforms = [
         {"header": {"frame_id": parent}, "child_frame_id": child} for parent, child in frames
@@ -88,19 +90,26 @@ class RobotTransforms:
         self._links = ForwardKinematics(description) if links else None
         moving, fixed = ((), ()) if self._links is None else (self._links.moving, self._links.fixed)
         base = world_frame, prefix + description.base_link
-        self._moving = (base, *_prefix_frames(moving, prefix))
         self._fixed = _prefix_frames(fixed, prefix)
+        # Nodes send a message per tick; a fed template takes a fifth of the time of a copy.
+        frames = (base, *_prefix_frames(moving, prefix))
+        self._template, self._poses = _transform_template(frames), np.zeros((1, len(frames), 7))
+        for path, pose in _transform_columns(self._poses).items():
+            self._template.feed(path, pose[0])
 
     def message(self, time_ns: int, pose: Array, q: Array) -> bytes:
         """Return the message for a base link pose (7,) and joint positions (n,)."""
-        return self.messages(np.array([time_ns]), pose[np.newaxis], q[np.newaxis])[0]
+        self._poses[0, 0] = pose
+        if self._links is not None:
+            self._poses[0, 1:] = self._links.transforms_at(q)
+        return self._template.serialised(stamp_bytes(time_ns))
 
     def messages(self, times_ns: NDArray[np.int64], poses: Array, q: Array) -> list[bytes]:
         """Return the messages for times (m,), base poses (m, 7) and joint positions (m, n)."""
         every = poses[:, np.newaxis]
         if self._links is not None:
             every = np.concatenate([every, self._links.transforms_at(q)], axis=1)
-        return transform_messages(self._moving, times_ns, every)
+        return self._template.copies(times_ns, _transform_columns(every))
 
     def static_message(self, time_ns: int) -> bytes | None:
         """Return the message for links fixed to their parents; None without such links."""

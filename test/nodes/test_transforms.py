@@ -21,7 +21,12 @@ from support.ros_harness import Harness, nanoseconds
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.reader import columns
-from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, transform_messages
+from spacerobot_ros.messages.builders import (
+    TRANSFORM_TYPE,
+    TRANSFORMS,
+    RobotTransforms,
+    transform_messages,
+)
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
@@ -273,6 +278,17 @@ def test_serialised_frames_are_what_ros_makes_of_each(robot: str) -> None:
         assert raw[end : end + 56] == head[-56:]
         place = end + 56
     assert len(raw) == place
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_frames_of_many_states_are_those_of_each_state(links: bool) -> None:
+    robot = load_robot(robot_file("servicer"))
+    frames, rng = RobotTransforms(robot, "world", "r/", links=links), np.random.default_rng(4)
+    times, poses = np.array([1, 10_000_000_007, 5]), rng.normal(size=(3, 7))
+    q = rng.normal(size=(3, len(robot.joint_names)))
+    each = [frames.message(*state) for state in zip(times.tolist(), poses, q, strict=True)]
+    assert frames.messages(times, poses, q) == each
+    assert len(set(each)) == 3
 
 
 def test_chains_of_frames_end_in_the_world_or_nowhere() -> None:
