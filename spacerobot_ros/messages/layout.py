@@ -189,6 +189,8 @@ def encode(type_name: str, values: Mapping[str, Any] | None = None) -> bytes:
     ------
     KeyError
         The type has no such field.
+    ValueError
+        An array has the wrong shape.
     RecordingError
         The type is not installed.
     """
@@ -215,14 +217,15 @@ def _field_value(kind: MessageType, node: Any, value: Any) -> Any:
         zero = "" if detail[0] == "string" else 0
         return zero if value is None else value
     element, count = detail
-    size = count if node_type == Nodetype.ARRAY else 0
+    if node_type == Nodetype.SEQUENCE:
+        count = 0 if value is None else len(value)
     if element[0] == Nodetype.NAME or element[1][0] == "string":
-        elements = [None] * size if value is None else value
+        elements = [None] * count if value is None else value
         return [_field_value(kind, element, each) for each in elements]
-    given = np.zeros(size) if value is None else value
-    numbers = np.ascontiguousarray(given, DTYPES[element[1][0]])
-    if numbers.shape != (size or len(numbers),):
-        raise ValueError(f"{size} numbers are required; the shape is {numbers.shape}")
+    given = np.zeros(count) if value is None else value
+    numbers = np.asarray(given, DTYPES[element[1][0]], order="C")
+    if numbers.shape != (count,):
+        raise ValueError(f"{count} numbers are required; the shape is {numbers.shape}")
     return numbers
 
 

@@ -173,6 +173,10 @@ def test_a_field_that_a_type_lacks_is_not_encoded() -> None:
         encode("nav_msgs/msg/Odometry", {"child_frame": "base"})
     with pytest.raises(ValueError, match="36 numbers"):
         encode("nav_msgs/msg/Odometry", {"pose": {"covariance": np.zeros(6)}})
+    with pytest.raises(ValueError, match=r"2 numbers are required; the shape is \(2, 3\)"):
+        encode(JOINT_STATE, {"position": np.zeros((2, 3))})
+    with pytest.raises(TypeError):
+        encode(JOINT_STATE, {"position": 5.0})
 
 
 def test_arrays_may_be_empty() -> None:
