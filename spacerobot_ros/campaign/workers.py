@@ -422,11 +422,11 @@ class TaskDistributor:
             left = len(self._fallbacks or waiting)
             # The last tasks are smaller, so that all workers finish at about the same time.
             share = max(engine_by_name(engine).efficient_flights, left / workers)
-            count = range(min(left, max(1, round(min(self._sizes[engine], share)))))
+            count = min(left, max(1, round(min(self._sizes[engine], share))))
             if self._fallbacks:
-                draws = [self._fallbacks.popleft() for _ in count]
+                draws = [self._fallbacks.popleft() for _ in range(count)]
             else:
-                draws = [self._draws[waiting.popleft()] for _ in count]
+                draws = [self._draws[waiting.popleft()] for _ in range(count)]
             self._submit_task(draws, engine)
 
     def _submit_task(self, draws: list[Draw], engine: str, *, alone: bool = False) -> None:
