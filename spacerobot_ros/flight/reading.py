@@ -230,17 +230,23 @@ class FlightBag(RecordedRobot):
             except SpaceRobotError:
                 yield time_ns, message.message
 
-    def events(self) -> Iterator[Event]:
-        """Yield the events, with their log times if stamps come from another clock."""
+    def events(self) -> Iterator[tuple[int, Event]]:
+        """Yield the events as published, with their log times, ns."""
         for time_ns, recorded in self.messages("events"):
             message = read_status(recorded)
             try:
                 event = Event.from_values(message.values, message.message, message.level)
             except SpaceRobotError:
                 continue  # The event is from a later version.
+            yield time_ns, replace(event, node=message.name.strip("/"))
+
+    def timed_events(self) -> Iterator[Event]:
+        """Yield the events with times like those of the signals; an event without a time has its
+        log time."""
+        for time_ns, event in self.events():
             time = event.time_s if self.stamped else None
             time = time_ns / SECOND if time is None else time
-            yield replace(event, node=message.name.strip("/"), time_s=time - self._zero)
+            yield replace(event, time_s=time - self._zero)
 
     def goals(self, link: str = "") -> tuple[SentGoal, ...]:
         """Return the valid goals of the base, or of an end-effector, in the odometry frame; for a
@@ -399,7 +405,7 @@ def read_flight(bag: FlightBag) -> Flight:
         series=bag.series(),
         commands=bag.commands(scenario.plant.actuation),
         statuses=tuple(sorted((s for each in statuses.values() for s in each), key=lambda s: s[0])),
-        events=tuple(bag.events()),
+        events=tuple(bag.timed_events()),
         outcome=Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value),
         message=status.message if status is not None else "",
         goal=goal_at_end(reports, goals),

@@ -246,7 +246,7 @@ def _injections(recorded: FlightBag, topic: str, period_ns: int) -> dict[int, li
 def _requested_grasps(recorded: FlightBag, config: PlantConfig) -> dict[int, list[bool]]:
     """Return the captures (true) and releases (false) that were requested in each tick."""
     grasps: dict[int, list[bool]] = {}
-    for event in recorded.events():
+    for _, event in recorded.events():
         captured = event.kind is EventKind.CAPTURED
         if event.time_s is None or not (captured or event.kind is EventKind.RELEASED):
             continue

@@ -163,7 +163,7 @@ def test_reports_of_a_flight_are_those_of_its_last_goal(bag: FlightBag, flight: 
         "Of another package."
     ]
     assert [(event.message, event.time_s) for event in flight.events] == [("It runs.", 1.5)]
-    assert [event.node for event in bag.events()] == ["a/plant"]
+    assert [event.node for event in flight.events] == ["a/plant"]
     assert bag.began == 1.0
     assert bag.message_count == 37
     assert (flight.scenario.name, flight.scenario.description) == ("made", "It is made.")
@@ -197,8 +197,11 @@ def test_times_are_stamps_unless_these_are_of_another_clock(
 ) -> None:
     bag = open_flight_bag(write(folder / f"{late}.mcap", late), "a")
     begin = 1.0 if stamped else 1.0 + late
-    assert read_flight(bag).time.tolist() == [begin + k / 2 for k in range(5)]
+    flight = read_flight(bag)
+    assert flight.time.tolist() == [begin + k / 2 for k in range(5)]
     assert bag.began == pytest.approx(begin)
+    assert [event.time_s for event in flight.events] == [begin + 0.5]
+    assert [event.time_s for _, event in bag.events()] == [1.5], "the plant's own time"
 
 
 def test_the_robot_of_a_namespace_is_read(folder: Path, bag: FlightBag) -> None:
