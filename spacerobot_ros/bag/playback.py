@@ -11,7 +11,7 @@ from spacerobot_ros.bag.mcap_file import QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import LATEST_TIME_NS
 from spacerobot_ros.bag.reader import Bag
 from spacerobot_ros.errors import ParameterError, RecordingError
-from spacerobot_ros.events import PLAIN_TEXT, SECONDS, KeyValueField, KeyValueFormat, number_format
+from spacerobot_ros.events import SECONDS, KeyValueField, KeyValueFormat, number_format
 from spacerobot_ros.times import SECOND
 
 _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
@@ -57,7 +57,7 @@ class ReplayStatus:
 
 _STATUS_FORMAT = KeyValueFormat(
     "status of a replay",
-    KeyValueField("state", PLAIN_TEXT),
+    KeyValueField("state"),
     KeyValueField("position_s", SECONDS),
     KeyValueField("duration_s", SECONDS),
     KeyValueField("rate", number_format(".9g")),

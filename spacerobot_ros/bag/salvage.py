@@ -194,7 +194,7 @@ class _Copy:
                     self._file.topics[number] = RecordedTopic(
                         channel.topic,
                         type_name,
-                        [*profiles, QosProfile()][0],
+                        profiles[0] if profiles else QosProfile(),
                         words.get("topic_type_hash", ""),
                     )
             case Attachment() as file:

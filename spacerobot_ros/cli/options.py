@@ -233,7 +233,19 @@ def with_goal(
     rpy_deg: Sequence[float] | None,
     end_effectors: Sequence[EndEffectorGoal] = (),
 ) -> Scenario:
-    """Return a scenario with a goal from options; warn about a rotation that looks like degrees."""
+    """Return a scenario with a goal from options; warn about a rotation that looks like degrees.
+
+    Parameters
+    ----------
+    scenario
+        The scenario whose goal is replaced.
+    pose
+        (7,) position (m) and quaternion, or (3,) position, if given.
+    rotvec, rpy_deg
+        (3,) attitude in radians or in degrees, if given.
+    end_effectors
+        Goals of end-effectors.
+    """
     if rotvec is not None:
         warn_of_large_angles(rotvec, "--goal-rpy-deg")
     return scenario.with_goal(pose, rotvec, rpy_deg, end_effectors=end_effectors)
