@@ -213,12 +213,14 @@ def _load_description(robot: str, text: str, world: str) -> RobotDescription:
 
 
 def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
-    """Return the targets with the given name: one target, or one target per body.
+    """Return the target with the given name, or all targets whose names match it; ``*`` stands for
+    any characters.
 
     Raises
     ------
     ParameterError
-        There is no such target; the message suggests a similar name.
+        There is no such target (the message suggests a similar name), or the targets have
+        different units.
     """
     kind, _, rest = name.partition(".")
     if kind in CONFIGS:
@@ -235,7 +237,13 @@ def targets_of(name: str, scenario: Scenario) -> list[DispersionTarget]:
         raise ParameterError(f"'{name}': the scenario has no goal for the end-effector.")
     available = _targets_by_name(kind, scenario)
     pattern = re.compile(re.escape(name).replace(r"\*", ".+"))
-    if found := [target for each, target in available.items() if pattern.fullmatch(each)]:
+    found = [target for each, target in available.items() if pattern.fullmatch(each)]
+    if len(units := {target.unit for target in found}) > 1:
+        raise ParameterError(
+            f"'{name}' stands for quantities with different units ({', '.join(sorted(units))}): "
+            "name them separately."
+        )
+    if found:
         return found
     if available:
         raise ParameterError(

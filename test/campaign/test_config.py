@@ -136,6 +136,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         "is not one of.*Did you mean 'initial.joints.slider_",
     ),
     ({"disperse": {"goal.position.u": NORM}}, "is not one of goal.position.x"),
+    ({"disperse": {"goal.*": NORM}}, r"'goal.\*' stands for .* different units \(m, rad\)"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),
     ({"disperse": {"faults[0].at": NORM}}, r"plant.faults has 0 faults"),
     (
