@@ -25,7 +25,12 @@ from spacerobot_ros.files import Cache
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.rotations import matrices_from_quaternions, matrix_from_quaternion
+from spacerobot_ros.model.rotations import (
+    matrices_from_quaternions,
+    matrix_from_quaternion,
+    quaternion_inverse,
+    quaternion_multiply,
+)
 from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
@@ -671,7 +676,9 @@ class OptimalGait(GaitMethod):
         base = self._prediction.poses(state, braking)
         beyond = np.any(braking < limits.lower) or np.any(braking > limits.upper)
         if self._efforts is not None and self._efforts_are_strict:
-            held = HeldMotion(braking, period, motion.velocity)
+            turns = quaternion_multiply(quaternion_inverse(state.quaternion), base.quaternion)
+            L_B = task.boundary.momenta_in_base(turns)
+            held = HeldMotion(braking, period, motion.velocity, L_B=L_B)
             beyond |= self._efforts.excess(held) > 1 + _LIMIT_ROUNDING
         if beyond or self._too_near(braking, base if self._has_obstacles else None):
             raise refusal
