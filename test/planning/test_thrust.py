@@ -98,6 +98,17 @@ def test_pinocchio_ends_at_the_goal_under_the_wrenches_and_efforts_of_a_plan() -
     assert 0 < motion.spent < straight * planner.propulsion.cost.sum()
 
 
+def test_a_joint_that_is_limited_to_no_effort_is_named() -> None:
+    limited = "<parent link='base_link'/><child link='arm'/><axis xyz='0 0 1'/><limit lower='-1'"
+    arm = f"""<joint name="elbow" type="revolute">{limited} upper="1" velocity="1" effort="0"/>
+</joint><link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+    planner = cube_planner(SpaceRobot.from_urdf(CUBE.replace("</robot>", arm)), clearance=0.0)
+    goal = ThrustGoal(beyond(START, np.array([0.3, 0.1, 0.0]), np.zeros(3)))
+    with pytest.raises(PlanningError, match="joint 'elbow' is limited to an effort of 0"):
+        planner.plan(RobotMotion.at_rest(START, np.zeros(1)), goal)
+
+
 def test_an_arm_that_is_to_keep_its_shape_keeps_it_all_the_way() -> None:
     planner, start = servicer(), RobotMotion.at_rest(START, FOLDED)
     goal = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))

@@ -409,7 +409,11 @@ class _Search:
         return next(self._ways(base, shape, self._sides(base) if past else fixture, time), None)
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
-        options = self.planner.options
+        planner, options = self.planner, self.planner.options
+        for name, limit in zip(planner.robot.joint_names, planner.effort_limit, strict=True):
+            if limit == 0:
+                why = f"joint '{name}' is limited to an effort of 0, which cannot move it"
+                raise self._failure(why)
         self._begin(SearchPhase.SEARCHING)
         is_timed = options.duration > 0 or options.time_factor > 1
         fastest = self._solve(guess, self._weights(guess), begins="rough" * is_timed)
@@ -428,7 +432,7 @@ class _Search:
         time = min(options.duration or options.time_factor * fastest.duration, horizon)
         for _ in range(_MAX_ROUNDS):
             motion = self._motion(fastest, time)
-            share = motion.effort_share(self.planner.effort_limit)
+            share = motion.effort_share(planner.effort_limit)
             if share <= 1.0:
                 return motion
             # Efforts of a motion from rest scale approximately with its squared speed.
