@@ -217,15 +217,19 @@ class MissionClient:
             Raised by ``look``.
         """
         failures: list[SpaceRobotError] = []
+        decision: Status | None = None
 
         def on_look() -> None:
+            nonlocal decision
             try:
                 stop = look()
             except SpaceRobotError as error:
                 failures.append(error)
                 stop = True
-            if self._decision is not None:
-                self._take(self._decision)
+            # The status, which says more than the event, may arrive within a period after it.
+            if decision is not None and self.outcome is None:
+                self._take(decision)
+            decision = self._decision
             if stop:
                 self._end(Outcome.INTERRUPTED)
 

@@ -167,6 +167,32 @@ def test_a_verdict_whose_status_is_lost_is_known_from_its_event(
     assert mission.client.message == "goal_reached."
 
 
+@pytest.mark.parametrize("decider", STATUS)
+def test_a_status_that_comes_after_its_event_is_kept_for_what_it_says(
+    harness: Harness, decider: str
+) -> None:
+    mission = Mission(harness, decider)
+    events = mission.commander.create_publisher(DiagnosticStatus, "events", 10)
+    harness.spin_until(events.get_subscription_count)
+    goal_id = mission.send(GOAL)
+    values = [KeyValue(key="event", value="goal_failed"), KeyValue(key="goal_id", value=goal_id)]
+    status: PlannerStatus | ControllerStatus
+    if decider == "planner":
+        status = PlannerStatus(PlannerState.FAILED, "Failed.", goal_id=goal_id, corrections=3)
+    else:
+        status = ControllerStatus(ControllerState.FAILED, "Failed.", goal_id=goal_id, task="x")
+    events.publish(DiagnosticStatus(name=f"/{decider}", message="Failed.", values=values))
+    looks = []
+
+    def look() -> bool:
+        looks.append(time.monotonic())
+        mission.publish(status)
+        return len(looks) > 10
+
+    assert mission.client.follow(harness.executor, look, 1.0) is Outcome.FAILED
+    assert mission.client.status == status
+
+
 def test_every_goal_has_an_id_of_its_own_though_time_stands_still(harness: Harness) -> None:
     mission = Mission(harness, "planner")
     assert [mission.send(GOAL) for _ in range(3)] == [f"12.000000{346 + n}" for n in range(3)]
