@@ -511,13 +511,15 @@ class ControlExecutive:
         if servicing.task is None:
             return
         progress = servicing.step(time, state, self.controller)
-        if progress.state is TaskState.DONE:
-            self._refuse_goals_by_state(state)
         match progress.state:
             case TaskState.ACTIVE:
                 pass
             case TaskState.DONE if self._pending:
-                self._begin_goals(time, state, carried=True)
+                self._refuse_goals_by_state(state)
+                if self._pending:
+                    self._begin_goals(time, state, carried=True)
+                else:
+                    self._hold_pose(time, state, aborted=False)
             case TaskState.DONE:
                 touched = bool(self._watch.touched)
                 ended = ControllerState.FAILED if touched else ControllerState.REACHED

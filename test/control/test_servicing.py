@@ -168,6 +168,17 @@ def test_a_goal_of_the_end_effector_is_carried_to_where_it_is_given() -> None:
     np.testing.assert_allclose(goal.position, TIP - AIM)
 
 
+def test_a_goal_that_cannot_be_met_after_the_tasks_is_refused_and_not_reached() -> None:
+    loop = Meeting(tasks="detumble")
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer()
+    loop.place = np.array([0.0, 0.0, 0.5])
+    loop.answer(8)
+    assert loop.kinds()[-2:] == ["detumbled", "goal_refused"]
+    assert "along z" in loop.events[-1].message
+    assert (loop.state, loop.status.goal_id) == ("holding", "")
+
+
 def test_the_reference_meets_the_grapple_frame_with_its_velocity_and_a_miss_has_its_figures() -> (
     None
 ):
