@@ -216,7 +216,10 @@ class JointRateLimits:
         return np.asarray(Js @ qddot + Fs)
 
     def holding_efforts(self, q: Array, base: PoseReference) -> Array:
-        """Return the efforts (n,) that hold joints at rest at ``q`` (n,) as the base moves."""
+        """Return the efforts (n,), N m or N, that hold joints at ``q`` (n,) as the base moves.
+
+        The robot is a rigid body; ``base`` is the motion of the base in W, moved by thrust alone.
+        """
         R_BW, still = matrix_from_quaternion(base.quaternion).T, np.zeros(3)
         omega, alpha = R_BW @ base.angular_velocity, R_BW @ base.angular_acceleration
         r, inertia = self._robot.center_of_mass(q), self._robot.inertia_matrix(q)[3:6, 3:6]
