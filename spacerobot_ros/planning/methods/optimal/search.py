@@ -622,7 +622,8 @@ class _Search:
         if problem.boundary.drifts and not (problem.motion is not None and len(self._wheels)):
             # A drifting robot finds others sooner after braking and coasting.
             return
-        most = _MAX_CLEAR_STARTS if problem.motion is None else _MAX_CLEAR_STARTS_IN_MOTION
+        brakes = problem.motion is not None and not problem.boundary.drifts
+        most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
         starts = min(problem.options.starts, most)
         guesses = itertools.islice(self._guesses(self._coarse, kept.is_clear), starts)
         clear = (each for each in guesses if kept.is_clear(each))
