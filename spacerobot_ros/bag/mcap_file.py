@@ -346,10 +346,14 @@ class McapFile(Writer):
                 self._raw.truncate(self.size)
                 self._raw.seek(self.size, os.SEEK_SET)
             self.message_counts = self._counts_in_file
+            written, what_is_left = self.message_counts.total(), "no message was written."
+            if written:
+                what_is_left = (
+                    f"'spacerobot salvage {shlex.quote(str(self.path))}' recovers the "
+                    f"{counted(written, 'message')} already written."
+                )
             raise RecordingError(
-                f"Cannot write the bag {self.path}: {error.strerror or error}; "
-                f"'spacerobot salvage {shlex.quote(str(self.path))}' recovers the "
-                f"{counted(self.message_counts.total(), 'message')} already written."
+                f"Cannot write the bag {self.path}: {error.strerror or error}; {what_is_left}"
             ) from error
         self.size += len(data)
         if data[:1] == _CHUNK:

@@ -242,7 +242,7 @@ def test_a_disk_that_refuses_a_message_is_reported_once(
     assert recording.state.value == "failed"
     (failure,) = map(str, failures)
     assert "No space left on device; " in failure
-    assert failure.endswith("recovers the 0 messages already written.")
+    assert failure.endswith("; no message was written.")
     assert recording.messages == 0
     recording.close()
 
