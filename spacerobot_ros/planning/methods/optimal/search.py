@@ -27,6 +27,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -139,8 +140,7 @@ path: with 0.3, a quadruped's plan took 1.75 instead of 1.00 s."""
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
 ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
-8 and 25 s of an idle core (0.35 us per nonzero). With 1.25e5, two arms took 60 % longer for the
-same plan."""
+8 and 25 s of an idle core (0.35 us per nonzero). With 1.25e5, two arms took 60 % more."""
 
 _MAX_STALLED_ROUNDS, _STALLED_SHARE = 3, 0.9
 """Number of successive paths, on the way to a clear path, that still lack more than this
@@ -162,9 +162,11 @@ _REACH_FROM_GUESS = 4.0
 """Factor applied to the largest reach from a guess, which is far from the goal."""
 
 _MAX_CLEAR_STARTS, _MAX_CLEAR_STARTS_IN_MOTION = 16, 1
-"""Largest number of guesses whose solutions are searched nearby for clear manoeuvres: in motion,
-only the rest of the motion, as others are found sooner from rest. With 8 guesses, a plan for a
-quadruped took 40 % longer."""
+"""Largest number of guesses near whose solutions clear manoeuvres are searched for; in motion, only
+the rest of the motion, as others are found sooner from rest. With 8, a plan took 40 % longer."""
+
+_KEPT_SOLVERS = 16
+"""Number of solvers that are kept for later plans: with two arms, each takes 30 MB."""
 
 _REPORT_PERIOD = 1.0
 """Wall time, s, after which a solver reports that it is still busy."""
@@ -304,8 +306,8 @@ class ManoeuvreSearch:
 
     def __init__(self, model: ManoeuvreModel) -> None:
         self._model = model
-        self._stages: dict[tuple[bool, bool], Stages] = {}
-        self._solvers: dict[tuple[_Grid, bool, bool, tuple[int, ...]], MultipleShooting] = {}
+        self._stages = cache(self._derive_stages)
+        self._solvers = lru_cache(_KEPT_SOLVERS)(self._build_solver)
 
     def search(self, problem: SearchProblem) -> Manoeuvre:
         """Return the fastest manoeuvre found.
@@ -354,25 +356,28 @@ class ManoeuvreSearch:
         self, grid: _Grid, boundary: BoundaryConditions, pairs: tuple[int, ...]
     ) -> MultipleShooting:
         """Return the solver on a grid, which keeps pairs of links apart."""
-        position, drifting, model = boundary.center is not None, boundary.drifts, self._model
-        if (position, drifting) not in self._stages:
-            self._stages[position, drifting] = Stages.of(
-                model.robot,
-                model.axes,
-                position,
-                model.constraints,
-                inequality=model.efforts and model.efforts.inequality(drifting=drifting),
-                end_effectors=model.end_effectors and model.end_effectors.function,
-                drifting=drifting,
-            )
-        key = grid, position, drifting, pairs
-        if key not in self._solvers:
-            stages = self._stages[position, drifting]
-            if pairs and model.distances is not None:
-                rows = PlaneDistances.of(model.distances.clearance.geometry, pairs)
-                stages = stages.with_distances(rows, instants_of(grid.intervals))
-            self._solvers[key] = MultipleShooting(stages, *grid)
-        return self._solvers[key]
+        return self._solvers(grid, boundary.center is not None, boundary.drifts, pairs)
+
+    def _build_solver(
+        self, grid: _Grid, position: bool, drifting: bool, pairs: tuple[int, ...]
+    ) -> MultipleShooting:
+        stages, distances = self._stages(position, drifting), self._model.distances
+        if pairs and distances is not None:
+            rows = PlaneDistances.of(distances.clearance.geometry, pairs)
+            stages = stages.with_distances(rows, instants_of(grid.intervals))
+        return MultipleShooting(stages, *grid)
+
+    def _derive_stages(self, position: bool, drifting: bool) -> Stages:
+        model = self._model
+        return Stages.of(
+            model.robot,
+            model.axes,
+            position,
+            model.constraints,
+            inequality=model.efforts and model.efforts.inequality(drifting=drifting),
+            end_effectors=model.end_effectors and model.end_effectors.function,
+            drifting=drifting,
+        )
 
 
 class _Search:
@@ -549,9 +554,8 @@ class _Search:
     ) -> HeldCommands | None:
         """Return a solution whose duration matters as held commands; None if that fails.
 
-        If it were stretched to whole control periods, the base would rotate farther, or the joints
-        would start at other rates. So a least-effort trajectory is computed for this number of
-        periods, or a few more.
+        Stretched to whole control periods, it would rotate the base farther, or start at other
+        rates. So the path of least effort is computed for that number of periods, or a few more.
         """
         problem, limits, near = self._problem, self._problem.limits, None
         if self._wheels_stop_base:
@@ -639,9 +643,7 @@ class _Search:
         grid, costs = self._coarse, [self._problem.cost(known)]
         others = itertools.islice(self._guesses(grid), len(self._coarse_solutions), starts)
         solved = (self._solve_start(grid, guess) for guess in others)
-        for solution in itertools.chain(self._coarse_solutions[:starts], solved):
-            if solution is None:
-                continue
+        for solution in filter(None, itertools.chain(self._coarse_solutions[:starts], solved)):
             cost = self._problem.cost(solution)
             if all(abs(cost - other) > _SAME_COST_TOLERANCE * other for other in costs):
                 costs.append(cost)
@@ -764,8 +766,7 @@ class _Search:
         self, kept: KeptDistances, grid: _Grid, path: Trajectory
     ) -> tuple[list[Approach], Manoeuvre | None]:
         """Return the pairs that come too close along a path, or else, on the full grid, along its
-        held commands, and these commands.
-        """
+        held commands, and these commands."""
         near = kept.approaches_of(path)
         if near or grid != self._full:
             return near, None
@@ -852,9 +853,8 @@ class _Search:
 
     def _is_over(self, *, found: bool, share: float = 1.0) -> bool:
         """Whether the time, or the work on clear paths, is used up; ``found``: if there is one."""
-        most = share * _MAX_WORK_PER_ITERATION * self._problem.options.iterations
-        if not found:
-            most *= _WORK_FACTOR_WITHOUT_PATH
+        factor = share if found else _WORK_FACTOR_WITHOUT_PATH
+        most = factor * _MAX_WORK_PER_ITERATION * self._problem.options.iterations
         return self._work > most or self._problem.clock.is_over(found=found)
 
     def _stop_rule(self, *, found: bool, work: int) -> StopRule:
