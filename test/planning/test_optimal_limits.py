@@ -27,11 +27,11 @@ from spacerobot_ros.model import SpaceRobot, model_functions
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
+from spacerobot_ros.planning.core import progress
 from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
 from spacerobot_ros.planning.core.schedule import HeldMotion
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.optimal import search
 from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
 from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.planning.methods.optimal.transcription import Stages, program
@@ -161,7 +161,7 @@ class SlowClock:
 @pytest.fixture
 def ticking(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have 20 ms go by whenever a search asks for the time, on any machine."""
-    monkeypatch.setattr(search, "time", SlowClock(0.02))
+    monkeypatch.setattr(progress, "time", SlowClock(0.02))
 
 
 @pytest.mark.usefixtures("ticking")
@@ -179,7 +179,7 @@ def test_all_searches_of_a_plan_share_its_time(
 ) -> None:
     """A base that drifts is planned for at once, then for its passes of the goal, then for any."""
     clock = SlowClock(0.02)
-    monkeypatch.setattr(search, "time", clock)
+    monkeypatch.setattr(progress, "time", clock)
     few: dict[str, Any] = {"iterations": 4, "starts": 24, "angular_momentum": [1.5, -0.6, 1.1]}
     with pytest.raises(PlanningError, match=r"within optimal\.time_budget 0\.5 s"):
         of_arm(arm, [0.5, -0.6, 0.4], time_budget=0.5, **few)
@@ -191,7 +191,7 @@ def test_a_plan_is_the_same_on_a_busy_machine(
 ) -> None:
     turn = [0.2, -0.3, 0.25]
     quiet = of_arm(arm, turn, answers=2)
-    monkeypatch.setattr(search, "time", SlowClock())
+    monkeypatch.setattr(progress, "time", SlowClock())
     busy = of_arm(arm, turn, answers=2)
     assert busy.positions.tobytes() == quiet.positions.tobytes()
     assert busy.notes == quiet.notes
