@@ -71,7 +71,6 @@ setup(
         NAME: [
             "py.typed",
             "batch/*.hpp",
-            "nodes/common/*.xml",
             "report/*.css",
             "report/*.js",
             "viewer/*.js",

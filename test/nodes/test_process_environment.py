@@ -106,30 +106,6 @@ def test_a_choice_of_the_user_stays(
     assert not caplog.text
 
 
-@pytest.mark.parametrize("discovery", ["", "LOCALHOST", "SUBNET"])
-def test_a_node_listens_to_sockets_alone(discovery: str, ros_domain: int) -> None:
-    """A process that a busy machine does not run for a second may not be heard in shared memory."""
-    script = """
-from pathlib import Path
-import rclpy
-from spacerobot_ros.nodes.common.process import use_loopback_discovery
-use_loopback_discovery()
-rclpy.init()
-node = rclpy.create_node("listener")
-print(*(path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")))
-"""
-    environment = {
-        **os.environ,
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
-        "ROS_DOMAIN_ID": str(ros_domain),
-    }
-    words = [sys.executable, "-c", script]
-    threads = subprocess.run(words, env=environment, capture_output=True, text=True, check=True)
-    listening = [name for name in threads.stdout.split() if re.fullmatch(r"dds[.].*[.]\d+", name)]
-    assert any(name.startswith("dds.udp.") for name in listening), listening
-    assert not any(name.startswith("dds.shm.") for name in listening), listening
-
-
 @pytest.mark.parametrize(("free", "warned"), [(None, False), (0, True), (2**20, False)])
 def test_full_memory_is_said_before_a_library_is_ended_by_it(
     free: int | None,

@@ -44,8 +44,6 @@ FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PRO
 
 _TRANSPORT_CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", *FASTDDS_FILE_VARIABLES)
 
-_FASTDDS_SETTINGS = Path(__file__).with_name("fastdds.xml")
-
 _turn = itertools.count(os.getpid())
 """Consecutive tests in one process use different domains."""
 
@@ -56,14 +54,10 @@ _REQUIRED_SHARED_MEMORY = 2 * 2**20
 
 
 def use_loopback_discovery() -> None:
-    """Limit discovery to this machine, and send messages through sockets, unless the user chose
-    otherwise; this applies to this process and to those that it starts."""
+    """Limit discovery to this machine unless the user chose otherwise; select a transport."""
     if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     _use_sockets_without_shared_memory()
-    transports = os.environ.get("FASTDDS_BUILTIN_TRANSPORTS") or "UDPv4"
-    if transports == "UDPv4" and not any(map(os.environ.get, FASTDDS_FILE_VARIABLES)):
-        os.environ.update(dict.fromkeys(FASTDDS_FILE_VARIABLES, str(_FASTDDS_SETTINGS)))
 
 
 def _use_sockets_without_shared_memory() -> None:
