@@ -15,6 +15,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
+from rclpy.publisher import Publisher
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from support.hand_motion import end_of_motion
@@ -144,23 +145,32 @@ def test_the_end_of_a_replaced_goal_counts_though_the_next_status_comes_at_once(
     assert mission.client.message == replaced
 
 
+def mission_with_events(harness: Harness, decider: str) -> tuple[Mission, Publisher, str]:
+    """Return a mission with a goal, the publisher of its commander's events, and the goal's id."""
+    mission = Mission(harness, decider)
+    events = mission.commander.create_publisher(DiagnosticStatus, "events", 10)
+    harness.spin_until(events.get_subscription_count)
+    return mission, events, mission.send(GOAL)
+
+
+def event(node: str, kind: str, goal_id: str) -> DiagnosticStatus:
+    values = [KeyValue(key="event", value=kind), KeyValue(key="goal_id", value=goal_id)]
+    return DiagnosticStatus(name=node, message=f"{kind}.", values=values)
+
+
 @pytest.mark.parametrize("decider", STATUS)
 def test_a_verdict_whose_status_is_lost_is_known_from_its_event(
     harness: Harness, decider: str
 ) -> None:
     """As when a later goal's status replaces it before a busy client has received it."""
-    mission = Mission(harness, decider)
-    events = mission.commander.create_publisher(DiagnosticStatus, "events", 10)
-    harness.spin_until(events.get_subscription_count)
-    goal_id = mission.send(GOAL)
+    mission, events, goal_id = mission_with_events(harness, decider)
     for node, kind, identity in (
         ("/other", "goal_failed", goal_id),
         (f"/{decider}", "goal_failed", "12.9"),
         (f"/{decider}", "goal_accepted", goal_id),
         (f"/{decider}", "goal_reached", goal_id),
     ):
-        values = [KeyValue(key="event", value=kind), KeyValue(key="goal_id", value=identity)]
-        events.publish(DiagnosticStatus(name=node, message=f"{kind}.", values=values))
+        events.publish(event(node, kind, identity))
     late = time.monotonic() + TIMEOUT
     outcome = mission.client.follow(harness.executor, lambda: time.monotonic() > late, 0.01)
     assert outcome is Outcome.REACHED
@@ -171,17 +181,13 @@ def test_a_verdict_whose_status_is_lost_is_known_from_its_event(
 def test_a_status_that_comes_after_its_event_is_kept_for_what_it_says(
     harness: Harness, decider: str
 ) -> None:
-    mission = Mission(harness, decider)
-    events = mission.commander.create_publisher(DiagnosticStatus, "events", 10)
-    harness.spin_until(events.get_subscription_count)
-    goal_id = mission.send(GOAL)
-    values = [KeyValue(key="event", value="goal_failed"), KeyValue(key="goal_id", value=goal_id)]
+    mission, events, goal_id = mission_with_events(harness, decider)
     status: PlannerStatus | ControllerStatus
     if decider == "planner":
         status = PlannerStatus(PlannerState.FAILED, "Failed.", goal_id=goal_id, corrections=3)
     else:
         status = ControllerStatus(ControllerState.FAILED, "Failed.", goal_id=goal_id, task="x")
-    events.publish(DiagnosticStatus(name=f"/{decider}", message="Failed.", values=values))
+    events.publish(event(f"/{decider}", "goal_failed", goal_id))
     looks = []
 
     def look() -> bool:
