@@ -33,9 +33,10 @@ from spacerobot_ros.files import Cache, warn_once
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.termination import tool
 
-_FLAGS = ("-O1", "-fPIC", "-shared", "-ffp-contract=off")
-"""Compiler flags for all objects; fused multiply-adds are disabled, because with them results would
-depend on the processor."""
+_FLAGS = ("-Og", "-fPIC", "-shared", "-ffp-contract=off")
+"""Compiler flags for all objects; with -O1, long functions take up to six times as long to compile
+and run no faster. Fused multiply-adds are disabled, because with them results would depend on the
+processor."""
 
 announcement_listeners: list[Callable[[str], None]] = []
 """Functions called with a message, which is also logged, when a long computation begins."""
@@ -126,21 +127,23 @@ def dense_function(
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs))
 
 
-def compiled(function: ca.Function) -> ca.Function:
-    """Return the compiled function, or the function unchanged if compilation is disabled or
-    fails."""
+def compiled(function: ca.Function, *, builds: bool = True) -> ca.Function:
+    """Return the compiled function, or the function unchanged if compilation is disabled or fails,
+    or if it is not in the cache and ``builds`` is false."""
     if not _is_compilation_enabled():
         return function
     name = function.name()
     generator = ca.CodeGenerator(name, {"with_header": False})
     generator.add(function)
+    source = str(generator.dump())
     try:
-        return load_library(name, str(generator.dump()), lambda path: ca.external(name, path))
+        return load_library(name, source, lambda path: ca.external(name, path), builds=builds)
     except NoLibraryError as reason:
-        warn_once(
-            "Functions run in CasADi's virtual machine, which is slower but uses the same formulas "
-            f"(SPACEROBOT_COMPILE=0 selects it): {reason}."
-        )
+        if builds:
+            warn_once(
+                "Functions run in CasADi's virtual machine, which is slower but uses the same "
+                f"formulas (SPACEROBOT_COMPILE=0 selects it): {reason}."
+            )
         return function
 
 
@@ -152,6 +155,7 @@ def load_library(
     flags: Sequence[str] = (),
     libraries: Sequence[str] = (),
     language: Literal["c", "cpp"] = "c",
+    builds: bool = True,
 ) -> _Loaded:
     """Load the shared object for a source, compiling it first if it is not cached.
 
@@ -166,6 +170,8 @@ def load_library(
     flags, libraries
         Compiler arguments before and after the source. The arguments are part of the key, so flags
         may select processor-specific instructions.
+    builds
+        Whether an object that is not in the cache is compiled.
 
     Returns
     -------
@@ -189,6 +195,8 @@ def load_library(
     cache = Cache(cache_directory())
     if kept := cache.load(file_name, key):
         return _loaded(load, kept[0])
+    if not builds:
+        raise NoLibraryError("the object is not in the cache")
     _announce_compilation()
     with tempfile.TemporaryDirectory(prefix="spacerobot_ros_") as folder:
         file, built = Path(folder, f"function.{language}"), Path(folder, "function.so")

@@ -208,8 +208,12 @@ def test_a_plan_is_the_same_with_compiled_functions_and_without(
     asked: dict[str, Any] = {"rotvec": [0, 0, 2.5], "cache": 0, "intervals": 40}
     plans = [plan("planar_chain", **asked).positions.tobytes() for _ in range(2)]
     assert not list(tmp_path.glob("*.so")), "a plan waits for no compiler"
+    asked_clear = {**asked, "rotvec": (0.09, -0.26, -0.21), "clearance": 0.03, "answers": 1}
+    plans += [plan("three_joint_arm", **asked_clear).positions.tobytes() for _ in range(2)]
+    assert list(tmp_path.glob("interval_hess*.so")), "a search for a clear path takes longer"
     monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    assert plans == [plan("planar_chain", **asked).positions.tobytes()] * 2
+    assert plans[:2] == [plan("planar_chain", **asked).positions.tobytes()] * 2
+    assert plans[2:] == [plan("three_joint_arm", **asked_clear).positions.tobytes()] * 2
 
 
 def test_a_plan_waits_for_no_compiler_of_its_robot(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -196,19 +196,15 @@ class Clearance:
 
     def is_roomy(self, shapes: Array) -> npt.NDArray[np.bool_]:
         """Return, for each configuration (N, n), whether all links have room for loops (N,)."""
-        return self._keep_distances(shapes, _CLEARANCE_FACTOR_FOR_LOOPS * self.distance)
+        room = _CLEARANCE_FACTOR_FOR_LOOPS * self.distance
+        return np.asarray(self.geometry.nearest_along(shapes, None, room, most=0.0)[0] >= 0.0)
 
     def is_clear(self, shapes: Array, required: Array) -> bool:
         """Whether pairs keep the ``required`` distances (P,), m, in all configurations (N, n).
 
         Obstacles are ignored.
         """
-        return bool(self._keep_distances(shapes, required).all())
-
-    def _keep_distances(self, shapes: Array, required: Array | float) -> npt.NDArray[np.bool_]:
-        """Return (N,) whether all pairs except obstacles keep their distances (P,), m."""
-        beyond, _ = self.geometry.nearest_along(shapes, required=required, most=0.0)
-        return np.asarray(beyond >= 0.0)
+        return self.geometry.keep_apart(self.geometry.poses(shapes), required)
 
     def approaches(
         self,

@@ -51,6 +51,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     PathConstraints,
     Trajectory,
 )
+from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 _WAVES_PER_JOINT = 6
 
@@ -113,6 +114,22 @@ class ManoeuvreModel:
     efforts: LimitedEfforts | None = None
     end_effectors: EndEffectorRows | None = None
     distances: DistanceLibrary | None = None
+
+    def stages(self, position: bool, drifting: bool, compiles: bool) -> Stages:
+        """Return the functions of the optimal control problem.
+
+        ``compiles``: whether they are compiled, which takes some seconds, if they are not yet.
+        """
+        stages = Stages.of(
+            self.robot,
+            self.axes,
+            position,
+            self.constraints,
+            inequality=self.efforts and self.efforts.inequality(drifting=drifting),
+            end_effectors=self.end_effectors and self.end_effectors.function,
+            drifting=drifting,
+        )
+        return replace(stages, interval=stages.interval.compiled(builds=compiles))
 
     def hold(
         self,

@@ -246,16 +246,16 @@ class MultipleShooting:
                 boundary, limits, guess, fixed=duration.fixed, drifting=self._drifting
             ),
         )
-        stats = solver.stats()
+        best, stats = self._monitor.end(), solver.stats()
         self.converged = bool(stats["success"])
-        self.feasible = self.converged or self._monitor.best is not None
+        self.feasible = self.converged or best is not None
         x = result["x"].full().ravel()
         if not self.converged:
             # If the goal drifts away, no duration compensates for the violations in each interval.
             infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
             if infeasible or not (self.feasible or lack):
                 return None
-            x = x if self._monitor.best is None else self._monitor.best
+            x = x if best is None else best
         self.lack = float(x[-1]) if layout.has_lack else 0.0
         h, (X, s, v, _) = float(x[0]), (x[each] for each in layout.knots())
         return Trajectory(h, s - h * v / 2, v, X)
@@ -330,12 +330,18 @@ class SolverMonitor(ca.Callback):
         nx, ng, np_ = (problem[name].numel() for name in ("x", "g", "p"))
         self._sizes = {"x": nx, "f": 1, "g": ng, "lam_x": nx, "lam_g": ng, "lam_p": np_}
         self._lower, self._upper = lower, upper
-        self.best: Array | None = None
+        self._best: Array | None = None
         self.construct("watch", {})
 
     def begin(self, stop: StopRule) -> None:
         """Discard the iterates of earlier solves, and set the stop conditions of the next solve."""
-        self.best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
+        self._best, self._least, self._stop, self._iterates = None, math.inf, stop, 0
+
+    def end(self) -> Array | None:
+        """Return the best feasible iterate, or None; the stop conditions are released."""
+        # They refer to the search, which refers to its solvers.
+        del self._stop
+        return self._best
 
     def get_n_in(self) -> int:
         """Return the number of values that a solver reports."""
@@ -361,14 +367,14 @@ class SolverMonitor(ca.Callback):
         if f[0] < self._least:
             worst = max((self._lower - g).max(), (g - self._upper).max())
             if worst <= _FEASIBILITY_TOLERANCE:
-                self.best, self._least = x.copy(), float(f[0])
+                self._best, self._least = x.copy(), float(f[0])
         self._iterates += 1
         self._stop.watch()
         stops = (
             # The first iterate is the guess itself.
             self._iterates > self._stop.iterations
             or self._stop.cancellation.requested
-            or self._stop.is_over(self.best is not None)
+            or self._stop.is_over(self._best is not None)
         )
         np.frombuffer(results[0])[:] = stops
         return 0

@@ -27,7 +27,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -140,7 +140,7 @@ path: with 0.3, a quadruped's plan took 1.75 instead of 1.00 s."""
 _MAX_WORK_PER_ITERATION, _WORK_FACTOR_WITHOUT_PATH = 8e4, 3.0
 """Largest work on clear paths, in Jacobian nonzeros over all solver steps, per step that
 ``optimal.iterations`` allows from one guess, and its factor if there is no clear path yet:
-8 and 25 s of an idle core (0.35 us per nonzero). With 1.25e5, two arms took 60 % more."""
+6 and 18 s of an idle core (0.25 us per nonzero). With 1.25e5, two arms took 60 % more."""
 
 _MAX_STALLED_ROUNDS, _STALLED_SHARE = 3, 0.9
 """Number of successive paths, on the way to a clear path, that still lack more than this
@@ -306,8 +306,9 @@ class ManoeuvreSearch:
 
     def __init__(self, model: ManoeuvreModel) -> None:
         self._model = model
-        self._stages = cache(self._derive_stages)
-        self._solvers = lru_cache(_KEPT_SOLVERS)(self._build_solver)
+        # No function refers to this object, so that solvers are released together with it.
+        stages = cache(model.stages)
+        self._solvers = lru_cache(_KEPT_SOLVERS)(partial(_built_solver, model, stages))
 
     def search(self, problem: SearchProblem) -> Manoeuvre:
         """Return the fastest manoeuvre found.
@@ -334,7 +335,7 @@ class ManoeuvreSearch:
         kept, knows_turn = None, len(model.axes) == 3
         if model.distances is not None and problem.keeps_clear:
             kept = model.distances.begin(problem.boundary, turn_is_known=knows_turn)
-        search = _Search(model, problem, self._solver)
+        search = _Search(model, problem, self._solvers)
         found, refusal = search.search_from_guesses(), NotFoundError
         if found is not None and kept is not None:
             found, refusal = search.keep_clear(kept, found), NoClearPathError
@@ -352,32 +353,22 @@ class ManoeuvreSearch:
             )
         return replace(found, starts=search.starts, cut_short=cut_short)
 
-    def _solver(
-        self, grid: _Grid, boundary: BoundaryConditions, pairs: tuple[int, ...]
-    ) -> MultipleShooting:
-        """Return the solver on a grid, which keeps pairs of links apart."""
-        return self._solvers(grid, boundary.center is not None, boundary.drifts, pairs)
 
-    def _build_solver(
-        self, grid: _Grid, position: bool, drifting: bool, pairs: tuple[int, ...]
-    ) -> MultipleShooting:
-        stages, distances = self._stages(position, drifting), self._model.distances
-        if pairs and distances is not None:
-            rows = PlaneDistances.of(distances.clearance.geometry, pairs)
-            stages = stages.with_distances(rows, instants_of(grid.intervals))
-        return MultipleShooting(stages, *grid)
-
-    def _derive_stages(self, position: bool, drifting: bool) -> Stages:
-        model = self._model
-        return Stages.of(
-            model.robot,
-            model.axes,
-            position,
-            model.constraints,
-            inequality=model.efforts and model.efforts.inequality(drifting=drifting),
-            end_effectors=model.end_effectors and model.end_effectors.function,
-            drifting=drifting,
-        )
+def _built_solver(
+    model: ManoeuvreModel,
+    stages_of: Callable[[bool, bool, bool], Stages],
+    position: bool,
+    drifting: bool,
+    grid: _Grid,
+    pairs: tuple[int, ...],
+) -> MultipleShooting:
+    """Return the solver on a grid, which keeps pairs of links apart."""
+    # Most of the time is spent on clear paths.
+    stages, distances = stages_of(position, drifting, bool(pairs)), model.distances
+    if pairs and distances is not None:
+        rows = PlaneDistances.of(distances.clearance.geometry, pairs)
+        stages = stages.with_distances(rows, instants_of(grid.intervals))
+    return MultipleShooting(stages, *grid)
 
 
 class _Search:
@@ -395,9 +386,10 @@ class _Search:
         self,
         model: ManoeuvreModel,
         problem: SearchProblem,
-        solver: Callable[[_Grid, BoundaryConditions, tuple[int, ...]], MultipleShooting],
+        solvers: Callable[[bool, bool, _Grid, tuple[int, ...]], MultipleShooting],
     ) -> None:
-        self._model, self._period, self._solver = model, model.control_period, solver
+        self._model, self._period, boundary = model, model.control_period, problem.boundary
+        self._solver = partial(solvers, boundary.center is not None, boundary.drifts)
         self._wheels = ReactionWheels.of(model.robot.description)
         self._wheels_stop_base = (
             len(self._wheels) > 0 and problem.boundary.is_timed and problem.motion is None
@@ -449,7 +441,7 @@ class _Search:
         boundary = self._problem.boundary
         curvature = self._model.robot.function("curvature", compile=False)
         L_0 = boundary.angular_momentum if boundary.drifts else None
-        turn = self._solver(grid, boundary, ()).turn
+        turn = self._solver(grid, ()).turn
         return InitialGuesses(turn, curvature, grid.intervals, L_0)
 
     # -- 2. coarse solutions ----------------------------------------------------------------------
@@ -821,7 +813,7 @@ class _Search:
         """
         problem, pairs = self._problem, () if kept is None else kept.pairs
         limits = limits or problem.limits
-        solver = self._solver(grid, problem.boundary, pairs)
+        solver = self._solver(grid, pairs)
         if longest is None:
             guess = guess.stretched(shortest / guess.duration)
         if kept is not None and near is not None:

@@ -90,19 +90,19 @@ class ConstraintBlock:
         name: str,
         facts: Sequence[str],
         derive: Callable[[], ConstraintBlock],
-        *,
-        repeated: bool = False,
     ) -> ConstraintBlock:
-        """Return a block from the cache, or derive it; the block depends only on ``facts``.
-
-        Derivatives are compiled if the block is ``repeated`` in a program.
-        """
+        """Return a block from the cache, or derive it; the block depends only on ``facts``."""
         key, derived = hashlib.sha256("\n".join(facts).encode()).hexdigest(), cache(derive)
         jacobian = cached_function(f"{name}_jac", key, lambda: derived().jacobian)
         hessian = cached_function(f"{name}_hess", key, lambda: derived().hessian)
-        if repeated:
-            jacobian, hessian = compiled(jacobian), compiled(hessian)
         return cls(cached_function(name, key, lambda: derived().values), jacobian, hessian)
+
+    def compiled(self, *, builds: bool = True) -> ConstraintBlock:
+        """Return the block with compiled derivatives; see :func:`.compiled`."""
+        jacobian, hessian = (
+            compiled(each, builds=builds) for each in (self.jacobian, self.hessian)
+        )
+        return replace(self, jacobian=jacobian, hessian=hessian)
 
     @classmethod
     def with_derivatives(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import casadi as ca
 import numpy as np
@@ -276,7 +276,7 @@ class Bodies:
             self._around.append(_Corridor(robot, link, grapple, begin))
         self._pairs = [(each, k) for each in self._around for k in range(len(each.required))]
         """Surroundings of each pair, and its number there."""
-        self.rows = cache(self._derived_rows)
+        self.rows = cache(partial(_derived_rows, robot, self._pairs))
         """Returns the rows of a pair with a given number."""
         self._kept: dict[int, tuple[float, npt.NDArray[np.bool_]]] = {}
         """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
@@ -289,11 +289,6 @@ class Bodies:
             each.clearance.require_shape(shape, each.required, _poses(pose))
 
     # -- rows of the program ------------------------------------------------------------------
-
-    def _derived_rows(self, number: int) -> ConstraintBlock:
-        around, pair = self._pairs[number]
-        center_of_mass = self._robot.function("center_of_mass", compile=False)
-        return pair_block(self._robot.n, around.distance_function(pair, center_of_mass))
 
     def _along(self, knots: ThrustKnots) -> Samples:
         """Return a path at the instants (N K,) at which pairs are kept apart."""
@@ -377,6 +372,14 @@ class Bodies:
         """Return a clause that describes a motion that is not clear."""
         around, _ = self._pairs[approach.pair]
         return f"no clear motion was found: {around.clause(approach)}"
+
+
+def _derived_rows(
+    robot: SpaceRobot, pairs: Sequence[tuple[_Surroundings | _Corridor, int]], number: int
+) -> ConstraintBlock:
+    around, pair = pairs[number]
+    center_of_mass = robot.function("center_of_mass", compile=False)
+    return pair_block(robot.n, around.distance_function(pair, center_of_mass))
 
 
 def _poses(pose: Array) -> BasePoses:

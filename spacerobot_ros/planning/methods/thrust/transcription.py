@@ -208,7 +208,7 @@ def thrust_stages(robot: SpaceRobot, levels: int, kind: EndKind) -> Stages:
     cached = ConstraintBlock.cached
     return (
         beginning_block(robot.n),
-        cached("thrust", facts, lambda: _interval_block(robot, levels), repeated=True),
+        cached("thrust", facts, lambda: _interval_block(robot, levels)).compiled(),
         cached("thrust_end", [*facts, str(kind)], lambda: _end_block(robot, kind)),
     )
 
@@ -357,10 +357,8 @@ class ThrustSolver:
         n, m = len(acceleration), len(propulsion.cost)
         self._layout = Layout((13 + 2 * n,), (n, m), intervals, bool(pairs))
         self._program = program = self._assembled(stages, pairs)
-        self._monitor = SolverMonitor(program.problem, program.lower, program.upper)
-        self._ipopt = cache(
-            lambda begins: build_solver("thrust", program, self._monitor, _OPTIONS[begins])
-        )
+        self._monitor = monitor = SolverMonitor(program.problem, program.lower, program.upper)
+        self._ipopt = cache(lambda each: build_solver("thrust", program, monitor, _OPTIONS[each]))
 
     def _assembled(
         self, stages: Stages, pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]]
@@ -471,11 +469,12 @@ class ThrustSolver:
         bounds = {"lbx": least, "ubx": largest, "lbg": program.lower, "ubg": program.upper}
         result = solver(**begin, **bounds, p=np.concatenate(parameters))
         x, *found = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
-        multipliers = (found[0], found[1]) if solver.stats()["success"] else None
-        if multipliers is None:
-            if self._monitor.best is None:
+        best, succeeded = self._monitor.end(), solver.stats()["success"]
+        multipliers = (found[0], found[1]) if succeeded else None
+        if not succeeded:
+            if best is None:
                 return None
-            x = self._monitor.best
+            x = best
         step, lack = float(x[0]), float(x[-1]) * layout.has_lack
         states, accelerations, levels = (x[at] for at in layout.knots())
         states = with_joints_moved(states, -step / 2)
