@@ -43,6 +43,10 @@ _MIN_LOOP_SIZE = 0.1
 
 _MAX_RANGE_SHARE = 0.85
 
+_SIZED_LOOPS = 5
+"""Number of loops, each as large as the drift during the one before requires, that give the size of
+loops of a drifting base: during smaller ones, it drifts farther than they rotate it."""
+
 _LEAST_TURN_TIME, _TURN_STRETCHES = 0.5, tuple(1.15**k for k in range(16))
 """Shortest guess with reaction wheels, s, and the factors by which other guesses are longer."""
 
@@ -90,13 +94,7 @@ class InitialGuesses:
         half = limits.joint_ranges(boundary.start)[1]
         likely = PossibleEnd(boundary.likely_final_shape, boundary.goal_rotation)
         ends = boundary.possible_ends or (likely,)
-        sizes = []
-        for end in ends:
-            (direct,) = self._build_trajectories(
-                self._direct_path(boundary.start, end.shape)[np.newaxis], limits
-            )
-            missing = attitude_error(direct.quaternions[-1], end.base_rotation)
-            sizes.append(min(1.0, self._loop_size(end.shape, half, float(np.linalg.norm(missing)))))
+        sizes = [self._size_of_loops(rng, boundary, end, limits, half) for end in ends]
         for number in itertools.count():
             around, place = divmod(number, len(ends))
             final, turn = ends[place].shape, ends[place].base_rotation
@@ -232,12 +230,36 @@ class InitialGuesses:
         shapes = np.clip(direct + half * rounds, middle - room, middle + room)
         return np.clip(shapes, limits.lower, limits.upper)
 
+    def _size_of_loops(
+        self,
+        rng: np.random.Generator,
+        boundary: BoundaryConditions,
+        end: PossibleEnd,
+        limits: MotionLimits,
+        half: Array,
+    ) -> float:
+        """Return the size, in half ranges, of loops that rotate the base by the angle by which the
+        direct path to an end misses its goal, and by the angle by which it drifts meanwhile.
+        """
+        q, direct = end.shape, self._direct_path(boundary.start, end.shape)[np.newaxis]
+        reached = self._build_trajectories(direct, limits)[0].quaternions[-1]
+        angle = float(np.linalg.norm(attitude_error(reached, end.base_rotation)))
+        size, rest = self._loop_size(q, half, angle), np.tile(q, (2, 1))
+        for _ in range(_SIZED_LOOPS if self._angular_momentum is not None else 0):
+            loop = size * _loop(rng, self._instants, len(half))[np.newaxis]
+            shapes = self._add_loops(loop, boundary.start, q, limits)
+            (looped,) = self._build_trajectories(shapes, limits)
+            drifted = self._integrate_attitudes(rest, 0.0 * rest, looped.duration)[-1]
+            drift = 2 * math.acos(min(1.0, abs(float(drifted[3]))))
+            size = self._loop_size(q, half, angle + drift)
+        return size
+
     def _loop_size(self, q: Array, half: Array, angle: float) -> float:
         """Return the size, in half ranges, of a loop that rotates the base by ``angle``."""
         n = len(q)
         K = np.abs(self._curvature(q).full()[3:]).sum(axis=0).reshape(n, n)
         largest = float((K * np.outer(half, half)).max())
-        return math.sqrt(angle / (math.pi * largest)) if largest > 0 else 1.0
+        return min(1.0, math.sqrt(angle / (math.pi * largest))) if largest > 0 else 1.0
 
     def _build_trajectories(self, shapes: Array, limits: MotionLimits) -> list[Trajectory]:
         """Return shapes (K, N + 1, n) as trajectories, as fast as the limits allow."""
