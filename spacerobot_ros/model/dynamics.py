@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from spacerobot_ros.model.composite_rigid_body import Composites, SymmetricFactor
+from spacerobot_ros.model.composite_rigid_body import Composites, SymmetricFactor, motion_forces
 from spacerobot_ros.model.kinematics import TreeKinematics
 
 
@@ -33,67 +33,20 @@ def point_jacobian(kin: TreeKinematics, link: str) -> ca.SX:
     return ca.blockcat([[ca.SX.eye(3), J_11, J_12], [ca.SX(3, 3), ca.SX.eye(3), J_22]])
 
 
-def bias(kin: TreeKinematics, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
+def bias(parts: Composites, v_cm: ca.SX, omega: ca.SX, qdot: ca.SX) -> ca.SX:
     """Return ``C+`` (6 + n,) by d'Alembert's principle: the generalised force that keeps ``z0ddot``
-    at zero.
-
-    An outward recursion yields the velocity-product accelerations, and an inward recursion sums the
-    inertia forces. Accelerations are relative to the system's centre of mass, which itself
-    accelerates by ``omega x v_cm``.
+    at zero, so that the centre of mass accelerates only by ``omega x v_cm``.
     """
-    M, qdot = kin.total_mass, kin.spread(qdot)
-    omegas, alphas, accelerations = [omega], [ca.SX(3, 1)], [ca.SX(3, 1)]
-    for k in range(1, kin.moving_body_count + 1):
-        i = kin.parent(k)
-        arm = kin.p[k] - kin.p[i]
-        rate = kin.axis[k] * qdot[k - 1]
-        acceleration = (
-            accelerations[i]
-            + ca.cross(alphas[i], arm)
-            + ca.cross(omegas[i], ca.cross(omegas[i], arm))
-        )
-        if kin.is_revolute(k):
-            omegas.append(omegas[i] + rate)
-            alphas.append(alphas[i] + ca.cross(omegas[i], rate))
-        else:
-            omegas.append(omegas[i])
-            alphas.append(alphas[i])
-            acceleration = acceleration + 2 * ca.cross(omegas[i], rate)
-        accelerations.append(acceleration)
-
-    com_accelerations = []
-    for k in range(kin.moving_body_count + 1):
-        arm = kin.com[k] - kin.p[k]
-        com_accelerations.append(
-            accelerations[k]
-            + ca.cross(alphas[k], arm)
-            + ca.cross(omegas[k], ca.cross(omegas[k], arm))
-        )
-    mean = sum((kin.mass(k) / M * a for k, a in enumerate(com_accelerations)), ca.SX(3, 1))
-
-    # Force and moment of each body about the system's centre of mass, then of its subtree.
-    forces, moments = [], []
-    for k, a in enumerate(com_accelerations):
-        force = kin.mass(k) * (a - mean)
-        spin = kin.inertia[k] @ omegas[k]
-        forces.append(force)
-        moments.append(
-            ca.cross(kin.com[k] - kin.r_BC_B, force)
-            + kin.inertia[k] @ alphas[k]
-            + ca.cross(omegas[k], spin)
-        )
-    joint_rows = [ca.SX(1, 1) for _ in range(kin.moving_body_count)]
-    for k in range(kin.moving_body_count, 0, -1):
-        if kin.is_revolute(k):
-            about_joint = moments[k] - ca.cross(kin.p[k] - kin.r_BC_B, forces[k])
-            joint_rows[k - 1] = ca.dot(kin.axis[k], about_joint)
-        else:
-            joint_rows[k - 1] = ca.dot(kin.axis[k], forces[k])
-        i = kin.parent(k)
-        forces[i] = forces[i] + forces[k]
-        moments[i] = moments[i] + moments[k]
-    rows = kin.gather(ca.vertcat(*joint_rows))
-    return ca.vertcat(M * ca.cross(omega, v_cm), moments[0], rows)
+    kin = parts.kin
+    f = motion_forces(parts, omega, qdot)
+    # There, the base origin does not accelerate, but the centre of mass does.
+    acceleration = f[0][3:] * kin.per_mass
+    along = (
+        ca.dot(S, force) - ca.dot(P[3:], acceleration)
+        for S, P, force in zip(parts.S[1:], parts.P[1:], f[1:], strict=True)
+    )
+    rows = kin.gather(ca.vertcat(*along))
+    return ca.vertcat(kin.total_mass * ca.cross(omega, v_cm), f[0][:3], rows)
 
 
 def solve_positive_definite(matrix: ca.SX, right: ca.SX) -> ca.SX:

@@ -57,15 +57,7 @@ from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
 class ModelFunctions:
-    """All functions of one robot model.
-
-    Parameters
-    ----------
-    robot
-        The robot.
-    mass_properties
-        Mass properties of the bodies as symbols; by default, they are constants.
-    """
+    """All functions of one robot model; by default, its mass properties are constants."""
 
     def __init__(
         self, robot: RobotDescription, mass_properties: SymbolicMassProperties | None = None
@@ -189,7 +181,7 @@ class ModelFunctions:
             case "connection":
                 return "q", {"result": self._connection}
             case "bias":
-                C_plus = bias(kin, x.v_cm_B, x.omega_WB_B, x.qdot)
+                C_plus = bias(parts, x.v_cm_B, x.omega_WB_B, x.qdot)
                 return "q v_cm_B omega_WB_B qdot", {"C_plus": C_plus}
             case "forward_dynamics":
                 motion = x.v_cm_B, x.omega_WB_B, x.qdot
