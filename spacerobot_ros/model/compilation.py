@@ -61,21 +61,24 @@ class BufferedFunction:
     are 1-D), allocated once. The overhead of a call is well under a microsecond.
 
     ``held`` is the constant value of the last argument, if that argument is not among ``inputs``.
+    The first ``inputs`` and ``outputs`` may be given, to share the memory of another function.
     """
 
     evaluate: Callable[[], None]
     """Computes the outputs."""
 
-    def __init__(self, function: ca.Function, held: Array | None = None) -> None:
+    def __init__(
+        self,
+        function: ca.Function,
+        held: Array | None = None,
+        inputs: Sequence[Array] = (),
+        outputs: Sequence[Array] = (),
+    ) -> None:
         self.function = function
-        self.inputs = tuple(
-            _dense_memory(function.size_in(i), function.sparsity_in(i))
-            for i in range(function.n_in())
-        )
-        self.outputs = tuple(
-            _dense_memory(function.size_out(i), function.sparsity_out(i))
-            for i in range(function.n_out())
-        )
+        arguments = (function.sparsity_in(i) for i in range(len(inputs), function.n_in()))
+        results = (function.sparsity_out(i) for i in range(len(outputs), function.n_out()))
+        self.inputs = (*inputs, *map(_dense_memory, arguments))
+        self.outputs = (*outputs, *map(_dense_memory, results))
         self._buffer, self.evaluate = function.buffer()
         for memories, setter in (
             (self.inputs, self._buffer.set_arg),
@@ -108,12 +111,12 @@ class BufferedFunction:
         return tuple(output.copy() for output in self.outputs)
 
 
-def _dense_memory(size: tuple[int, int], sparsity: ca.Sparsity) -> Array:
+def _dense_memory(sparsity: ca.Sparsity) -> Array:
     """Return zeros for an argument or a result; vectors are 1-D, matrices column-major."""
     if not sparsity.is_dense():
         raise ValueError("a buffered function has dense arguments and results")
-    memory = np.zeros(size[0] * size[1])
-    return memory if size[1] == 1 else memory.reshape(size, order="F")
+    rows, columns = sparsity.shape
+    return np.zeros(rows) if columns == 1 else np.zeros((rows, columns), order="F")
 
 
 def dense_function(
@@ -258,16 +261,7 @@ def source_hash(*names: str) -> str:
 
 def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca.Function:
     """Return an expensive function from the cache, or derive and cache it; both ways yield the same
-    function.
-
-    Parameters
-    ----------
-    name
-        Name of the function.
-    key
-        Hash of everything the function depends on.
-    build
-        Derives it.
+    function. ``key`` is a hash of everything that the function depends on.
     """
     cache = Cache(cache_directory())
     serialised = f"{name}-{key[:32]}.casadi"

@@ -9,7 +9,7 @@ works in place.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -48,6 +48,10 @@ class SpaceRobot:
     ------
     RobotDescriptionError
         The robot's inertia matrix is not positive definite.
+
+    Notes
+    -----
+    Methods for a link raise KeyError, with the names of the links, if there is no such link.
     """
 
     def __init__(self, description: RobotDescription, build: SymbolicModels | None = None) -> None:
@@ -88,11 +92,7 @@ class SpaceRobot:
         All variants of the robot with different values share their compiled functions. If the
         values are unchanged, the robot itself is returned.
 
-        Raises
-        ------
-        RobotDescriptionError
-            A value is not finite, a mass is negative, all masses are zero, or an inertia is not
-            physical.
+        Raises RobotDescriptionError; see :meth:`.InertialParameters.require_physical`.
         """
         parameters.require_physical([body.name for body in self.description.bodies])
         if np.array_equal(parameters.vector, self.inertial.vector):
@@ -129,13 +129,7 @@ class SpaceRobot:
         return self._call_function("center_of_mass", q)[0]
 
     def link_pose(self, link: str, q: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return ``(R_BL (3, 3), r_BL_B (3,))`` of a link frame relative to the base.
-
-        Raises
-        ------
-        KeyError
-            There is no such link.
-        """
+        """Return ``(R_BL (3, 3), r_BL_B (3,))`` of a link frame relative to the base."""
         index = self._model.link_index(link)
         R, r = self._call_function("link_poses", q)
         return R[:, 3 * index : 3 * index + 3], r.reshape((3, -1), order="F")[:, index]
@@ -233,11 +227,6 @@ class SpaceRobot:
         """Return ``0J+`` (6, 6 + n) for a link frame origin (paper 4, eq. 10), in the base frame.
 
         The matrix maps ``[v_cm; omega; qdot]`` to linear and angular velocity.
-
-        Raises
-        ------
-        KeyError
-            There is no such link.
         """
         self._model.link_index(link)
         return self._call_function(f"jacobian:{link}", q)[0]
@@ -247,11 +236,6 @@ class SpaceRobot:
 
         The matrix maps ``qdot`` to linear and angular velocity in the world, while the base moves
         according to the momenta (Umetani and Yoshida's generalised Jacobian).
-
-        Raises
-        ------
-        KeyError
-            There is no such link.
         """
         J = self.jacobian(link, q)
         # The centre of mass is at rest, and the base rotates at -A qdot.
@@ -333,8 +317,15 @@ class SpaceRobot:
         robot._buffers, robot._compiles = {}, False
         return robot
 
-    def composed(self, name: str, build: Callable[[Composition], ca.Function]) -> BufferedFunction:
-        """Return a buffered function that ``build`` composes from MX model functions.
+    def composed(
+        self,
+        name: str,
+        build: Callable[[Composition], ca.Function],
+        inputs: Sequence[Array] = (),
+        outputs: Sequence[Array] = (),
+    ) -> BufferedFunction:
+        """Return a buffered function that ``build`` composes from MX model functions, with the
+        memory of the first ``inputs`` and ``outputs`` as for :class:`.BufferedFunction`.
 
         The function is compiled once per name for all robots that differ only in mass properties,
         for evaluation at every tick.
@@ -343,7 +334,7 @@ class SpaceRobot:
         function = model.composed(
             name, lambda: build(Composition(model, ca.MX)), compile=self._compiles
         )
-        return BufferedFunction(function, self._p)
+        return BufferedFunction(function, self._p, inputs, outputs)
 
     def expressions(self) -> Composition:
         """Return the model functions as SX expressions, to build larger functions; see

@@ -1,16 +1,14 @@
-"""External loads on a plant, and plant ticks under these loads."""
+"""External loads on a plant."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array, Inertia, Pose, plane_normal
 from spacerobot_ros.model.external_loads import LoadLayout, mean_motion_at
 from spacerobot_ros.model.grasp import BodyMotion
@@ -23,19 +21,7 @@ _PLANE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Loads from the robot's environment, constant during a flight.
-
-    Attributes
-    ----------
-    mean_motion
-        Mean motion of the circular orbit, rad/s; zero if there is no orbit.
-    quaternion_WO
-        (4,) attitude (x, y, z, w) of the orbital frame in W at time zero.
-    gravity_W
-        (3,) uniform acceleration, m/s^2.
-    friction
-        Viscous friction force on a body divided by the body's momentum, 1/s.
-    """
+    """Loads from the robot's environment, constant during a flight, as in :class:`.LoadLayout`."""
 
     mean_motion: float = 0.0
     quaternion_WO: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
@@ -110,14 +96,7 @@ class Surroundings:
             )
 
     def require_flat(self, name: str, motion: BodyMotion, inertia: Inertia) -> None:
-        """Reject a free body that would leave the table plane.
-
-        Parameters
-        ----------
-        name
-            Name of the body.
-        motion, inertia
-            Its motion, and its mass properties in its frame.
+        """Reject a free body, with mass properties in its frame, that would leave the table plane.
 
         Raises
         ------
@@ -141,24 +120,16 @@ class Surroundings:
 class PlantLoads:
     """The loads on a robot, updated in place; initially there are no wrenches.
 
-    Parameters
-    ----------
-    robot
-        The model.
-    surroundings
-        Constant loads; None: none.
-
     Attributes
     ----------
     vector
         All values, in the order of :class:`.LoadLayout`.
     in_link, in_world
-        (L, 6) force (N) and torque (N m) at each link origin, in the order of
-        ``robot.link_names``; one array is in link components, the other in W.
+        Its wrenches (L, 6), in the order of ``robot.link_names``.
     last
         ``vector`` of the last tick.
     surroundings
-        The constant loads.
+        The constant loads; by default none.
     """
 
     def __init__(self, robot: SpaceRobot, surroundings: Surroundings | None = None) -> None:
@@ -197,40 +168,3 @@ class PlantLoads:
     @time.setter
     def time(self, seconds: float) -> None:
         self._time[0] = seconds
-
-
-class LoadedTick:
-    """A tick with loads that uses the buffers of the tick without loads.
-
-    Parameters
-    ----------
-    plain
-        The tick without loads, whose inputs and outputs are read and written.
-    loaded
-        The tick with loads: its last input is the load vector; it may have additional outputs.
-    loads
-        The loads.
-    further
-        Arrays for the additional outputs.
-    """
-
-    def __init__(
-        self,
-        plain: BufferedFunction,
-        loaded: BufferedFunction,
-        loads: PlantLoads,
-        further: Sequence[Array] = (),
-    ) -> None:
-        self._loaded, self._loads = loaded, loads
-        *inputs, self._vector = loaded.inputs
-        self._inputs = list(zip(inputs, plain.inputs, strict=True))
-        self._outputs = list(zip([*plain.outputs, *further], loaded.outputs, strict=True))
-
-    def evaluate(self) -> None:
-        """Evaluate the outputs for the current inputs."""
-        for to, given in self._inputs:
-            to[...] = given
-        self._vector[:] = self._loads.vector
-        self._loaded.evaluate()
-        for to, result in self._outputs:
-            to[...] = result

@@ -19,7 +19,7 @@ from spacerobot_ros.model.integration import count_steps
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.loads import LoadedTick, PlantLoads
+from spacerobot_ros.simulation.loads import PlantLoads
 
 Counts = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
@@ -74,7 +74,15 @@ class Plant(Protocol):
 
     @property
     def step(self) -> Callable[..., bool]:
-        """Advance one tick under the plant's commands; return whether a joint was limited."""
+        """Advance one tick under the plant's commands; return whether a joint was limited.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the plant does not advance.
+        SpaceRobotError
+            The motion is no longer finite; only a plant in MuJoCo has advanced.
+        """
 
 
 class WrappedPlant:
@@ -148,7 +156,7 @@ class CompiledPlant(ABC):
         self.initial = initial or InitialState()
         self._substeps = count_steps(control_period, step)
         self._advance = self._composed()
-        self._tick: BufferedFunction | LoadedTick = self._advance
+        self._tick = self._advance
         self.limit_counts = {each: np.zeros(robot.n, dtype=np.int64) for each in self.limits}
         self._bind(self._advance.inputs, self._advance.outputs)
         self.reset()
@@ -169,16 +177,21 @@ class CompiledPlant(ABC):
     def reset(self) -> None:
         """Return to the initial state; the limit counts are kept."""
 
-    def _composed(self, prefix: str = "") -> BufferedFunction:
+    def _composed(
+        self, prefix: str = "", inputs: Sequence[Array] = (), outputs: Sequence[Array] = ()
+    ) -> BufferedFunction:
         robot, substeps = self.robot, self._substeps
         return robot.composed(
             f"{prefix}{self.actuation}_tick_{substeps}",
             lambda model: self.tick_function(robot, model, substeps, loaded=bool(prefix)),
+            inputs,
+            outputs,
         )
 
-    def _use_loads(self, loads: PlantLoads, *further: Array) -> None:
-        """Apply loads from now on; ``further`` are arrays for additional outputs of the tick."""
-        self._tick = LoadedTick(self._advance, self._composed("loaded_"), loads, further)
+    def _use_loads(self, loads: PlantLoads) -> None:
+        """Apply loads from now on, by a tick in the memory of the tick without loads."""
+        plain = self._advance
+        self._tick = self._composed("loaded_", [*plain.inputs, loads.vector], plain.outputs)
 
     def _update_outputs(self) -> None:
         """Compute all outputs of the current state, by a tick of zero duration."""
@@ -219,7 +232,9 @@ class InitialState:
     Raises
     ------
     ParameterError
-        Both ``position`` and ``center_of_mass`` are set.
+        Both ``position`` and ``center_of_mass`` are set. The methods raise it if the quaternion is
+        zero, a value is not finite, the number of joint values is wrong, or a joint position
+        violates its limits.
     """
 
     position: Array = field(default_factory=lambda: np.zeros(3))
@@ -232,13 +247,7 @@ class InitialState:
 
     @classmethod
     def of(cls, config: PlantConfig) -> InitialState:
-        """Return the configured initial state; empty lists select defaults.
-
-        Raises
-        ------
-        ParameterError
-            The position is specified twice.
-        """
+        """Return the configured initial state; empty lists select defaults."""
         return cls(
             position=np.array(config.initial_position or (0.0, 0.0, 0.0)),
             quaternion=np.array(config.initial_orientation or (0.0, 0.0, 0.0, 1.0)),
@@ -264,39 +273,21 @@ class InitialState:
             )
 
     def attitude(self) -> Array:
-        """Return the unit quaternion (x, y, z, w) of the base attitude.
-
-        Raises
-        ------
-        ParameterError
-            The quaternion is zero or not finite.
-        """
+        """Return the unit quaternion (x, y, z, w) of the base attitude."""
         try:
             return unit_quaternion(self.quaternion)
         except ValueError as error:
             raise ParameterError(f"The initial orientation is refused: {error}.") from None
 
     def momenta(self) -> Array:
-        """Return linear and angular momentum (6,).
-
-        Raises
-        ------
-        ParameterError
-            A momentum is not finite.
-        """
+        """Return linear and angular momentum (6,)."""
         momenta = np.concatenate([self.linear_momentum, self.angular_momentum])
         if not np.all(np.isfinite(momenta)):
             raise ParameterError("The initial momenta must be finite.")
         return momenta
 
     def shape(self, robot: SpaceRobot) -> Array:
-        """Return the joint positions (n,).
-
-        Raises
-        ------
-        ParameterError
-            The number of joints is wrong, or a position violates its limits.
-        """
+        """Return the joint positions (n,)."""
         if self.joint_positions is None:
             return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
         q = _require_joint_values(robot, self.joint_positions, "positions")
@@ -311,25 +302,13 @@ class InitialState:
         return q
 
     def rates(self, robot: SpaceRobot) -> Array:
-        """Return the joint velocities (n,).
-
-        Raises
-        ------
-        ParameterError
-            The number of joints is wrong, or a velocity is not finite.
-        """
+        """Return the joint velocities (n,)."""
         if self.joint_velocities is None:
             return np.zeros(robot.n)
         return _require_joint_values(robot, self.joint_velocities, "velocities")
 
     def system_position(self, robot: SpaceRobot) -> Array:
-        """Return the position of the system's centre of mass in W (3,), m.
-
-        Raises
-        ------
-        ParameterError
-            The position is not finite, or the configuration or the orientation is invalid.
-        """
+        """Return the position of the system's centre of mass in W (3,), m."""
         if self.center_of_mass is not None:
             r_WC_W = np.asarray(self.center_of_mass, dtype=float)
         else:

@@ -53,6 +53,7 @@ class VelocityPlant(CompiledPlant):
         self.effort, self.momentum, self.link_R, self.link_r = outputs[4:8]
         self._limited, self._next_r_cm = outputs[8:]
         self.q = self._next_state[: self.robot.n]
+        self._next_momenta: Array | None = None
         self._held: Flags | None = None
 
     def reset(self) -> None:
@@ -76,7 +77,8 @@ class VelocityPlant(CompiledPlant):
 
     def load(self, loads: PlantLoads) -> None:
         """Apply external loads; their values may change before each step."""
-        self._use_loads(loads, self.expected_momenta)
+        self._use_loads(loads)
+        self._next_momenta = self._tick.outputs[-1]
 
     def step(self, command: Array) -> bool:
         """Advance one tick under the joint velocities ``command`` (n,), clipped to their limits.
@@ -91,6 +93,8 @@ class VelocityPlant(CompiledPlant):
             self._command[self._held] = 0.0
         self._tick.evaluate()
         self._r_cm[:] = self._next_r_cm
+        if self._next_momenta is not None:
+            self.expected_momenta[:] = self._next_momenta
         if self._limited[0] == 0.0:
             return False
         by_rate, by_stroke = self._limited[1:].reshape(2, -1) != 0.0
