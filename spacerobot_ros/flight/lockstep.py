@@ -367,7 +367,7 @@ class LockstepFlight:
             self._commands.rest()
             self._report_plant_status(PlantState.FAILED)
             return False
-        if self._plant.capturing is not None and self._plant.capturing.reports:
+        if self._plant.capturing is not None and self._plant.capturing.events:
             self._report_plant_status(PlantState.RUNNING)
         self._tick += 1
         return True

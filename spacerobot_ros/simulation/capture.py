@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -178,99 +177,11 @@ class Target:
         )
 
 
-@dataclass(frozen=True)
-class CaptureReport:
-    """A capture: the impact, and the momenta and motion after it.
-
-    Attributes
-    ----------
-    impact
-        The impact.
-    R_WB
-        Base link attitude (3, 3).
-    momenta
-        Linear and angular momentum (6,) of the robot and the target, about their common centre of
-        mass, in W.
-    residual
-        Relative difference between the total momenta and the sum over the joined bodies after the
-        impact.
-    requested
-        Whether the capture was requested rather than automatic.
-    joint_names, joint_impulse_limit
-        The joints, and the largest permissible joint impulse, N m s or N s; 0: no limit.
-    """
-
-    impact: GraspImpact
-    R_WB: Array
-    momenta: Array
-    residual: float
-    requested: bool
-    joint_names: tuple[str, ...] = ()
-    joint_impulse_limit: float = 0.0
-
-    def to_values(self) -> dict[str, Any]:
-        """Return the ``capture`` object printed by ``spacerobot run --json``; vectors are in W."""
-        impact = self.impact
-        return {
-            "captured": True,
-            "requested": self.requested,
-            "base_velocity_mps": (self.R_WB @ impact.twist[:3]).tolist(),
-            "base_rate_radps": (self.R_WB @ impact.twist[3:]).tolist(),
-            "joint_rates_radps": impact.qdot.tolist(),
-            "impulse_Ns": impact.impulse.tolist(),
-            "joint_impulses_Nms": impact.joint_impulses.tolist(),
-            "joint_impulse_limit_Nms": self.joint_impulse_limit,
-            "energy_before_J": impact.energy_before,
-            "energy_lost_J": impact.energy_lost,
-            "linear_momentum_kgmps": self.momenta[:3].tolist(),
-            "angular_momentum_Nms": self.momenta[3:].tolist(),
-            "total_momentum_residual": self.residual,
-        }
-
-    def event(self, time_s: float) -> Event:
-        """Return the capture event, which is a warning if a joint impulse exceeds the limit of its
-        joint."""
-        impact, limit = self.impact, self.joint_impulse_limit
-        force, moment = np.linalg.norm(impact.impulse[:3]), np.linalg.norm(impact.impulse[3:])
-        message = (
-            f"The target is captured by an impulse of {force:.4g} N s and {moment:.4g} N m s; "
-            f"{impact.energy_lost:.4g} J of {impact.energy_before:.4g} J are lost"
-        )
-        worst = int(np.argmax(np.abs(impact.joint_impulses))) if self.joint_names else -1
-        exceeded = worst >= 0 and 0.0 < limit < abs(impact.joint_impulses[worst])
-        if exceeded:
-            message += (
-                f", and joint '{self.joint_names[worst]}' takes "
-                f"{abs(impact.joint_impulses[worst]):.4g} N m s, more than "
-                f"'capture.joint_impulse_limit', {limit:g}"
-            )
-        about = {name: json.dumps(value) for name, value in self.to_values().items()}
-        return Event(EventKind.CAPTURED, f"{message}.", int(exceeded), time_s, about=about)
-
-
-@dataclass(frozen=True)
-class ReleaseReport:
-    """Target velocity (3,), m/s, and angular rate (3,), rad/s, in W at the release."""
-
-    velocity: Array
-    rate: Array
-
-    def event(self, time_s: float) -> Event:
-        """Return the release event."""
-        about = {
-            "velocity_mps": json.dumps(self.velocity.tolist()),
-            "rate_radps": json.dumps(self.rate.tolist()),
-        }
-        speed, rate = np.linalg.norm(self.velocity), np.linalg.norm(self.rate)
-        message = f"The target is released; it moves at {speed:.4g} m/s and {rate:.4g} rad/s."
-        return Event(EventKind.RELEASED, message, 0, time_s, about=about)
-
-
 def capture_values(about: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values of :meth:`CaptureReport.to_values` from a capture event; empty for other
-    events.
+    """Return the object ``capture`` that ``spacerobot run --json`` prints, from a capture event;
+    empty for other events.
 
-    Numbers are restored exactly.
+    Vectors are in W; numbers are restored exactly.
     """
     try:
         return {name: json.loads(text) for name, text in about.items()}
@@ -294,8 +205,8 @@ class CapturePlant(WrappedPlant):
         (6,) linear (m/s) and angular velocity (rad/s) of the root link, in its frame.
     payload
         The held target; None if the target floats freely.
-    reports
-        Captures and releases since the list was last cleared.
+    events
+        Captures and releases since the list was last cleared, without their times.
 
     Parameters
     ----------
@@ -335,7 +246,7 @@ class CapturePlant(WrappedPlant):
         self.expected_momenta = self.expected_momenta.copy()
         self.target_pose, self.target_twist = target.pose.copy(), target.twist.copy()
         self.payload: Payload | None = None
-        self.reports: list[CaptureReport | ReleaseReport] = []
+        self.events: list[Event] = []
         self._held_joints: Flags = np.zeros(robot.n, dtype=np.bool_)
         self._loads: PlantLoads | None = None
         self._changed: RobotMotion | None = None
@@ -455,8 +366,9 @@ class CapturePlant(WrappedPlant):
         end_effector = frame_motion(self.robot, self.link, self._motion())
         return RelativeMotion.between(end_effector, self._body().at(self.target.grapple))
 
-    def capture(self) -> CaptureReport:
-        """Capture the target; the next tick starts from the motion after the impact.
+    def capture(self) -> Event:
+        """Capture the target and return the event; the next tick starts from the motion after the
+        impact.
 
         Raises
         ------
@@ -473,8 +385,8 @@ class CapturePlant(WrappedPlant):
             raise CommandError(f"The target cannot be captured: its {'; its '.join(misses)}.")
         return self._capture(requested=True)
 
-    def release(self) -> ReleaseReport:
-        """Release the target, which keeps its velocity.
+    def release(self) -> Event:
+        """Release the target, which keeps its velocity, and return the event.
 
         Raises
         ------
@@ -495,11 +407,36 @@ class CapturePlant(WrappedPlant):
         self._continue(robot, motion, momenta)
         # An automatic capture waits until the target has left.
         self.payload, self._ready = None, False
-        report = ReleaseReport(body.v, body.omega)
-        self.reports.append(report)
-        return report
+        speed, rate = np.linalg.norm(body.v), np.linalg.norm(body.omega)
+        message = f"The target is released; it moves at {speed:.4g} m/s and {rate:.4g} rad/s."
+        vectors = {"velocity_mps": body.v.tolist(), "rate_radps": body.omega.tolist()}
+        return self._report(EventKind.RELEASED, message, 0, vectors)
 
-    def _capture(self, *, requested: bool) -> CaptureReport:
+    def _describe(self, impact: GraspImpact) -> tuple[str, int]:
+        """Return the message about an impact, and its level: a warning if a joint impulse exceeds
+        its limit."""
+        limit, impulses = self._config.joint_impulse_limit, np.abs(impact.joint_impulses)
+        force, moment = np.linalg.norm(impact.impulse[:3]), np.linalg.norm(impact.impulse[3:])
+        message = (
+            f"The target is captured by an impulse of {force:.4g} N s and {moment:.4g} N m s; "
+            f"{impact.energy_lost:.4g} J of {impact.energy_before:.4g} J are lost"
+        )
+        if not 0.0 < limit < impulses.max(initial=0.0):
+            return f"{message}.", 0
+        worst = int(impulses.argmax())
+        return (
+            f"{message}, and joint '{self.robot.joint_names[worst]}' takes {impulses[worst]:.4g} "
+            f"N m s, more than 'capture.joint_impulse_limit', {limit:g}."
+        ), 1
+
+    def _report(
+        self, kind: EventKind, message: str, level: int, values: Mapping[str, Any]
+    ) -> Event:
+        about = {name: json.dumps(value) for name, value in values.items()}
+        self.events.append(Event(kind, message, level, about=about))
+        return self.events[-1]
+
+    def _capture(self, *, requested: bool) -> Event:
         robot, motion, body = self._alone.robot, self._motion(), self._body()
         inertia = self.target.inertia
         impact = grasp_impact(robot, self.link, motion, body, inertia)
@@ -514,17 +451,25 @@ class CapturePlant(WrappedPlant):
         after = RobotMotion(motion.pose, impact.twist, motion.q, impact.qdot)
         self._continue(joined, after, momenta)
         self.payload, self._grasp = payload, grasp
-        report = CaptureReport(
-            impact,
-            motion.R_WB,
-            momenta,
-            _relative_difference(_summed_momenta(joined, after), momenta),
-            requested,
-            tuple(robot.joint_names),
-            self._config.joint_impulse_limit,
-        )
-        self.reports.append(report)
-        return report
+        values = {
+            "captured": True,
+            "requested": requested,
+            "base_velocity_mps": (motion.R_WB @ impact.twist[:3]).tolist(),
+            "base_rate_radps": (motion.R_WB @ impact.twist[3:]).tolist(),
+            "joint_rates_radps": impact.qdot.tolist(),
+            "impulse_Ns": impact.impulse.tolist(),
+            "joint_impulses_Nms": impact.joint_impulses.tolist(),
+            "joint_impulse_limit_Nms": self._config.joint_impulse_limit,
+            "energy_before_J": impact.energy_before,
+            "energy_lost_J": impact.energy_lost,
+            "linear_momentum_kgmps": momenta[:3].tolist(),
+            "angular_momentum_Nms": momenta[3:].tolist(),
+            # Between the total momenta and the sum over the joined bodies after the impact.
+            "total_momentum_residual": _relative_difference(
+                _summed_momenta(joined, after), momenta
+            ),
+        }
+        return self._report(EventKind.CAPTURED, *self._describe(impact), values)
 
     def _continue(self, robot: SpaceRobot, motion: RobotMotion, momenta: Array) -> None:
         q = np.clip(motion.q, robot.lower, robot.upper)

@@ -183,25 +183,15 @@ class PlantMonitor:
         self._commands, self._plant, self._config = commands, plant, config
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
-        """Update the status.
+        """Update the status at a simulated time (s), and return the events since the last update.
 
-        Parameters
-        ----------
-        activity
-            Plant activity: inactive, running, paused or failed.
-        time_s
-            Simulated time, s.
-
-        Returns
-        -------
-        list[Event]
-            Events since the last update; empty if the status is unchanged.
+        The plant's ``activity`` is inactive, running, paused or failed.
         """
         before, commands, capturing = self.status, self._commands, self._plant.capturing
         captures, payload = [], ""
         if capturing is not None:
-            captures = [report.event(time_s) for report in capturing.reports]
-            capturing.reports.clear()
+            captures = [replace(event, time_s=time_s) for event in capturing.events]
+            capturing.events.clear()
             payload = "" if capturing.payload is None else capturing.payload.to_text()
         now = replace(
             self._status(activity),

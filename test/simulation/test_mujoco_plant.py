@@ -23,6 +23,7 @@ from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
+from spacerobot_ros.simulation.capture import capture_values
 from spacerobot_ros.simulation.config import PlantConfig
 
 pytest.importorskip("mujoco")
@@ -180,8 +181,8 @@ def test_a_grasp_is_a_weld_and_a_release_ends_it() -> None:
     np.testing.assert_allclose(before, total_momentum(exact), rtol=1e-12)
     for flown in (ours, exact):
         flown.step(np.zeros(3), np.zeros(6))
-        report = capturing_of(flown).capture()
-        assert report.requested
+        event = capturing_of(flown).capture()
+        assert capture_values(event.about)["requested"]
     joints = np.array([1.0, -2.0, 0.5])
     for _ in range(20):
         for flown in (ours, exact):

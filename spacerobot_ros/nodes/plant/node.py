@@ -27,6 +27,7 @@ from spacerobot_ros.errors import (
     SpaceRobotError,
     printable,
 )
+from spacerobot_ros.events import Event
 from spacerobot_ros.messages.builders import RobotMarkers
 from spacerobot_ros.messages.readers import CommandReader, actuation_of
 from spacerobot_ros.messages.statuses import StatusRecord
@@ -46,7 +47,7 @@ from spacerobot_ros.nodes.plant.publisher import (
 )
 from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
-from spacerobot_ros.simulation.capture import CapturePlant, CaptureReport, ReleaseReport
+from spacerobot_ros.simulation.capture import CapturePlant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.sensors import ReportedState
@@ -394,7 +395,7 @@ class PlantNode(FlightNode):
             raise SpaceRobotError(f"The plant stops at {time:g} s: {error}") from error
         if limited:
             self._report.limited()
-        if self._capturing is not None and self._capturing.reports:
+        if self._capturing is not None and self._capturing.events:
             # Commanders must know about the other robot before they answer its states.
             self._publish_changed_status()
         self.tick += 1
@@ -585,7 +586,7 @@ class PlantNode(FlightNode):
         self._publish_changed_status()
         return f"Commands are accepted again after: {fault}."
 
-    def _grasp(self, act: Callable[[CapturePlant], CaptureReport | ReleaseReport]) -> str:
+    def _grasp(self, act: Callable[[CapturePlant], Event]) -> str:
         """Capture or release the target; it takes effect in the next tick."""
         if self._capturing is None:
             raise CommandError("There is no target: set parameter 'target.robot' to its URDF.")
@@ -593,9 +594,9 @@ class PlantNode(FlightNode):
             raise CommandError(f"The plant is {self._active.value}: nothing moves.")
         if self.commands.fault:
             raise CommandError(f"A fault is latched: {self.commands.fault}; rearm the plant first.")
-        report = act(self._capturing)
+        event = act(self._capturing)
         self._publish_changed_status()
-        return report.event(self.time_ns / SECOND).message
+        return event.message
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._when_active = PlantState.PAUSED if request.data else PlantState.RUNNING
