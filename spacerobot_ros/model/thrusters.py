@@ -136,15 +136,8 @@ class ThrusterTable:
 
 
 def find_thrusters(source: str, robot: RobotDescription) -> ThrusterTable:
-    """Return the table from :data:`IN_URDF` or from a YAML file.
-
-    Raises
-    ------
-    ParameterError
-        The file or a thruster in it is invalid.
-    RobotDescriptionError
-        A thruster in the URDF is invalid, or the URDF has no thrusters.
-    """
+    """Return the table from :data:`IN_URDF` (:func:`thrusters_of_urdf`) or from a YAML file
+    (:func:`load_thrusters`)."""
     return thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
 
 
@@ -435,8 +428,6 @@ class ThrusterModulator:
         """Whether a pulse of each thruster (m,) began in the last period."""
         self.pulses = np.zeros(count, dtype=np.int64)
         """Number of pulses of each thruster (m,) so far."""
-        self.on_time = np.zeros(count)
-        """Total commanded on-time of each thruster (m,), s."""
         self.reset()
 
     @property
@@ -445,18 +436,10 @@ class ThrusterModulator:
         all."""
         return self._missing(self._excluded)
 
-    @property
-    def propellant(self) -> float:
-        """Propellant used by the commanded on-times, kg."""
-        return float(self.table.mass_flow @ self.on_time)
-
     def exclude(self, name: str) -> None:
         """Stop using a (broken) thruster; the other thrusters produce the wrench if possible.
 
-        Raises
-        ------
-        ParameterError
-            There is no thruster with that name.
+        Raises ParameterError; see :meth:`ThrusterTable.index`.
         """
         self.allocation.exclude(self.table.index(name))
         self._excluded += (name,)
@@ -466,9 +449,8 @@ class ThrusterModulator:
         self.pending_impulse = np.zeros(6)
         """Desired impulse (6,) that has not been fired yet, N s, N m s."""
         self._remaining[:] = 0.0
-        self._open[:] = False
+        self._open[:] = self.begun[:] = False
         self.unmet[:] = 0.0
-        self.begun[:] = False
 
     def fire(self, wrench: Array) -> Array:
         """Return the on-time of each thruster (m,) in the next period, s.
@@ -483,7 +465,6 @@ class ThrusterModulator:
         on_time, added = self._pulses(shares.levels)
         self.pending_impulse = shares.achieved - self._wrenches @ added
         self.pulses += self.begun
-        self.on_time += on_time
         return on_time
 
     def _pulses(self, levels: Array) -> tuple[Array, Array]:

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy.typing as npt
 from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.thrusters import ThrusterModulator, ThrusterTable, find_thrusters
+from spacerobot_ros.model.thrusters import ThrusterModulator, find_thrusters
 from spacerobot_ros.simulation.capture import CapturePlant, Target, load_target
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.effort_plant import EffortPlant
@@ -68,34 +67,18 @@ class ThrusterPlant(WrappedPlant):
         Factors (6,) by which the thruster wrench is multiplied, and wrench (6,) added to the
         product; None if there is no fault. The modulation ignores it.
 
-    Parameters
-    ----------
-    plant
-        The wrapped plant, stepped with efforts and a wrench.
-    control_period
-        Duration of a tick, s.
-    table
-        The thrusters.
-    excluded
-        Names of disabled thrusters.
-
     Raises
     ------
     ParameterError
-        There is no thruster with the name of an excluded thruster.
+        A thruster is invalid, or a disabled thruster does not exist.
     """
 
-    def __init__(
-        self,
-        plant: Plant,
-        control_period: float,
-        table: ThrusterTable,
-        excluded: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, plant: Plant, config: PlantConfig) -> None:
         super().__init__(plant)
-        self.table = table
-        self._control_period = control_period
-        self.modulator = ThrusterModulator(table, control_period, excluded)
+        self.table = table = find_thrusters(config.thrusters, plant.robot.description)
+        self._control_period = config.control_period
+        disabled = config.thrusters_excluded.split()
+        self.modulator = ThrusterModulator(table, config.control_period, disabled)
         self._wrenches, self._mass_flow = table.wrenches, table.mass_flow
         count = len(table.names)
         self.wrench = np.zeros(6)
@@ -115,13 +98,6 @@ class ThrusterPlant(WrappedPlant):
         """Advance one tick under joint efforts (n,) and a commanded base wrench (6,).
 
         Returns whether any joint was limited.
-
-        Raises
-        ------
-        CommandError
-            A command is not finite; the plant does not advance.
-        SpaceRobotError
-            The wrapped plant cannot advance.
         """
         wanted = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
         for command in (effort, wanted):
@@ -153,22 +129,7 @@ class PlantWithFaults(WrappedPlant):
     stuck joint is held in place (:meth:`Plant.hold`). Wrench faults act on the commanded wrench, or
     on the thrusters' wrench if thrusters are modelled.
 
-    Parameters
-    ----------
-    plant
-        The wrapped plant.
-    faults
-        The faults, one per line (:func:`.parse_fault`).
-    control_period
-        Duration of a tick, s.
-    wrench
-        Whether the plant accepts a wrench on its base.
-    seed
-        Seed of the actuator noise.
-    disturbances
-        The disturbances, one per line (:func:`.parse_disturbance`).
-    surroundings
-        Orbit or table loads, which act during the whole flight; None: none.
+    The orbit or table loads of the ``surroundings`` act during the whole flight.
 
     Raises
     ------
@@ -177,15 +138,7 @@ class PlantWithFaults(WrappedPlant):
     """
 
     def __init__(
-        self,
-        plant: Plant,
-        faults: Iterable[str],
-        control_period: float,
-        *,
-        wrench: bool,
-        seed: int = 0,
-        disturbances: Iterable[str] = (),
-        surroundings: Surroundings | None = None,
+        self, plant: Plant, config: PlantConfig, surroundings: Surroundings | None = None
     ) -> None:
         super().__init__(plant)
         self.thrusters = plant if isinstance(plant, ThrusterPlant) else None
@@ -194,15 +147,15 @@ class PlantWithFaults(WrappedPlant):
         self.capturing = inner if isinstance(inner, CapturePlant) else None
         """The plant that captures the target; None if there is no target."""
         nozzles = self.thrusters.table.names if self.thrusters is not None else ()
-        targets = FaultTargets(plant.robot.joint_names, wrench, nozzles)
-        self.timeline = Timeline(faults, lambda line, now: parse_fault(line, targets, now))
-        self.takes_wrench = wrench
+        self.takes_wrench = PLANTS[config.actuation].takes_wrench
         """Whether a step accepts a base wrench in addition to the joint commands."""
+        targets = FaultTargets(plant.robot.joint_names, self.takes_wrench, nozzles)
+        self.timeline = Timeline(config.faults, lambda line, now: parse_fault(line, targets, now))
         self.tick = 0
         """Ticks since the beginning."""
-        self._control_period = control_period
+        self._control_period = config.control_period
         # The random stream differs from the sensors' stream, which has the seed itself.
-        self._rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
+        self._rng = np.random.default_rng(np.random.SeedSequence(config.sensors.seed).spawn(1)[0])
         self._index = {name: i for i, name in enumerate(self.robot.joint_names)}
         n = self.robot.n
         self._bias, self._noise, self._factor = np.zeros(n), np.zeros(n), np.ones(n)
@@ -217,7 +170,8 @@ class PlantWithFaults(WrappedPlant):
         self.loads: PlantLoads | None = None
         """External loads; None if no load has acted so far."""
         self._disturbances = Timeline(
-            disturbances, lambda line, now: parse_disturbance(line, plant.robot.link_names, now)
+            config.disturbances,
+            lambda line, now: parse_disturbance(line, plant.robot.link_names, now),
         )
         self._surroundings = surroundings or Surroundings()
         self._update_active()
@@ -233,24 +187,12 @@ class PlantWithFaults(WrappedPlant):
         self._update_active()
 
     def inject(self, text: str) -> None:
-        """Add faults, one per line, while the plant runs; ``clear`` removes all faults.
-
-        Raises
-        ------
-        ParameterError
-            A line is not a valid fault for this robot; none of the lines is added.
-        """
+        """Add faults while the plant runs; see :meth:`.Timeline.inject`."""
         self.timeline.inject(text, self.time)
         self._update_active()
 
     def disturb(self, text: str) -> None:
-        """Add disturbances, one per line, while the plant runs; ``clear`` removes them all.
-
-        Raises
-        ------
-        ParameterError
-            A line is not a valid disturbance for this robot; none of the lines is added.
-        """
+        """Add disturbances while the plant runs; see :meth:`.Timeline.inject`."""
         self._disturbances.inject(text, self.time)
         self._update_active()
 
@@ -359,16 +301,8 @@ PLANTS: dict[str, type[VelocityPlant | EffortPlant]] = {
 def build_plant(
     robot: SpaceRobot, config: PlantConfig, initial: InitialState | None = None
 ) -> PlantWithFaults:
-    """Build a plant from its configuration, including thrusters and faults.
-
-    Parameters
-    ----------
-    robot
-        The model.
-    config
-        The plant parameters.
-    initial
-        Initial state, if it differs from the one in the configuration.
+    """Build a plant from its configuration, including thrusters and faults; ``initial`` is the
+    initial state, if it differs from the one in the configuration.
 
     Raises
     ------
@@ -428,14 +362,5 @@ def build_plant(
             target = Target(description, config.target, control_period, step, robot)
             plant = CapturePlant(dynamics, robot, start, target, config)
     if config.thrusters:
-        table = find_thrusters(config.thrusters, robot.description)
-        plant = ThrusterPlant(plant, control_period, table, config.thrusters_excluded.split())
-    return PlantWithFaults(
-        plant,
-        config.faults,
-        control_period,
-        wrench=kind.takes_wrench,
-        seed=config.sensors.seed,
-        disturbances=config.disturbances,
-        surroundings=surroundings,
-    )
+        plant = ThrusterPlant(plant, config)
+    return PlantWithFaults(plant, config, surroundings)

@@ -48,16 +48,8 @@ _OBSTACLE = "obstacle"
 
 @dataclass(frozen=True)
 class ClearanceStatus:
-    """The smallest distance between two links at one time, as published on ``clearance``.
-
-    Attributes
-    ----------
-    distance
-        m; if the links touch, the negative contact depth.
-    links
-        The two links.
-    time_s
-        Simulated time, s.
+    """The smallest distance between two links at one simulated time, as published on ``clearance``;
+    m, or, if the links touch, the negative contact depth.
     """
 
     distance: float
@@ -176,16 +168,11 @@ class ClearanceMonitor:
     def measure(
         self, link_R: Array, link_r: Array, pose: Array, time_s: float
     ) -> tuple[ClearanceStatus, list[Event]]:
-        """Return the clearance, and an event for each contact that began or ended.
+        """Return the clearance at a simulated time, s, and an event for each contact that began or
+        ended.
 
-        Parameters
-        ----------
-        link_R, link_r
-            Attitudes (3, 3 L) and positions (3, L), m, of the links in B.
-        pose
-            (7,) position, m, and quaternion (x, y, z, w) of the base in W.
-        time_s
-            Simulated time, s.
+        The attitudes (3, 3 L) and positions (3, L), m, of the links are in B; ``pose`` (7,) is that
+        of the base in W.
         """
         R = link_R.reshape(1, 3, -1, 3).swapaxes(1, 2)[:, self._order]
         links = R, link_r.reshape(3, -1).T[np.newaxis, self._order]

@@ -117,16 +117,9 @@ class FaultTargets:
 
 
 def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
-    """Parse a fault line.
+    """Parse a fault line (see the module docstring) for a plant with these targets.
 
-    Parameters
-    ----------
-    line
-        The line; see the module docstring.
-    targets
-        Targets of this plant.
-    now
-        Start time of the fault if the line specifies none, s.
+    A fault without a start time begins at ``now`` (s).
 
     Raises
     ------
@@ -216,16 +209,9 @@ class Disturbance:
 
 
 def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Disturbance:
-    """Parse a disturbance line.
+    """Parse a disturbance line (see the module docstring) for a robot with these links.
 
-    Parameters
-    ----------
-    line
-        The line; see the module docstring.
-    links
-        Link names of the robot.
-    now
-        Start time of the disturbance if the line specifies none, s.
+    A disturbance without a start time begins at ``now`` (s).
 
     Raises
     ------
@@ -286,16 +272,8 @@ def parse_times(
 ) -> tuple[float, float]:
     """Return the start and end (s) from the last words of a line, ``[at SECONDS] [until SECONDS]``.
 
-    Parameters
-    ----------
-    words
-        The words.
-    before
-        The preceding part of the line, for messages.
-    now
-        Start time if the words specify none, s.
-    refusal
-        Function that returns the error for the line.
+    ``before`` is the preceding part of the line, for messages; ``now`` is the start time (s) if the
+    words specify none.
 
     Raises
     ------
@@ -383,10 +361,7 @@ class Timeline(Generic[Entry]):
         """Add the entries in a string, one per line, or remove all entries (``clear``), including
         future entries.
 
-        Raises
-        ------
-        ParameterError
-            As for :meth:`read`.
+        Raises ParameterError; see :meth:`read`.
         """
         if text.strip() == "clear":
             self.entries.clear()

@@ -17,7 +17,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.capture import CapturePlant
-from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
+from spacerobot_ros.simulation.config import PlantConfig, TargetSensorConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
 from spacerobot_ros.topics import Topic, pose_topic, state_topics
 
@@ -77,30 +77,21 @@ class Sensors:
 
     When a delay begins, pose and twist are frozen until the delay has elapsed.
 
-    Parameters
-    ----------
-    plant
-        The measured plant, with its sensor faults.
-    config
-        Errors without faults.
-    control_period
-        Duration of a tick, s.
-
     Raises
     ------
     ParameterError
         The joint bias has the wrong length.
     """
 
-    def __init__(self, plant: PlantWithFaults, config: SensorConfig, control_period: float) -> None:
-        n = plant.robot.n
-        if len(config.joint_bias) not in (0, n):
+    def __init__(self, plant: PlantWithFaults, config: PlantConfig) -> None:
+        n, errors = plant.robot.n, config.sensors
+        if len(errors.joint_bias) not in (0, n):
             raise ParameterError(
-                f"Parameter 'sensors.joint_bias' has {counted(len(config.joint_bias), 'value')}; "
+                f"Parameter 'sensors.joint_bias' has {counted(len(errors.joint_bias), 'value')}; "
                 f"the robot has {counted(n, 'joint')}."
             )
-        self._plant, self._config, self._control_period = plant, config, control_period
-        self._normals = NormalNumbers(config.seed, 12 + 2 * n)
+        self._plant, self._config, self._control_period = plant, errors, config.control_period
+        self._normals = NormalNumbers(errors.seed, 12 + 2 * n)
         self._joint_index = {name: i for i, name in enumerate(plant.robot.joint_names)}
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
         self.q, self.qdot = plant.q.copy(), plant.qdot.copy()
@@ -192,38 +183,23 @@ class TargetSensors:
     from a separate random stream.
 
     When a delay begins, pose and twist are frozen until the delay has elapsed.
-
-    Parameters
-    ----------
-    capturing
-        The plant with the target.
-    config
-        The errors.
-    seed
-        Noise seed of all sensors.
-    control_period
-        Duration of a tick, s.
     """
 
-    def __init__(
-        self,
-        capturing: CapturePlant,
-        config: TargetSensorConfig,
-        seed: int,
-        control_period: float,
-    ) -> None:
-        self._capturing, self._config = capturing, config
+    def __init__(self, capturing: CapturePlant, config: PlantConfig) -> None:
+        self._capturing, errors = capturing, config.target.sensors
+        self._config, control_period = errors, config.control_period
         # Robot sensors have the stream of the seed itself, actuators that of its first child.
-        self._rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
+        seeds = np.random.SeedSequence(config.sensors.seed, spawn_key=(1,))
+        self._rng = np.random.default_rng(seeds)
         self.pose, self.twist = capturing.target_pose.copy(), capturing.target_twist.copy()
-        self.used = config != TargetSensorConfig()
+        self.used = errors != TargetSensorConfig()
         """Whether measurements differ from the truth."""
         self.missing = False
         """Whether there is no measurement in this tick."""
-        self._position_bias = np.array(config.position_bias or (0.0, 0.0, 0.0))
-        self._attitude_bias = np.array(config.attitude_bias or (0.0, 0.0, 0.0))
-        self._delay = round(config.delay / control_period)
-        self._every = max(1, round(1.0 / (config.rate * control_period))) if config.rate else 1
+        self._position_bias = np.array(errors.position_bias or (0.0, 0.0, 0.0))
+        self._attitude_bias = np.array(errors.attitude_bias or (0.0, 0.0, 0.0))
+        self._delay = round(errors.delay / control_period)
+        self._every = max(1, round(1.0 / (errors.rate * control_period))) if errors.rate else 1
         self._count = 0
         self._past: deque[tuple[Array, Array]] = deque(maxlen=self._delay + 1)
 
@@ -250,13 +226,6 @@ class TargetSensors:
 class ReportedState:
     """A plant's measured and true state, as published on its topics.
 
-    Parameters
-    ----------
-    plant
-        The plant.
-    config
-        The plant configuration: sensors and end-effector.
-
     Attributes
     ----------
     sensors
@@ -276,7 +245,7 @@ class ReportedState:
 
     def __init__(self, plant: PlantWithFaults, config: PlantConfig) -> None:
         self._plant = plant
-        self.sensors = Sensors(plant, config.sensors, config.control_period)
+        self.sensors = Sensors(plant, config)
         robot, count = plant.robot, len(plant.robot.link_names)
         link = robot.description.end_effector(config.end_effector_frame)
         self._end_effector: LinkPlacement | None = None
@@ -297,9 +266,7 @@ class ReportedState:
         """The target; None if there is no target."""
         self.target_sensors: TargetSensors | None = None
         if capturing is not None:
-            self.target_sensors = TargetSensors(
-                capturing, config.target.sensors, config.sensors.seed, config.control_period
-            )
+            self.target_sensors = TargetSensors(capturing, config)
         self._sensors_used, self._loaded = self.sensors.used, plant.loads is not None
         self.quantities = self._quantities()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import PlantWithFaults
+from spacerobot_ros.simulation.config import PlantConfig
 
 Array = npt.NDArray[np.float64]
 
@@ -186,6 +188,7 @@ def test_joints_that_never_follow_again_are_found_in_the_end(
 SERVICER = (share_directory() / "urdf" / "servicer.urdf").read_text("utf-8")
 ARM = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
 SHAPE = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+CONFIG = PlantConfig(actuation="velocity", tick_rate=1 / TICK)
 
 
 def gait(
@@ -218,7 +221,7 @@ def test_an_arm_turns_its_base_without_its_elbow(options: dict[str, Any]) -> Non
     """The plant holds the joint; the flight ends where it does by its own equations."""
     elbow = 2
     inner = VelocityPlant(robot_of(SERVICER), TICK, InitialState(joint_positions=SHAPE))
-    plant = PlantWithFaults(inner, ["joint_stuck elbow_pitch"], TICK, wrench=False)
+    plant = PlantWithFaults(inner, replace(CONFIG, faults=("joint_stuck elbow_pitch",)))
     method = gait(SERVICER, SHAPE, "elbow_pitch", k=0.5, **options)
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.01, 0.005, -0.01]).as_quat())
     for _ in range(30):
@@ -306,7 +309,8 @@ def test_a_shape_that_a_stuck_joint_is_not_in_is_refused() -> None:
 def test_a_chain_turns_its_base_by_the_one_pin_that_is_left() -> None:
     chain = (share_directory() / "urdf" / "planar_chain.urdf").read_text("utf-8")
     robot = robot_of(chain)
-    plant = PlantWithFaults(VelocityPlant(robot, TICK), ["joint_stuck pin_1"], TICK, wrench=False)
+    stuck = replace(CONFIG, faults=("joint_stuck pin_1",))
+    plant = PlantWithFaults(VelocityPlant(robot, TICK), stuck)
     goal = Goal(np.zeros(3), Rotation.from_rotvec([0.0, 0.0, 0.1]).as_quat())
     method = gait(chain, plant.q, "pin_1", method="square_path")
     for rates in method.plan(measured(plant), goal).velocities:

@@ -19,7 +19,6 @@ from spacerobot_ros.errors import CommandError, ParameterError, RobotDescription
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion
-from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import (
@@ -423,6 +422,7 @@ ROOT = Path(__file__).parents[2]
 SERVICER = (ROOT / "urdf" / "servicer.urdf").read_text(encoding="utf-8")
 
 SHAPE = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
+CONFIG = PlantConfig(actuation="effort", tick_rate=1 / TICK, thrusters="urdf")
 
 
 def flying(
@@ -430,8 +430,7 @@ def flying(
 ) -> ThrusterPlant:
     start = initial or InitialState(joint_positions=SHAPE)
     plant = EffortPlant(robot or robot_of(SERVICER), TICK, start)
-    table = find_thrusters("urdf", plant.robot.description)
-    return ThrusterPlant(plant, TICK, table, excluded.split())
+    return ThrusterPlant(plant, dataclasses.replace(CONFIG, thrusters_excluded=excluded))
 
 
 def wanted(rng: np.random.Generator) -> Array:
@@ -567,7 +566,7 @@ def test_faults_of_the_wrench_act_on_the_thrusters_and_not_on_what_is_asked_of_t
     """A component that is stuck, off or weak is so in every tick, whatever pulses begin."""
     faults = ("thruster_stuck force_y 3.5", "thruster_off torque_x", "thruster_weak force_x 0.5")
     sound, inner = flying(), flying()
-    broken = PlantWithFaults(inner, faults, TICK, wrench=True)
+    broken = PlantWithFaults(inner, dataclasses.replace(CONFIG, faults=faults))
     rng = np.random.default_rng(4)
     for _ in range(40):
         command = wanted(rng)

@@ -6,6 +6,7 @@ import itertools
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, VelocityPlant
 from spacerobot_ros.simulation.actuators import (
@@ -23,7 +23,7 @@ from spacerobot_ros.simulation.actuators import (
     ThrusterPlant,
     build_plant,
 )
-from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.faults import (
     FAULT_KINDS,
     Fault,
@@ -31,7 +31,6 @@ from spacerobot_ros.simulation.faults import (
     Timeline,
     parse_fault,
 )
-from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
 
 URDF = Path(__file__).parents[2] / "urdf"
@@ -44,19 +43,24 @@ def urdf(name: str) -> str:
     return (URDF / f"{name}.urdf").read_text("utf-8")
 
 
+def faulty(
+    plant: VelocityPlant | EffortPlant, *faults: str, seed: int = 0, **values: Any
+) -> PlantWithFaults:
+    """Return a plant with faults, and with thrusters if ``thrusters`` are among the values."""
+    config = PlantConfig(
+        actuation=plant.actuation,
+        tick_rate=1 / plant.control_period,
+        faults=faults,
+        sensors=SensorConfig(seed=seed),
+        **values,
+    )
+    return PlantWithFaults(ThrusterPlant(plant, config) if config.thrusters else plant, config)
+
+
 def arm(*faults: str, seed: int = 0, tick: float = TICK) -> PlantWithFaults:
     """Return the three-joint arm under velocity commands."""
-    return PlantWithFaults(
-        VelocityPlant(robot_of(urdf("three_joint_arm")), tick),
-        faults,
-        tick,
-        wrench=False,
-        seed=seed,
-    )
-
-
-def pushed(plant: Plant, *faults: str) -> PlantWithFaults:
-    return PlantWithFaults(plant, faults, TICK, wrench=True)
+    plant = VelocityPlant(robot_of(urdf("three_joint_arm")), tick)
+    return faulty(plant, *faults, seed=seed)
 
 
 def momenta(robot: str, plant: PlantWithFaults) -> Array:
@@ -148,7 +152,7 @@ def test_the_largest_faults_leave_numbers_finite_or_stop_the_plant_with_a_senten
     robot = SpaceRobot.from_file(robot_file("sliding_masses"))
     config = PlantConfig(actuation=actuation, tick_rate=20.0)
     plant = build_plant(robot, config)
-    sensors = Sensors(plant, config.sensors, config.control_period)
+    sensors = Sensors(plant, config)
     targets = FaultTargets(robot.joint_names, actuation == "effort").of(FAULT_KINDS[kind])
     extremes = (
         {FAULT_KINDS[kind].minimum, FAULT_KINDS[kind].maximum} if FAULT_KINDS[kind].value else {""}
@@ -284,7 +288,7 @@ def test_a_plant_without_faults_is_the_plant_within() -> None:
     robot = robot_of(urdf("three_joint_arm"))
     bare, wrapped = (
         VelocityPlant(robot, TICK),
-        PlantWithFaults(VelocityPlant(robot, TICK), (), TICK, wrench=False),
+        faulty(VelocityPlant(robot, TICK)),
     )
     rng = np.random.default_rng(3)
     for _ in range(20):
@@ -302,12 +306,8 @@ def test_a_plant_without_faults_is_the_plant_within() -> None:
 def test_a_joint_that_jams_changes_no_momentum_and_gains_no_energy(seed: int) -> None:
     text = random_urdf(seed)
     robot, rng = robot_of(text), np.random.default_rng(seed)
-    plant = PlantWithFaults(
-        EffortPlant(robot, 0.01, tumbling(robot, rng)),
-        [f"joint_stuck {robot.joint_names[1]} at 0.2 until 0.4"],
-        0.01,
-        wrench=True,
-    )
+    jam = f"joint_stuck {robot.joint_names[1]} at 0.2 until 0.4"
+    plant = faulty(EffortPlant(robot, 0.01, tumbling(robot, rng)), jam)
     before, places, energies = momenta(text, plant), [], []
     for effort, _ in thrusts(rng, robot.n, 60):
         plant.step(0.2 * effort)
@@ -325,7 +325,7 @@ def test_energy_is_lost_when_a_moving_joint_jams() -> None:
     text = random_urdf(4)
     robot = robot_of(text)
     start = tumbling(robot, np.random.default_rng(4))
-    plant = PlantWithFaults(EffortPlant(robot, 0.001, start), (), 0.001, wrench=True)
+    plant = faulty(EffortPlant(robot, 0.001, start))
     rest = np.zeros(robot.n)
     plant.step(rest)
     before = plant.momentum.copy()
@@ -360,7 +360,7 @@ def test_the_momentum_is_what_the_faulty_thrusters_gave(
 ) -> None:
     # The sliders' robot has its centre of mass at the origin of its base: forces do not turn it.
     text = urdf("sliding_masses")
-    plant = pushed(EffortPlant(robot_of(text), TICK), *faults)
+    plant = faulty(EffortPlant(robot_of(text), TICK), *faults)
     wrench = np.array([2.0, -1.0, 0.5, 0.0, 0.0, 0.0])
     for _ in range(10):
         plant.step(np.zeros(3), wrench)
@@ -372,31 +372,27 @@ def test_the_momentum_is_what_the_faulty_thrusters_gave(
 
 
 def test_nozzles_stay_open_closed_and_weak() -> None:
-    robot = robot_of(urdf("servicer"))
-    plant = PlantWithFaults(
-        ThrusterPlant(EffortPlant(robot, 0.1), 0.1, find_thrusters("urdf", robot.description)),
-        [
-            "nozzle_open plus_x_1",
-            "nozzle_closed minus_x_1 until 1",
-            "nozzle_weak minus_x_1 0.5 at 1",
-        ],
-        0.1,
-        wrench=True,
+    plant = faulty(
+        EffortPlant(robot_of(urdf("servicer")), 0.1),
+        "nozzle_open plus_x_1",
+        "nozzle_closed minus_x_1 until 1",
+        "nozzle_weak minus_x_1 0.5 at 1",
+        thrusters="urdf",
     )
     thrusters = plant.thrusters
     assert thrusters is not None
     opened, other = (thrusters.table.names.index(name) for name in ("plus_x_1", "minus_x_1"))
     back = np.array([-40.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     for _ in range(5):
-        plant.step(np.zeros(robot.n), back)
+        plant.step(np.zeros(plant.robot.n), back)
     assert thrusters.thrust[opened] == 10.0, "nobody asked for it"
     assert thrusters.thrust[other] == 0.0
     for _ in range(10):
-        plant.step(np.zeros(robot.n), back)
+        plant.step(np.zeros(plant.robot.n), back)
     assert thrusters.thrust[other] == pytest.approx(0.5 * 10.0 * thrusters.duty[other])
     assert thrusters.duty[other] > 0.9
     plant.inject("clear")
-    plant.step(np.zeros(robot.n), np.zeros(6))
+    plant.step(np.zeros(plant.robot.n), np.zeros(6))
     assert thrusters.thrust[opened] == 0.0
 
 

@@ -18,7 +18,12 @@ from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import PlantWithFaults, build_plant
-from spacerobot_ros.simulation.config import PlantConfig, SensorConfig, TargetSensorConfig
+from spacerobot_ros.simulation.config import (
+    PlantConfig,
+    SensorConfig,
+    TargetConfig,
+    TargetSensorConfig,
+)
 from spacerobot_ros.simulation.sensors import NormalNumbers, ReportedState, Sensors, TargetSensors
 
 TICK = 0.05
@@ -49,13 +54,19 @@ def test_noise_is_normal_independent_and_given_by_its_seed() -> None:
     np.testing.assert_allclose([np.exp(-(radius**2) / 2.0), angle / (2.0 * np.pi)], [one, two])
 
 
+def measured_plant(
+    errors: SensorConfig, tick: float, faults: tuple[str, ...] = ()
+) -> tuple[PlantWithFaults, Sensors]:
+    config = PlantConfig(actuation="velocity", tick_rate=1 / tick, faults=faults, sensors=errors)
+    plant = PlantWithFaults(VelocityPlant(robot_of(URDF), tick, START), config)
+    return plant, Sensors(plant, config)
+
+
 class Flight:
     """A plant, its sensors, and everything they said beside the truth."""
 
     def __init__(self, config: SensorConfig, *faults: str, ticks: int, moving: bool = True) -> None:
-        inner = VelocityPlant(robot_of(URDF), TICK, START)
-        self.plant = PlantWithFaults(inner, faults, TICK, wrench=False)
-        self.sensors = Sensors(self.plant, config, TICK)
+        self.plant, self.sensors = measured_plant(config, TICK, faults)
         self.dropouts: list[bool] = []
         measured: list[Array] = []
         true: list[Array] = []
@@ -227,8 +238,7 @@ def test_a_delay_that_begins_in_flight_holds_the_present_pose_and_follows_it(
     config: SensorConfig, tick: float, delay: float
 ) -> None:
     """Whatever quotients round to, a delay of three ticks lasts three; a bias does not add up."""
-    plant = PlantWithFaults(VelocityPlant(robot_of(URDF), tick, START), (), tick, wrench=False)
-    sensors = Sensors(plant, config, tick)
+    plant, sensors = measured_plant(config, tick)
     bias = np.array(config.position_bias)
     true, measured = [], []
     for number in range(14):
@@ -252,7 +262,7 @@ def test_actuators_and_sensors_draw_from_different_streams() -> None:
         sensors=SensorConfig(position_noise=1.0, seed=11),
     )
     plant = build_plant(robot_of(URDF), config, START)
-    sensors = Sensors(plant, config.sensors, config.control_period)
+    sensors = Sensors(plant, config)
     noises, errors = [], []
     for _ in range(300):
         sensors.measure()
@@ -283,7 +293,10 @@ class Seen:
     """What sensors of a target say, tick by tick, beside the truth; None where they say nothing."""
 
     def __init__(self, ticks: int, seed: int = 5, **errors: Any) -> None:
-        config = configured(TargetSensorConfig, errors)
+        target_config = TargetConfig(sensors=configured(TargetSensorConfig, errors))
+        config = PlantConfig(
+            tick_rate=1 / TARGET_TICK, sensors=SensorConfig(seed=seed), target=target_config
+        )
         target = Target()
         self.true: list[Array] = []
         self.measured: list[Array | None] = []
@@ -293,7 +306,7 @@ class Seen:
             target.target_twist[:] = [0.1, -0.2, 0.3 + 0.001 * tick, 0.05, 0.04, -0.06]
             if not tick:
                 plant: Any = target
-                self.sensors = TargetSensors(plant, config, seed, TARGET_TICK)
+                self.sensors = TargetSensors(plant, config)
             self.sensors.measure()
             self.true.append(np.concatenate([target.target_pose, target.target_twist]))
             said = np.concatenate([self.sensors.pose, self.sensors.twist])

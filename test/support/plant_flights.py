@@ -28,7 +28,7 @@ from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower
 from spacerobot_ros.simulation.actuators import PlantWithFaults
-from spacerobot_ros.simulation.config import SensorConfig
+from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.plant import Plant
 from spacerobot_ros.simulation.sensors import Sensors
 from spacerobot_ros.times import SECOND
@@ -55,9 +55,9 @@ def _fly_row(
     flights: Flights, row: int, result: BatchResult, controller: BatchController | None
 ) -> None:
     plant, period = plant_of(flights, row), flights.control_period
-    config = SensorConfig() if flights.sensors is None else sensor_config(flights.sensors, row)
-    faulty = PlantWithFaults(plant, (), period, wrench=flights.actuation == "effort")
-    sensors = Sensors(faulty, config, period)
+    errors = SensorConfig() if flights.sensors is None else sensor_config(flights.sensors, row)
+    config = PlantConfig(actuation=flights.actuation, tick_rate=1 / period, sensors=errors)
+    sensors = Sensors(PlantWithFaults(plant, config), config)
     ends = False  # Whether the flight ends at the tick of the decision about its goal.
     match flights.program:
         case FollowedSchedule() as program:

@@ -23,6 +23,7 @@ from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.resources import resource_names, robot_file, share_directory
 from spacerobot_ros.simulation import mujoco_model
 from spacerobot_ros.simulation.actuators import PlantWithFaults
+from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.loads import Surroundings
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
@@ -149,15 +150,9 @@ def test_external_loads_are_flown_under_velocities(surroundings: Surroundings) -
         joint_positions=np.array([-0.4, -0.5, 0.2]),
         angular_momentum=np.array([0.2, -0.3, 0.1]),
     )
-    period, pushed = 0.013, [f"{robot.link_names[2]} force 0 2 0.5 at 0.1"]
-    plant = PlantWithFaults(
-        VelocityPlant(robot, period, start),
-        (),
-        period,
-        wrench=False,
-        disturbances=pushed,
-        surroundings=surroundings,
-    )
+    period, pushed = 0.013, (f"{robot.link_names[2]} force 0 2 0.5 at 0.1",)
+    config = PlantConfig(actuation="velocity", tick_rate=1 / period, disturbances=pushed)
+    plant = PlantWithFaults(VelocityPlant(robot, period, start), config, surroundings)
     flight = EngineFlight(plant, period)
     poses, shapes = [plant.pose.copy()], [plant.q.copy()]
     for tick in range(30):
