@@ -173,26 +173,24 @@ class ApproachPlan:
         return grapple.with_relative_motion(relative)
 
 
-class ArmReach:
-    """Checks whether an arm on a fixed base can follow end-effector motions.
+class ArmReach(FixedBaseArm):
+    """An arm on a fixed base, in the current state: whether it can follow end-effector motions.
 
-    ``axes`` of the end-effector ``link`` are controlled; ``rates`` (n,) are the largest joint
-    rates.
+    ``rates`` (n,) are the largest joint rates.
     """
 
     def __init__(
         self, robot: SpaceRobot, link: str, axes: tuple[str, ...], state: ControlState, rates: Array
     ) -> None:
-        self.base = Pose(matrix_from_quaternion(state.quaternion_WB), state.r_WB.copy())
-        """Base pose in W."""
-        self._arm = FixedBaseArm(robot, link, self.base, axes)
-        self._joint_names, self._rates = robot.joint_names, rates
+        base = Pose(matrix_from_quaternion(state.quaternion_WB), state.r_WB.copy())
+        super().__init__(robot, link, base, axes)
+        self._rates = rates
         self.q = state.q.copy()
         """Current shape (n,)."""
 
     def distance_to(self, motion: FrameMotion, k: int) -> float:
         """Return the smallest distance (m or rad) of the arm from pose k of a motion."""
-        return self._arm.nearest_shape(self.q, Pose(motion.R[k], motion.r[k]))[1]
+        return self.nearest_shape(self.q, Pose(motion.R[k], motion.r[k]))[1]
 
     def shapes_along(self, motion: FrameMotion, period: float) -> tuple[Array, str]:
         """Return the arm configurations (K, n) along a motion, from the current one, and the reason
@@ -203,7 +201,7 @@ class ArmReach:
         q, shapes = self.q, np.empty((len(motion.r), len(self.q)))
         for k in range(len(motion.r)):
             before = q
-            q, distance = self._arm.nearest_shape(q, Pose(motion.R[k], motion.r[k]))
+            q, distance = self.nearest_shape(q, Pose(motion.R[k], motion.r[k]))
             shapes[k] = q
             if distance > REACHED_DISTANCE:
                 return shapes, f"the end-effector stays {distance:.3g} m or rad away from it"
@@ -212,8 +210,8 @@ class ArmReach:
             if k and share.max(initial=0.0) > 1.0:
                 worst = int(share.argmax())
                 return shapes, (
-                    f"joint '{self._joint_names[worst]}' would move at {rate[worst]:.3g}/s, but "
-                    f"its limit is {self._rates[worst]:.3g}/s"
+                    f"joint '{self.robot.joint_names[worst]}' would move at {rate[worst]:.3g}/s, "
+                    f"but its limit is {self._rates[worst]:.3g}/s"
                 )
         return shapes, ""
 
@@ -224,7 +222,6 @@ def plan_approach(
     options: ApproachOptions,
     limits: MotionLimits,
     reach: ArmReach,
-    axes: tuple[str, ...],
     clearance: TargetClearance | None = None,
 ) -> ApproachPlan:
     """Return the approach with the earliest start.
@@ -242,8 +239,6 @@ def plan_approach(
         The standoff, and reference limits in W.
     reach
         The arm.
-    axes
-        Controlled end-effector axes.
     clearance
         Distances from the target body; None if the body is unknown.
 
@@ -280,7 +275,7 @@ def plan_approach(
             last = first + math.ceil((plan.contact - start) / _SAMPLE_PERIOD) + 1
             times, rows = _SAMPLE_PERIOD * np.arange(first, last), slice(first, last)
             motion = plan.hand(grapple.rows(rows), times)
-            share = _largest_limit_share(motion, limits, axes)
+            share = _largest_limit_share(motion, limits, reach.axes)
             if share[0] > 1.0:
                 sentence = (
                     "The target moves too fast to be reached: the end-effector's reference would "

@@ -117,7 +117,6 @@ class CoordinatedController:
         planner: ReferencePlanner | None,
     ) -> None:
         self.law, self.wheels, self.planner = law, wheels, planner
-        self._distances = law.outputs.selection.distances
         self.limits, self._motion = limits, config.motion
         rates = config.joint_rates * law.robot.velocity_limit
         self.joint_rate_limits = JointRateLimits(law.robot, rates, config.control_period)
@@ -345,10 +344,7 @@ class CoordinatedController:
         ``measured`` is the state, or None without a base measurement; ``q`` and ``qdot`` (n,) are
         the joint positions and rates, which are always measured.
 
-        Raises
-        ------
-        NotFiniteError
-            A measurement is not finite.
+        Raises NotFiniteError if a measurement is not finite.
         """
         state, around_B = self._known_state(measured, q, qdot), None
         if state is None:
@@ -467,10 +463,7 @@ class CoordinatedController:
     def errors(self) -> OutputDistance:
         """Return the errors of the last command's outputs relative to the reference; 0 for kinds
         that are not controlled."""
-        worst, error = dict.fromkeys(OutputDistance._fields, 0.0), self.law.error.tolist()
-        for kind, places in self._distances:
-            worst[kind] = max(worst[kind], math.hypot(*[error[i] for i in places]))
-        return OutputDistance(**worst)
+        return self.law.outputs.selection.distance(self.law.error, other=0.0)
 
     def distance_from_reference(self) -> OutputDistance:
         """Return the distance of the last command's outputs from the reference."""
@@ -494,8 +487,9 @@ class CoordinatedController:
         Kp, Kd = law.gain_diagonals
         reach = np.abs(law.error) + Kd / Kp * np.abs(law.error_rate)
         bounds = np.empty(len(reach))
-        for kind in {kind for kind, _ in self._distances}:
-            of_kind = [i for each, places in self._distances if each == kind for i in places]
+        distances = law.outputs.selection.distances
+        for kind in {kind for kind, _ in distances}:
+            of_kind = [i for each, places in distances if each == kind for i in places]
             largest = max(getattr(far, kind), float(reach[of_kind].max()))
             bounds[of_kind] = 2 * largest + getattr(margins, kind)
         return bounds
@@ -592,11 +586,7 @@ def build_controller(robot: SpaceRobot, config: ControllerConfig) -> Coordinated
             f"The control law '{config.law}' cannot be built: {describe_exception(error)}."
         ) from error
     limits = ActuatorLimits(force, torque, robot.effort_limit)
-    planner = None
-    if config.plans:
-        planner = ReferencePlanner(
-            robot, outputs, limits, config.plan, in_background=config.plan_in_background
-        )
+    planner = ReferencePlanner(robot, outputs, limits, config) if config.plans else None
     return CoordinatedController(law, limits, config, wheels, planner)
 
 

@@ -174,7 +174,7 @@ class JointRateLimits:
         """
         if self._unlimited:
             return given
-        Js, Fs, G = self._evaluate_dynamics(state)
+        Js, Fs, G = self._evaluate_dynamics(state.q, state.omega_WB_B, state.qdot)
         pushed = G @ given.wrench_B
         qddot = np.linalg.solve(Js, given.tau + pushed - Fs)
         soonest = _MIN_PERIODS_TO_LIMIT * periods * self._control_period
@@ -211,8 +211,7 @@ class JointRateLimits:
 
     def efforts(self, q: Array, qdot: Array, qddot: Array) -> Array:
         """Return the efforts (n,) for joint accelerations (n,) without thrust and base rotation."""
-        rest = np.zeros(3)
-        Js, Fs, _ = self._evaluate_dynamics(ControlState(rest, rest, rest, rest, q, qdot))
+        Js, Fs, _ = self._evaluate_dynamics(q, np.zeros(3), qdot)
         return np.asarray(Js @ qddot + Fs)
 
     def holding_efforts(self, q: Array, base: PoseReference) -> Array:
@@ -220,19 +219,18 @@ class JointRateLimits:
 
         The robot is a rigid body; ``base`` is the motion of the base in W, moved by thrust alone.
         """
-        R_BW, still = matrix_from_quaternion(base.quaternion).T, np.zeros(3)
+        R_BW = matrix_from_quaternion(base.quaternion).T
         omega, alpha = R_BW @ base.angular_velocity, R_BW @ base.angular_acceleration
         r, inertia = self._robot.center_of_mass(q), self._robot.inertia_matrix(q)[3:6, 3:6]
         turning = np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
         force = self._robot.total_mass * (R_BW @ base.acceleration + turning)
         torque = inertia @ alpha + np.cross(omega, inertia @ omega) + np.cross(r, force)
-        rest = ControlState(still, still, still, omega, q, np.zeros_like(q))
-        _, Fs, G = self._evaluate_dynamics(rest)
+        _, Fs, G = self._evaluate_dynamics(q, omega, np.zeros_like(q))
         return np.asarray(Fs - G @ np.concatenate([force, torque]))
 
-    def _evaluate_dynamics(self, state: ControlState) -> tuple[Array, Array, Array]:
+    def _evaluate_dynamics(self, q: Array, omega: Array, qdot: Array) -> tuple[Array, Array, Array]:
         inputs = self._dynamics.inputs
-        inputs[0][:], inputs[1][:], inputs[2][:] = state.q, state.omega_WB_B, state.qdot
+        inputs[0][:], inputs[1][:], inputs[2][:] = q, omega, qdot
         self._dynamics.evaluate()
         Js, Fs, G = self._dynamics.outputs
         n = self._robot.n

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -77,7 +78,7 @@ class OutputSelection:
     joints: tuple[str, ...] = ()
     end_effector_link: str = ""
 
-    @property
+    @cached_property
     def distances(self) -> tuple[tuple[str, tuple[int, ...]], ...]:
         """Kind and indices of the outputs that together form a distance, angle or joint error."""
         count = len(self.base)
@@ -90,13 +91,15 @@ class OutputSelection:
         first = count + len(self.end_effector)
         return (*found, *(("joints", (first + i,)) for i in range(len(self.joints))))
 
-    def distance(self, errors: Array) -> OutputDistance:
-        """Return the distances for the output errors (m,)."""
-        largest = dict.fromkeys(OutputDistance._fields, math.nan)
+    def distance(self, errors: Array, other: float = math.nan) -> OutputDistance:
+        """Return the distances for the output errors (m,); ``other`` is the value of kinds that are
+        not controlled."""
+        sizes: dict[str, float] = {}
+        given = errors.tolist()
         for kind, places in self.distances:
-            size = float(np.linalg.norm(errors[list(places)]))
-            largest[kind] = max(size, largest[kind]) if largest[kind] >= 0 else size
-        return OutputDistance(**largest)
+            size = math.hypot(*[given[i] for i in places])
+            sizes[kind] = max(size, sizes.get(kind, 0.0))
+        return OutputDistance(*[sizes.get(kind, other) for kind in OutputDistance._fields])
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -221,10 +224,7 @@ class OutputVector:
         Whether forces on the base move the centre of mass; if not, the first columns of ``J_z`` are
         zero.
 
-    Raises
-    ------
-    ParameterError
-        The robot lacks a selected output; see :meth:`OutputSelection.require_valid`.
+    Raises ParameterError; see :meth:`OutputSelection.require_valid`.
     """
 
     def __init__(
@@ -277,12 +277,7 @@ class OutputVector:
     def pack_state(self, state: ControlState, memory: Array) -> None:
         """Write a state into memory (13 + 2 n,) for the symbol ``state``.
 
-        Raises
-        ------
-        NotFiniteError
-            A value in the state is not finite.
-        ValueError
-            A component has the wrong length.
+        Raises as :meth:`.ControlLaw.command`.
         """
         state.stack(memory)
         require_finite("state", memory)
@@ -290,14 +285,7 @@ class OutputVector:
     def pack_reference(self, reference: Reference, memory: Array) -> None:
         """Write a reference into memory for the symbol ``reference``.
 
-        Raises
-        ------
-        TargetNotSetError
-            The reference lacks a selected group.
-        NotFiniteError
-            A value in the reference is not finite.
-        ValueError
-            A component has the wrong length.
+        Raises as :meth:`.ControlLaw.command`.
         """
         parts: list[Array] = []
         if self.selection.base:

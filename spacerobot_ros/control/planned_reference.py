@@ -10,6 +10,7 @@ from typing import ClassVar, NamedTuple, TypedDict
 import numpy as np
 
 from spacerobot_ros.collision import BasePoses
+from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.limits import ActuatorLimits
 from spacerobot_ros.control.outputs import OutputSelection
 from spacerobot_ros.control.reference import PLANNED_PROFILE, ReferenceProfile
@@ -29,7 +30,7 @@ from spacerobot_ros.model.target_motion import FrameMotion, RelativeMotionOverTi
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.methods.thrust.motion import Samples, ThrustMotion
-from spacerobot_ros.planning.methods.thrust.problem import Grapple, ThrustGoal, ThrustOptions
+from spacerobot_ros.planning.methods.thrust.problem import Grapple, ThrustGoal
 from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 
 PLANNING_TIME = 2.0
@@ -216,10 +217,11 @@ class ReferencePlanner:
         The model controlled by the law, without wheels: plans do not use wheel torque.
     outputs
         The outputs of the law.
-    limits, options
-        See :class:`.ThrustPlanner`.
-    in_background
-        Whether plans are made in a thread while states are handled.
+    limits
+        Limits of the thrusters.
+    config
+        Options of the plans (:class:`.ThrustPlanner`), and whether they are made in a thread while
+        states are handled.
 
     Raises
     ------
@@ -232,18 +234,16 @@ class ReferencePlanner:
         robot: SpaceRobot,
         outputs: OutputSelection,
         limits: ActuatorLimits,
-        options: ThrustOptions,
-        *,
-        in_background: bool,
+        config: ControllerConfig,
     ) -> None:
         if not outputs.base:
             raise ParameterError(
                 "The profile 'planned' requires a controlled base pose: set base_outputs, or set "
                 "profile to quintic."
             )
-        self._outputs, self.in_background = outputs, in_background
+        self._outputs, self.in_background = outputs, config.plan_in_background
         self._planner = ThrustPlanner(
-            robot, options, outputs.end_effector_link, limits.force, limits.torque
+            robot, config.plan, outputs.end_effector_link, limits.force, limits.torque
         )
 
     def use_obstacles(self, world: RobotDescription | None) -> None:
@@ -271,10 +271,7 @@ class ReferencePlanner:
         """Return the planned reference for a motion; ``state`` provides the positions of joints
         without a reference.
 
-        Raises
-        ------
-        PlanningError
-            No motion is found.
+        Raises PlanningError if no motion is found.
         """
         start, goal, carries, waypoints = motion
         assert goal.base is not None
@@ -311,10 +308,7 @@ class ReferencePlanner:
     ) -> GrappleReference:
         """Return the planned reference to a target; the given target motion starts with the plan.
 
-        Raises
-        ------
-        PlanningError
-            No motion is found.
+        Raises PlanningError if no motion is found.
         """
         motion = self._planner.plan(self._begin(start, state), grapple, cancellation)
         return GrappleReference(start, motion, grapple)

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -41,6 +43,8 @@ class ReferenceProfile(ABC):
         Current poses and joint positions; velocities are ignored.
     goal
         Desired poses and joint positions; missing groups are not controlled.
+    limits
+        Limits of a motion by interpolation; other profiles ignore them.
     carries
         Whether the end-effector has no goal and moves with the base, so that the arm keeps its
         shape.
@@ -48,7 +52,14 @@ class ReferenceProfile(ABC):
 
     name: ClassVar[str]
 
-    def __init__(self, start: Reference, goal: Reference, *, carries: bool = False) -> None:
+    def __init__(
+        self,
+        start: Reference,
+        goal: Reference,
+        limits: MotionLimits | None = None,
+        *,
+        carries: bool = False,
+    ) -> None:
         self.start, self.goal, self.carries = start, goal, carries
         self.duration = 0.0
         """Time after which the reference equals the goal, s."""
@@ -62,15 +73,16 @@ class ReferenceProfile(ABC):
         start, goal, joints = self.start, self.goal, 0.0
         if start.joints is not None and goal.joints is not None:
             joints = float(np.abs(goal.joints.q - start.joints.q).max(initial=0.0))
-        lines = [line for line in self.lines() if line is not None]
+        lines = [line for line in self.lines if line is not None]
         return OutputDistance(
             max((line.length for line in lines), default=0.0),
             max((line.angle for line in lines), default=0.0),
             joints,
         )
 
+    @cached_property
     def lines(self) -> tuple[_PoseInterpolation | None, _PoseInterpolation | None]:
-        """Return the base and end-effector paths; None for a group that is not controlled."""
+        """The base and end-effector paths; None for a group that is not controlled."""
         start, goal, base, hand = self.start, self.goal, None, None
         if start.base is not None and goal.base is not None:
             base = _PoseInterpolation(start.base, goal.base)
@@ -84,16 +96,6 @@ class StepReference(ReferenceProfile):
     """Step to the goal, as in paper 4, section V; it has no limits."""
 
     name: ClassVar[str] = "step"
-
-    def __init__(
-        self,
-        start: Reference,
-        goal: Reference,
-        limits: MotionLimits | None = None,
-        *,
-        carries: bool = False,
-    ) -> None:
-        super().__init__(start, goal, carries=carries)
 
     def at(self, time: float) -> Reference:
         """Return the goal."""
@@ -115,7 +117,6 @@ class QuinticReference(ReferenceProfile):
         self, start: Reference, goal: Reference, limits: MotionLimits, *, carries: bool = False
     ) -> None:
         super().__init__(start, goal, carries=carries)
-        self._base, self._end_effector = self.lines()
         self._joints = np.zeros(0)
         if goal.joints is not None and start.joints is not None:
             self._joints = goal.joints.q - start.joints.q
@@ -123,7 +124,7 @@ class QuinticReference(ReferenceProfile):
             quintic_duration(float(abs(d)), limits.joint_speed, limits.joint_acceleration)
             for d in self._joints
         ]
-        for line in (self._base, self._end_effector):
+        for line in self.lines:
             if line is not None:
                 needs.append(quintic_duration(line.length, limits.speed, limits.acceleration))
                 needs.append(
@@ -142,11 +143,10 @@ class QuinticReference(ReferenceProfile):
         if self.start.joints is not None and self.goal.joints is not None:
             d = self._joints
             joints = JointReference(self.start.joints.q + s * d, rate * d, acceleration * d)
-        return Reference(
-            None if self._base is None else self._base.at(s, rate, acceleration),
-            None if self._end_effector is None else self._end_effector.at(s, rate, acceleration),
-            joints,
+        base, hand = (
+            None if line is None else line.at(s, rate, acceleration) for line in self.lines
         )
+        return Reference(base, hand, joints)
 
 
 def _quintic(u: Any, T: Any) -> tuple[Any, Any, Any]:
@@ -156,20 +156,15 @@ def _quintic(u: Any, T: Any) -> tuple[Any, Any, Any]:
 
 
 def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n: int) -> Array:
-    """Return a profile as the values required by :func:`profile_expression`.
+    """Return a profile, whose goal includes the controlled groups, as the values required by
+    :func:`profile_expression`.
 
-    Parameters
-    ----------
-    profile
-        A profile whose goal includes the controlled groups.
-    base, end_effector
-        Whether these poses are controlled.
-    n
-        Number of joints with references; 0 if joints are not controlled.
+    ``base`` and ``end_effector``: whether these poses are controlled; ``n``: number of joints with
+    references, 0 if joints are not controlled.
     """
     start, goal = profile.start, profile.goal
     parts: list[npt.ArrayLike] = [[profile.duration]]
-    for wanted, line in zip((base, end_effector), profile.lines(), strict=True):
+    for wanted, line in zip((base, end_effector), profile.lines, strict=True):
         if wanted and line is not None:
             parts += line.numbers
     if n and start.joints is not None and goal.joints is not None:
@@ -191,15 +186,8 @@ def profile_expression(
     s, rate, acceleration = _quintic(time / duration, duration)
     moving, resting = [], []
     for k in range(base + end_effector):
-        r, d, e, c, quaternion, half_turn, turn_W, angle, *end = rest[10 * k : 10 * k + 10]
-        half = s * angle / 2
-        sine, cosine = ca.sin(s * angle), ca.cos(s * angle)
-        arm, beside = cosine * e + sine * c, cosine * c - sine * e
-        speed = rate * angle
-        moving += [r + s * d + arm, ca.sin(half) * half_turn + ca.cos(half) * quaternion]
-        moving += [rate * d + speed * beside, rate * turn_W]
-        moving += [acceleration * d + acceleration * angle * beside - speed**2 * arm]
-        moving += [acceleration * turn_W]
+        path, (angle, *end) = rest[10 * k : 10 * k + 7], rest[10 * k + 7 : 10 * k + 10]
+        moving += _pose_along(path, angle, s, rate, acceleration, ca)
         resting += [*end, ca.SX.zeros(12)]
     if n:
         r, d, goal = rest[-3:]
@@ -221,12 +209,7 @@ class HeldVelocityReference:
     """Joint references from commands whose velocities are held over a control period.
 
     At a command, the velocity jumps: the reference has the mean of the velocities before and after,
-    and the acceleration that changes one into the other within one period.
-
-    Parameters
-    ----------
-    control_period
-        Time between commands, s.
+    and the acceleration that changes one into the other within one period (s).
     """
 
     def __init__(self, control_period: float) -> None:
@@ -263,45 +246,51 @@ class _PoseInterpolation:
     def __init__(
         self, start: PoseReference, goal: PoseReference, carrier: PoseReference | None = None
     ) -> None:
-        self._start, self._goal = start, goal
         turn_B = attitude_error(start.quaternion, goal.quaternion)
         # The rotation axis is fixed both in the body and in W.
-        self._turn_W: Array = matrix_from_quaternion(start.quaternion) @ turn_B
+        turn_W: Array = matrix_from_quaternion(start.quaternion) @ turn_B
         self.angle = float(np.linalg.norm(turn_B))
-        # The quaternion of a rotation by phi is linear in sin(phi/2) and cos(phi/2).
-        axis = self._turn_W / self.angle if self.angle > 0 else np.zeros(3)
-        self._r, self._d = start.position, goal.position - start.position
-        self._e, self._c = np.zeros(3), np.zeros(3)
+        axis = turn_W / self.angle if self.angle > 0 else np.zeros(3)
+        r, d = start.position, goal.position - start.position
+        e, c = np.zeros(3), np.zeros(3)
         if carrier is not None:
             arm = start.position - carrier.position
-            self._e, self._c = arm - axis * (axis @ arm), np.cross(axis, arm)
-            self._r = start.position - self._e
-            self._d = goal.position - self._r - self._arm(1.0)[0]
-        self.length = float(np.linalg.norm(self._d))
-        self._half_turn = quaternion_multiply(np.append(axis, 0.0), start.quaternion)
-
-    @property
-    def numbers(self) -> list[npt.ArrayLike]:
+            e, c = arm - axis * (axis @ arm), np.cross(axis, arm)
+            r = start.position - e
+            d = goal.position - r - (math.cos(self.angle) * e + math.sin(self.angle) * c)
+        self.length = float(np.linalg.norm(d))
+        half_turn = quaternion_multiply(np.append(axis, 0.0), start.quaternion)
+        self._path = r, d, e, c, start.quaternion, half_turn, turn_W
+        self.numbers: list[npt.ArrayLike] = [
+            *self._path,
+            [self.angle],
+            goal.position,
+            goal.quaternion,
+        ]
         """All parameters of the line, and its end pose."""
-        line = [self._r, self._d, self._e, self._c, self._start.quaternion, self._half_turn]
-        return [*line, self._turn_W, [self.angle], self._goal.position, self._goal.quaternion]
-
-    def _arm(self, s: float) -> tuple[Array, Array]:
-        """Return the rotating arm (3,) from the carrier, and its derivative by the angle."""
-        sine, cosine = math.sin(s * self.angle), math.cos(s * self.angle)
-        return cosine * self._e + sine * self._c, cosine * self._c - sine * self._e
 
     def at(self, s: float, rate: float, acceleration: float) -> PoseReference:
-        half, speed = s * self.angle / 2, rate * self.angle
-        arm, beside = self._arm(s)
-        return PoseReference(
-            self._r + s * self._d + arm,
-            math.sin(half) * self._half_turn + math.cos(half) * self._start.quaternion,
-            rate * self._d + speed * beside,
-            rate * self._turn_W,
-            acceleration * self._d + acceleration * self.angle * beside - speed**2 * arm,
-            acceleration * self._turn_W,
-        )
+        return PoseReference(*_pose_along(self._path, self.angle, s, rate, acceleration, math))
+
+
+def _pose_along(
+    path: Sequence[Any], angle: Any, s: Any, rate: Any, acceleration: Any, functions: Any
+) -> list[Any]:
+    """Return the parts of the :class:`.PoseReference` on a path at ``s``, and its rate and
+    acceleration, as numbers or symbols; ``functions`` has the sine and cosine for them."""
+    r, d, e, c, quaternion, half_turn, turn_W = path
+    half, speed = s * angle / 2, rate * angle
+    sine, cosine = functions.sin(s * angle), functions.cos(s * angle)
+    arm, beside = cosine * e + sine * c, cosine * c - sine * e
+    return [
+        r + s * d + arm,
+        # The quaternion of a rotation by phi is linear in sin(phi/2) and cos(phi/2).
+        functions.sin(half) * half_turn + functions.cos(half) * quaternion,
+        rate * d + speed * beside,
+        rate * turn_W,
+        acceleration * d + acceleration * angle * beside - speed**2 * arm,
+        acceleration * turn_W,
+    ]
 
 
 def quintic_duration(distance: float, speed: float, acceleration: float) -> float:

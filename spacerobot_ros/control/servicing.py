@@ -381,9 +381,9 @@ class ApproachTask:
                 options.clearance,
             )
         target, rates = self.target.free_motion(time), controller.joint_rate_limits.rates
-        axes = outputs.end_effector
-        reach = ArmReach(law.robot, outputs.end_effector_link, axes, state, rates)
-        plan = plan_approach(target, held, options, self.config.motion, reach, axes, clearance)
+        link, axes = outputs.end_effector_link, outputs.end_effector
+        reach = ArmReach(law.robot, link, axes, state, rates)
+        plan = plan_approach(target, held, options, self.config.motion, reach, clearance)
         self._plan, self._start, self._contact = plan, plan.start, plan.contact
         self._predicted, self._planned_at, self._looks_ahead = target, time, True
         starts, closes, contact = (

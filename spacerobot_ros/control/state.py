@@ -58,10 +58,7 @@ class ControlState:
     def stack(self, memory: Array) -> None:
         """Write the six components in sequence into ``memory`` (13 + 2 n,).
 
-        Raises
-        ------
-        ValueError
-            A component has the wrong length.
+        Raises ValueError if a component has the wrong length.
         """
         parts = self.r_WB, self.quaternion_WB, self.v_WB_B, self.omega_WB_B, self.q, self.qdot
         np.concatenate(parts, out=memory)
@@ -199,10 +196,7 @@ class DeadReckoning:
     integration_step
         Longest Runge-Kutta step, s.
 
-    Raises
-    ------
-    ParameterError
-        A duration is not positive.
+    Raises ParameterError; see :func:`.count_steps`.
     """
 
     def __init__(

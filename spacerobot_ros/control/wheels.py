@@ -79,14 +79,8 @@ class WheelAllocation:
     """Distributes a torque over wheels by bounded least squares.
 
     The torques solve ``min |A tau - torque|`` with ``lower <= tau <= upper``; among several
-    solutions, the one with the smallest torques relative to their limits is chosen.
-
-    Parameters
-    ----------
-    axes
-        (3, k) wheel axes A.
-    torque
-        (k,) largest motor torques, N m.
+    solutions, the one with the smallest torques relative to their limits is chosen. ``axes`` (3, k)
+    are the wheel axes A, ``torque`` (k,) the largest motor torques, N m.
     """
 
     def __init__(self, axes: Array, torque: Array) -> None:
@@ -173,7 +167,7 @@ class WheelControl:
         self.thrust = np.zeros(6)
         """Wrench (6,) for the thrusters, N and N m."""
         self.rates, self._omega = np.zeros(count), np.zeros(3)
-        self._q, self._spins = np.zeros(0), np.zeros(count)
+        self._spins = np.zeros(count)
         self._announced = np.zeros(count)
         """Rate of each wheel when last reported, as a fraction of the largest rate; zero: not
         reported."""
@@ -210,7 +204,7 @@ class WheelControl:
     ) -> tuple[ControlState | None, Array, Array]:
         """Process a robot state and return the gyrostat state."""
         wheels = self.wheels
-        self._q, self.rates = q, qdot[wheels.index]
+        self.rates = qdot[wheels.index]
         q, qdot = q[wheels.other], qdot[wheels.other]
         if measured is None:
             self._known = False

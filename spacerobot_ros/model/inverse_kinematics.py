@@ -40,25 +40,15 @@ _RADIAN_LENGTH = 0.5
 
 
 class FixedBaseArm:
-    """An arm on a fixed base.
-
-    Parameters
-    ----------
-    robot
-        The model.
-    link
-        Link of the end-effector.
-    base
-        Base pose in W.
-    axes
-        Controlled end-effector axes; default: all.
+    """An arm on a fixed base, whose pose is given in W; ``axes`` of the end-effector ``link`` are
+    controlled, by default all.
     """
 
     def __init__(
         self, robot: SpaceRobot, link: str, base: Pose, axes: tuple[str, ...] = AXES
     ) -> None:
-        self._robot, self._link = robot, link
-        self.base = base
+        self.robot, self._link = robot, link
+        self.base, self.axes = base, axes
         self._rows = [AXES.index(axis) for axis in axes]
 
     def error(self, q: Array, goal: Pose) -> tuple[Array, Array]:
@@ -66,7 +56,7 @@ class FixedBaseArm:
 
         Also return the negative derivative of the error with respect to the joint positions (m, n).
         """
-        robot, R_WB = self._robot, self.base.R
+        robot, R_WB = self.robot, self.base.R
         R_BE, r_BE = robot.link_pose(self._link, q)
         R_WE = R_WB @ R_BE
         turn = rotvec_from_quaternion(quaternion_from_matrix(R_WE.T @ goal.R))
@@ -84,7 +74,7 @@ class FixedBaseArm:
         Also return the largest remaining error, m or rad. The search uses damped least squares
         with steps short enough to stay on one solution branch.
         """
-        lower, upper = self._robot.lower, self._robot.upper
+        lower, upper = self.robot.lower, self.robot.upper
         distance = np.inf
         for _ in range(_MAX_ITERATIONS):
             error, J = self.error(q, goal)
@@ -117,8 +107,8 @@ class FixedBaseArm:
             # The rotation vector is an eigenvector of its own derivative: the gradient is exact.
             return -weights[:, np.newaxis] * self.error(shape, goal)[1]
 
-        lower = np.where(np.isfinite(self._robot.lower), self._robot.lower, -math.pi)
-        upper = np.where(np.isfinite(self._robot.upper), self._robot.upper, math.pi)
+        lower = np.where(np.isfinite(self.robot.lower), self.robot.lower, -math.pi)
+        upper = np.where(np.isfinite(self.robot.upper), self.robot.upper, math.pi)
         # The solver requires a lower bound below the upper one.
         lower, upper = np.minimum(lower, q) - 1e-9, np.maximum(upper, q) + 1e-9
         random = np.random.default_rng(0)

@@ -1,10 +1,8 @@
 """Forward kinematics of the link tree in the base frame, symbolic and numeric (paper 4, section
 II).
 
-The base frame B is the root link frame. All vectors here are expressed in B, so every
-quantity is a function of the configuration q only. :func:`tree_kinematics` builds the equations
-that are compiled; :class:`ForwardKinematics` needs no compilation and computes link poses, to draw
-a robot or publish its frames.
+The base frame B is the root link frame. All vectors here are expressed in B, so every quantity is a
+function of the configuration q only.
 """
 
 from __future__ import annotations
@@ -144,15 +142,8 @@ def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
 def tree_kinematics(
     robot: RobotDescription, mass_properties: MassProperties | None = None
 ) -> TreeKinematics:
-    """Build the symbolic kinematics of a robot.
-
-    Parameters
-    ----------
-    robot
-        The robot.
-    mass_properties
-        Mass properties of the bodies; by default, constants from the description.
-    """
+    """Build the symbolic kinematics of a robot; by default, the mass properties are constants from
+    its description."""
     mass_properties = mass_properties or MassProperties(robot)
     q = ca.SX.sym("q", len(robot.joint_names))
     theta = joint_positions(robot, q)
@@ -237,15 +228,8 @@ class LinkPlacement:
         self.poses = self._function.outputs[0].reshape(len(frames), 7)
 
     def update(self, base: Array, link_R: Array, link_r: Array) -> None:
-        """Place the frames.
-
-        Parameters
-        ----------
-        base
-            (7,) base link pose in W.
-        link_R, link_r
-            (3, 3 L) attitudes side by side and (3, L) link positions in B, m.
-        """
+        """Place the frames, given the base link pose (7,) in W, and the attitudes side by side
+        (3, 3 L) and positions (3, L), m, of the links in B."""
         self._base[:], self._R[...], self._r[...] = base, link_R, link_r.reshape(self._r.shape)
         self._function.evaluate()
 
@@ -264,7 +248,8 @@ def joints_outward(robot: RobotDescription) -> list[Joint]:
 
 
 class ForwardKinematics:
-    """Link poses of a robot from its joint positions.
+    """Link poses of a robot from its joint positions, without compilation, to draw the robot or
+    publish its frames.
 
     Transforms (k, 7) are rows of a position (m) followed by a quaternion (x, y, z, w). Quaternions
     depend on half the joint angle, so they are continuous over several revolutions.
@@ -321,12 +306,8 @@ class ForwardKinematics:
         return np.concatenate([position, attitude], axis=-1)
 
     def link_poses(self, q: Array) -> tuple[Array, Array]:
-        """Return ``R_BL`` (..., L, 3, 3) and ``r_BL_B`` (..., L, 3), m, of all :attr:`links`.
-
-        Parameters
-        ----------
-        q
-            Joint positions (..., n), m or rad.
+        """Return ``R_BL`` (..., L, 3, 3) and ``r_BL_B`` (..., L, 3), m, of all :attr:`links`, at
+        joint positions (..., n), m or rad.
         """
         many = q.shape[:-1]
         fixed = np.broadcast_to(self.fixed_transforms, (*many, *self.fixed_transforms.shape))
@@ -341,12 +322,8 @@ class ForwardKinematics:
         return R, r
 
     def poses_in_world(self, base: Array, q: Array) -> tuple[Array, Array]:
-        """Return ``R_WL`` (..., L, 3, 3) and ``r_WL`` (..., L, 3), m, of all :attr:`links`.
-
-        Parameters
-        ----------
-        base, q
-            Base poses (..., 7) in the world, and joint positions (..., n).
+        """Return ``R_WL`` (..., L, 3, 3) and ``r_WL`` (..., L, 3), m, of all :attr:`links`, given
+        base poses (..., 7) in the world and joint positions (..., n).
         """
         R_BL, r_BL_B = self.link_poses(q)
         R_WB = matrices_from_quaternions(base[..., 3:])[..., None, :, :]

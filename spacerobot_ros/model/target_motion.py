@@ -187,18 +187,10 @@ def _jacobian_terms(phi: Array, phidot: Array) -> tuple[Array, Array, Array, Arr
 
 
 class RelativePath:
-    """A path of a frame E relative to a frame G, from a given motion to rest at a pose.
+    """A path of a frame E relative to a frame G, from an initial motion (K = 1) to rest at a
+    position (3,), m, where the attitudes of E and G coincide; ``duration`` is in s.
 
     Position and rotation vector are fifth-order polynomials in time.
-
-    Parameters
-    ----------
-    start
-        Initial motion (K = 1).
-    position
-        (3,) position at the end, m, where the attitudes of E and G coincide.
-    duration
-        Duration, s.
     """
 
     def __init__(self, start: RelativeMotionOverTime, position: Array, duration: float) -> None:
@@ -255,14 +247,7 @@ def _evaluate_polynomials(coefficients: Array, t: Array) -> list[Array]:
 
 
 class TorqueFreeMotion:
-    """Motion of a free target, starting from a measured state.
-
-    Parameters
-    ----------
-    body
-        The target.
-    motion
-        State of the target's root link frame.
+    """Motion of a free target, starting from a measured motion of its root link frame.
 
     Attributes
     ----------

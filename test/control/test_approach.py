@@ -57,13 +57,7 @@ def reach(rates: float = 1.0, axes: tuple[str, ...] = ("x", "y")) -> ArmReach:
 
 
 def plan(motion: TorqueFreeMotion, **changes: Any) -> ApproachPlan:
-    given: dict[str, Any] = {
-        "options": OPTIONS,
-        "limits": LIMITS,
-        "reach": reach(),
-        "axes": ("x", "y"),
-    }
-    given |= changes
+    given: dict[str, Any] = {"options": OPTIONS, "limits": LIMITS, "reach": reach(), **changes}
     return plan_approach(motion, given.pop("held", HELD), **given)
 
 
@@ -153,7 +147,7 @@ def test_a_target_that_is_too_fast_is_refused_with_the_limit(
 def test_rotation_counts_only_where_it_is_controlled() -> None:
     limits = MotionLimits(speed=0.3, acceleration=0.1, angular_speed=0.01, angular_acceleration=9.0)
     assert plan(target((1.7, -0.5)), limits=limits).start == 0.0
-    said = refusal(target((1.7, -0.5)), limits=limits, axes=("x", "rz"))
+    said = refusal(target((1.7, -0.5)), limits=limits, reach=reach(axes=("x", "rz")))
     assert "rad/s, and 'motion.angular_speed' is 0.01" in said
 
 
