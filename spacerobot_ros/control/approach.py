@@ -229,18 +229,9 @@ def plan_approach(
     If the target body blocks the way, the end-effector takes a path that is short in W, to the
     standoff or to a standoff at two or three times the distance, or starts later.
 
-    Parameters
-    ----------
-    target
-        Predicted motion of the target.
-    held
-        End-effector reference before the approach; if it moves, the approach starts immediately.
-    options, limits
-        The standoff, and reference limits in W.
-    reach
-        The arm.
-    clearance
-        Distances from the target body; None if the body is unknown.
+    ``held`` is the end-effector reference before the approach; if it moves, the approach starts
+    immediately. The limits are those of the reference in W. Without ``clearance``, the target body
+    is unknown.
 
     Raises
     ------
@@ -412,16 +403,9 @@ class TargetClearance:
     ) -> NearestLinks | None:
         """Return the smallest distance in a motion; None: nothing can touch.
 
-        Parameters
-        ----------
-        base
-            Pose of the fixed base in W.
-        shapes
-            (K, n) joint positions, m or rad.
-        grapple
-            Motion of the grapple frame at the same times.
-        closes
-            First sample of closing in.
+        The joint positions (K, n), m or rad, and the motion of the grapple frame are at the same
+        times, ``base`` is the pose of the fixed base in W, and ``closes`` the first sample of
+        closing in.
         """
         geometry = self._geometry
         if not len(geometry.pairs):

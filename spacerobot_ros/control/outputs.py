@@ -214,15 +214,8 @@ class OutputVector:
     ``acceleration``
         (m,) ``z1ddot_des``.
 
-    Parameters
-    ----------
-    robot
-        The model.
-    selection
-        The outputs.
-    thrust
-        Whether forces on the base move the centre of mass; if not, the first columns of ``J_z`` are
-        zero.
+    Without ``thrust``, no force on the base moves the centre of mass, and the first columns of
+    ``J_z`` are zero.
 
     Raises ParameterError; see :meth:`OutputSelection.require_valid`.
     """

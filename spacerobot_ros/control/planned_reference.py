@@ -42,12 +42,8 @@ class PlannedReference(ReferenceProfile):
     """A motion of the base and the joints, planned within the available thrust and around
     obstacles.
 
-    Parameters
-    ----------
-    start, goal, carries
-        See :class:`.ReferenceProfile`.
-    *legs
-        The plan: motions one after the other, all but the last to a waypoint.
+    The plan consists of ``legs``: motions one after the other, all but the last to a waypoint. See
+    :class:`.ReferenceProfile` for the other parameters.
     """
 
     name: ClassVar[str] = PLANNED_PROFILE
@@ -148,14 +144,8 @@ class PlannedReference(ReferenceProfile):
 
 
 class GrappleReference(PlannedReference):
-    """A planned motion to a target, followed by motion with the target.
-
-    Parameters
-    ----------
-    start, motion
-        See :class:`PlannedReference`.
-    grapple
-        The target; its motion starts at the same time as the plan.
+    """A planned motion to a target, whose motion starts at the same time as the plan, followed by
+    motion with the target.
     """
 
     name: ClassVar[str] = "grapple"
@@ -209,19 +199,9 @@ class GoalMotion(NamedTuple):
 
 
 class ReferencePlanner:
-    """Plans references for one controller.
+    """Plans references for one controller, whose law controls the robot and the outputs.
 
-    Parameters
-    ----------
-    robot
-        The model controlled by the law, without wheels: plans do not use wheel torque.
-    outputs
-        The outputs of the law.
-    limits
-        Limits of the thrusters.
-    config
-        Options of the plans (:class:`.ThrustPlanner`), and whether they are made in a thread while
-        states are handled.
+    The robot has no wheels, as plans do not use wheel torque.
 
     Raises
     ------

@@ -187,15 +187,7 @@ class DeadReckoning:
     rates replace the predicted ones, and the base rotates according to the connection ``A``. Errors
     then accumulate only in the effects of the thrusters.
 
-    Parameters
-    ----------
-    robot
-        The controller's robot model.
-    control_period
-        Duration of a step, s.
-    integration_step
-        Longest Runge-Kutta step, s.
-
+    A step lasts a ``control_period`` (s), in Runge-Kutta steps of at most ``integration_step`` (s).
     Raises ParameterError; see :func:`.count_steps`.
     """
 

@@ -197,14 +197,8 @@ class LinkPlacement:
     """Poses in W of frames fixed to links, from the base pose and the link poses.
 
     The poses are evaluated in CasADi's virtual machine: the few hundred operations take less time
-    than one matrix product in numpy.
-
-    Parameters
-    ----------
-    links
-        Number of links.
-    frames
-        Link index of each frame, and the frame's pose in the link.
+    than one matrix product in numpy. Each of the frames has the index of its link (of ``links``
+    links) and its pose in the link.
 
     Attributes
     ----------
@@ -253,11 +247,6 @@ class ForwardKinematics:
 
     Transforms (k, 7) are rows of a position (m) followed by a quaternion (x, y, z, w). Quaternions
     depend on half the joint angle, so they are continuous over several revolutions.
-
-    Parameters
-    ----------
-    robot
-        The robot.
 
     Attributes
     ----------

@@ -319,27 +319,23 @@ class SpaceRobot:
 
     def composed(
         self,
-        name: str,
-        build: Callable[[Composition], ca.Function],
+        key: Hashable,
+        build: Callable[[], ca.Function],
         inputs: Sequence[Array] = (),
         outputs: Sequence[Array] = (),
     ) -> BufferedFunction:
-        """Return a buffered function that ``build`` composes from MX model functions, with the
+        """Return a buffered function that ``build`` composes from :meth:`expressions`, with the
         memory of the first ``inputs`` and ``outputs`` as for :class:`.BufferedFunction`.
 
-        The function is compiled once per name for all robots that differ only in mass properties,
+        The function is compiled once per key for all robots that differ only in mass properties,
         for evaluation at every tick.
         """
-        model = self._model
-        function = model.composed(
-            name, lambda: build(Composition(model, ca.MX)), compile=self._compiles
-        )
+        function = self._model.composed(key, build, compile=self._compiles)
         return BufferedFunction(function, self._p, inputs, outputs)
 
-    def expressions(self) -> Composition:
-        """Return the model functions as SX expressions, to build larger functions; see
-        :meth:`view`."""
-        return Composition(self._model, ca.SX)
+    def expressions(self, kind: type[ca.MX] | type[ca.SX] = ca.SX) -> Composition:
+        """Return the model functions as expressions, to build larger functions."""
+        return Composition(self._model, kind)
 
     def view(
         self, key: Hashable, make: Callable[[], ca.Function]
@@ -353,9 +349,7 @@ class SpaceRobot:
         derived = self._model.derived
         if key not in derived:
             derived[key] = make()
-        function: ca.Function = derived[key]
-        compiled = self._model.composed(("view", key), lambda: function)
-        return function, BufferedFunction(compiled, self._p)
+        return derived[key], self.composed(("view", key), lambda: derived[key])
 
     @property
     def mass_arguments(self) -> dict[str, Array]:

@@ -117,13 +117,8 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class RelativeMotionOverTime:
-    """Motion of a frame E relative to a frame G at given times (K,), in G.
-
-    Attributes
-    ----------
-    values, rates, accelerations
-        (K, 6) position, m, and rotation vector of ``R_GE``, rad, and their first and second
-        derivatives.
+    """Motion of a frame E relative to a frame G at given times (K,), in G: the position, m, and
+    rotation vector of ``R_GE``, rad, (K, 6), and their first and second derivatives.
     """
 
     values: Array
@@ -408,21 +403,10 @@ def _rotate_vectors(R: Array, vectors: Array) -> Array:
 class PathInWorld:
     """A path that is short in W; relative to the rotating frame G, it leads around the body.
 
-    The position is a fifth-order polynomial in W, from a given motion to the motion of a point
-    fixed in G; the attitude relative to G follows ``relative``.
-
-    Parameters
-    ----------
-    relative
-        Path relative to G with the same endpoints.
-    target
-        The target with grapple frame G.
-    start
-        Start time, s since the state from which the target motion is predicted.
-    moving
-        Initial motion in W (K = 1).
-    position
-        (3,) end point in G, m.
+    The position is a fifth-order polynomial in W, from the motion ``moving`` (K = 1) to that of a
+    point (3,), m, fixed in the grapple frame G of the target. The attitude relative to G follows
+    ``relative``, with the same endpoints. The path starts ``start`` s after the state from which
+    the target motion is predicted.
     """
 
     def __init__(

@@ -462,9 +462,10 @@ class CapturePlant(WrappedPlant):
             "joint_impulse_limit_Nms": self._config.joint_impulse_limit,
             "energy_before_J": impact.energy_before,
             "energy_lost_J": impact.energy_lost,
+            # About the common centre of mass, and differing from the sum over the joined bodies
+            # after the impact.
             "linear_momentum_kgmps": momenta[:3].tolist(),
             "angular_momentum_Nms": momenta[3:].tolist(),
-            # Between the total momenta and the sum over the joined bodies after the impact.
             "total_momentum_residual": _relative_difference(
                 _summed_momenta(joined, after), momenta
             ),

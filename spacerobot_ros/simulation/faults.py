@@ -326,15 +326,9 @@ Entry = TypeVar("Entry", Fault, Disturbance)
 
 
 class Timeline(Generic[Entry]):
-    """Timed entries of one plant.
+    """Timed entries of one plant, one per line.
 
-    Parameters
-    ----------
-    lines
-        One entry per line.
-    parse
-        Function that parses an entry line; the second argument is the start time if the line
-        specifies none, s.
+    The second argument of ``parse`` is the start time (s) if the line specifies none.
     """
 
     def __init__(self, lines: Iterable[str], parse: Callable[[str, float], Entry]) -> None:

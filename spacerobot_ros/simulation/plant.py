@@ -183,7 +183,9 @@ class CompiledPlant(ABC):
         robot, substeps = self.robot, self._substeps
         return robot.composed(
             f"{prefix}{self.actuation}_tick_{substeps}",
-            lambda model: self.tick_function(robot, model, substeps, loaded=bool(prefix)),
+            lambda: self.tick_function(
+                robot, robot.expressions(ca.MX), substeps, loaded=bool(prefix)
+            ),
             inputs,
             outputs,
         )

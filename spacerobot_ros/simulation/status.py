@@ -153,13 +153,7 @@ _FORMAT = KeyValueFormat(
 class PlantMonitor:
     """Derives the status of a plant, and the events between successive statuses.
 
-    Parameters
-    ----------
-    commands, plant
-        The plant and its command validator.
-    config
-        Configuration of the plant. In lockstep, the plant waits for commands and is therefore never
-        ``resting``.
+    In lockstep, the plant waits for commands and is therefore never ``resting``.
     """
 
     def __init__(
