@@ -272,7 +272,6 @@ class Composition:
     """
 
     def __init__(self, model: ModelFunctions, kind: type[ca.MX] | type[ca.SX]) -> None:
-        self.n, self.link_names = model.n, model.link_names
         self._model = model
         self.inputs = {name: kind.sym(name, p.numel()) for name, p in model.mass_inputs.items()}
         """The symbol ``p`` by name; empty if the mass properties are constants."""

@@ -85,16 +85,7 @@ def target_parameters(text: str) -> dict[str, Any]:
 class Target:
     """A free rigid body: it moves with constant momenta, or under orbit or table loads.
 
-    Attributes
-    ----------
-    description
-        The body.
-    inertia
-        Mass properties in the root link frame T.
-    grapple
-        Grapple frame pose in T.
-    initial
-        Its initial motion.
+    Its mass properties ``inertia`` and the pose of its grapple frame are in its root link frame T.
     """
 
     def __init__(
@@ -197,8 +188,6 @@ class CapturePlant(WrappedPlant):
 
     Attributes
     ----------
-    target
-        The target.
     target_pose
         (7,) root link position (m) and quaternion (x, y, z, w) in W.
     target_twist
@@ -214,10 +203,6 @@ class CapturePlant(WrappedPlant):
         Function that builds a robot's plant from an initial state.
     robot, initial
         The robot alone, and its initial state.
-    target
-        The target.
-    config
-        Parameters of the plant.
 
     Raises
     ------
@@ -290,16 +275,9 @@ class CapturePlant(WrappedPlant):
         self._update()
 
     def resume(self, state: InitialState, payload: Payload | None, body: BodyMotion) -> None:
-        """Continue from a later state of a flight.
+        """Continue from a later state of a flight, in which the target moves like ``body``.
 
-        Parameters
-        ----------
-        state
-            Robot state; its momenta include the held body.
-        payload
-            The body that the robot holds; None if the target floats freely.
-        body
-            Target motion.
+        The momenta of the robot's state include the held body, the ``payload``, if any.
 
         Raises
         ------

@@ -250,17 +250,9 @@ class FlightClearance:
         """Return the clearance of a flight; None if the flight has no states, or if no link pair is
         checked.
 
-        Parameters
-        ----------
-        robot
-            The robot.
-        joint_names
-            The names of the columns of ``q``.
-        q, pose
-            Times (N,), s, and joint positions (N, n), m or rad; times (M,) and base poses (M, 7).
-            If there are obstacles, only the times common to ``q`` and ``pose`` are used.
-        mesh_of
-            As for :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
+        ``q`` are times (N,), s, and positions (N, n), m or rad, of the named joints; ``pose`` are
+        times (M,) and base poses (M, 7). If there are obstacles, only their common times are used.
+        See :class:`~spacerobot_ros.collision.geometry.CollisionGeometry` for ``mesh_of``.
         """
         (time, shapes), names, base = q, list(joint_names), None
         if robot.world is not None:

@@ -1,6 +1,5 @@
 """The effort-driven plant: free-flying dynamics under joint efforts and a base wrench.
 
-Each tick is computed by one compiled function: limits, integration, and all published quantities.
 The total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust and
 external loads they are constant to the last bit. If a joint reaches a limit during a tick, the tick
 is repeated with inelastic stops.
@@ -343,10 +342,6 @@ class EffortPlant(CompiledPlant):
     def tick_function(
         robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
     ) -> ca.Function:
-        """Compose the tick from model functions; see :class:`EffortPlant` for its results.
-
-        If ``loaded`` is set, the external load vector is the last input.
-        """
         n = robot.n
         parts = state_slices(n)
         state, command = ca.MX.sym("state", parts[-1].stop), ca.MX.sym("command", n + 6)

@@ -114,10 +114,6 @@ def build_model(
 
     Parameters
     ----------
-    mujoco
-        The module.
-    robot
-        The robot.
     target
         The target, and the link that captures it; None if there is no target.
     step

@@ -72,14 +72,8 @@ class MujocoPlant:
 
     Parameters
     ----------
-    robot
-        The model; MuJoCo reads its URDF, so its masses must match the URDF.
-    control_period
-        Duration of a tick, s.
-    initial
-        Initial state.
-    integration_step
-        Maximum Runge-Kutta step within a tick, s.
+    robot, control_period, initial, integration_step
+        See :class:`.CompiledPlant`; MuJoCo reads the robot's URDF, so its masses must match it.
     actuation
         ``velocity`` or ``effort``, as in parameter ``actuation``.
     target

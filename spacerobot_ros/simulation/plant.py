@@ -166,8 +166,8 @@ class CompiledPlant(ABC):
     def tick_function(
         robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
     ) -> ca.Function:
-        """Compose the tick from model functions; with ``loaded``, the external load vector is the
-        last input."""
+        """Compose the tick from model functions: limits, integration, and all published quantities.
+        With ``loaded``, the external load vector is the last input."""
 
     @abstractmethod
     def _bind(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:

@@ -1,7 +1,6 @@
 """The velocity-driven plant: servos hold joint velocities, and momentum determines the base motion.
 
-Each tick is computed by one compiled function: limits, step, and all published quantities. The
-total linear and angular momenta are constants of the motion, initially zero by default; under
+The total linear and angular momenta are constants of the motion, initially zero by default; under
 external loads, they are states that change with the impulses.
 """
 
@@ -111,11 +110,7 @@ class VelocityPlant(CompiledPlant):
         *,
         loaded: bool = False,
     ) -> ca.Function:
-        """Compose the tick from model functions; see :class:`VelocityPlant` for its results.
-
-        With ``loaded``, the external load vector is the last input, and the momenta after the tick
-        are the last output. The model has a parameter argument ``p``.
-        """
+        """Compose the tick; with ``loaded``, the momenta after it are the last output."""
         n = robot.n
         state, command = ca.MX.sym("state", n + 4), ca.MX.sym("command", n)
         before = ca.MX.sym("before", n)

@@ -48,12 +48,10 @@ class ComputedTorqueLaw(ControlLaw):
     @classmethod
     @override
     def default_outputs(cls, robot: SpaceRobot, end_effector_link: str) -> OutputSelection:
-        """Return all the joints."""
         return OutputSelection(joints=robot.joint_names)
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the command expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)

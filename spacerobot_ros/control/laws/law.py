@@ -52,11 +52,7 @@ singularities."""
 @dataclass(frozen=True)
 class GainPair:
     """Proportional, derivative and integral gains for each output in a group: entries of Kp, Kd and
-    Ki.
-
-    The units of the gains depend on the law (:attr:`ControlLaw.gain_units`): a force or torque per
-    error and per error rate with ``transposed_jacobian``, an acceleration per error and per error
-    rate with laws that use the inertia. The unit of Ki is that of Kp per second.
+    Ki, in units that depend on the law (:attr:`ControlLaw.gain_units`; for Ki, per second).
 
     Automatic gains depend on the robot and the control period (:meth:`ControlLaw.set_gains`).
 

@@ -58,12 +58,7 @@ class ModelBasedLaw(ControlLaw):
       along v follows the joints of that motion instead, with critical damping.
 
     Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
-
-    Parameters
-    ----------
-    robot, outputs, gains, options
-        See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s. ``posture_stiffness`` acts if the reference
-        includes joints.
+    ``posture_stiffness`` acts if the reference includes joints.
     """
 
     name: ClassVar[str] = "model_based"
@@ -76,7 +71,6 @@ class ModelBasedLaw(ControlLaw):
 
     @override
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
-        """Return the law's additional arguments; see :meth:`ControlLaw.inputs`."""
         return {
             "null_space": (self.options.posture_stiffness, self.options.null_space_damping),
             "posture": np.zeros(self.robot.n),
@@ -97,7 +91,6 @@ class ModelBasedLaw(ControlLaw):
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the command expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         H = z1.model("inertia_matrix", z1.q)
         C = z1.model("bias", z1.q, z1.v_cm, z1.omega, z1.qdot)
@@ -126,7 +119,6 @@ class ModelBasedLaw(ControlLaw):
 
     @override
     def actuation(self, reference: Reference) -> Actuation:
-        """Return the command; see :meth:`ControlLaw.actuation`."""
         # Without a joint reference, the posture is the current one and exerts no pull.
         q = self._in["state"][13 : 13 + self.robot.n]
         self._in["posture"][:] = q if reference.joints is None else reference.joints.q

@@ -36,13 +36,8 @@ class TransposedJacobianLaw(ControlLaw):
     feedforward (:meth:`.ControlLaw.automatic_effort`).
 
     If there are fewer outputs than degrees of freedom, eq. (29) does not act on the remaining
-    motion: arms continue to swing.
-    ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
-
-    Parameters
-    ----------
-    robot, outputs, gains, options
-        See :class:`ControlLaw`; Kp in N/m (N m/rad), Kd in N s/m (N m s/rad).
+    motion: arms continue to swing. ``joint_damping`` subtracts ``joint_damping * qdot`` from the
+    joint efforts.
     """
 
     name: ClassVar[str] = "transposed_jacobian"
@@ -56,12 +51,10 @@ class TransposedJacobianLaw(ControlLaw):
 
     @override
     def inputs(self) -> Mapping[str, npt.ArrayLike]:
-        """Return the law's additional arguments; see :meth:`ControlLaw.inputs`."""
         return {"joint_damping": self.joint_damping}
 
     @override
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        """Return the command expressions; see :meth:`ControlLaw.results`."""
         z1 = self.outputs
         effort = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate + symbols["integral"]
         effort += self.automatic_effort(symbols)
