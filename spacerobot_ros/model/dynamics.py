@@ -78,7 +78,7 @@ def momentum_of_bodies(
         origin_velocities.append(v)
     for k, (v, omega) in enumerate(zip(origin_velocities, omegas, strict=True)):
         v_com = v + ca.cross(omega, kin.com[k] - kin.p[k])
-        spin = kin.inertia[k] @ omega
+        spin = kin.mass_properties.inertia(k, kin.R[k]) @ omega
         linear = linear + kin.mass(k) * v_com
         angular = angular + spin + kin.mass(k) * ca.cross(kin.com[k] - kin.r_BC_B, v_com)
         energy = energy + (ca.dot(omega, spin) + kin.mass(k) * ca.dot(v_com, v_com)) / 2

@@ -35,13 +35,12 @@ from spacerobot_ros.model.symbolic_rotations import quaternion_from_matrix as sy
 
 @dataclass(frozen=True)
 class TreeKinematics:
-    """Body poses, centres of mass and inertias as functions of the configuration q.
+    """Body poses and centres of mass as functions of the configuration q.
 
     For body k, in the base frame: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
-    origin, ``com[k]`` centre of mass, ``inertia[k]`` inertia about that centre, ``axis[k]`` the
-    unit axis of the joint that carries it (None for the base). ``theta`` (m,) are the positions
-    of the joints that carry ``bodies[1:]``: equal to q unless there are mimic joints.
-    ``mass_properties`` are constants or symbols.
+    origin, ``com[k]`` centre of mass, ``axis[k]`` the unit axis of the joint that carries it (None
+    for the base). ``theta`` (m,) are the positions of the joints that carry ``bodies[1:]``: equal
+    to q unless there are mimic joints. ``mass_properties`` are constants or symbols.
     """
 
     robot: RobotDescription
@@ -50,7 +49,6 @@ class TreeKinematics:
     R: tuple[ca.SX, ...]
     p: tuple[ca.SX, ...]
     com: tuple[ca.SX, ...]
-    inertia: tuple[ca.SX, ...]
     axis: tuple[ca.SX | None, ...]
     r_BC_B: ca.SX
     mass_properties: MassProperties
@@ -162,13 +160,10 @@ def tree_kinematics(
             R.append(R_joint @ matrix_about_axis(joint.axis, theta[k - 1]))
             p.append(p_joint)
         axis.append(direction)
-    com, inertia = [], []
-    for k in range(len(robot.bodies)):
-        com.append(p[k] + R[k] @ mass_properties.centers[k])
-        inertia.append(mass_properties.inertia(k, R[k]))
+    com = [p[k] + R[k] @ mass_properties.centers[k] for k in range(len(robot.bodies))]
     r_BC_B = sum((m * c for m, c in zip(mass_properties.masses, com, strict=True)), ca.SX(3, 1))
     r_BC_B = r_BC_B / mass_properties.total
-    frames = tuple(R), tuple(p), tuple(com), tuple(inertia), tuple(axis)
+    frames = tuple(R), tuple(p), tuple(com), tuple(axis)
     return TreeKinematics(robot, q, theta, *frames, r_BC_B, mass_properties)
 
 

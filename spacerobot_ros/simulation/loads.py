@@ -134,20 +134,10 @@ class PlantLoads:
 
     def __init__(self, robot: SpaceRobot, surroundings: Surroundings | None = None) -> None:
         count = len(robot.link_names)
-        layout = LoadLayout(count)
+        layout = self._layout = LoadLayout(count)
         self.vector, self.last = np.zeros((2, layout.size))
         self.in_link = self.vector[layout.in_link].reshape(count, 6)
         self.in_world = self.vector[layout.in_world].reshape(count, 6)
-        self._acting = [
-            self.vector[part]
-            for part in (
-                layout.in_link,
-                layout.in_world,
-                layout.mean_motion,
-                layout.gravity_W,
-                layout.friction,
-            )
-        ]
         self._time = self.vector[layout.time]
         given = self.surroundings = surroundings or Surroundings()
         self.vector[layout.mean_motion] = given.mean_motion
@@ -158,7 +148,9 @@ class PlantLoads:
     @property
     def has_loads(self) -> bool:
         """Whether any load acts now."""
-        return bool(any(part.any() for part in self._acting))
+        acting = self.vector.copy()
+        acting[self._layout.quaternion_WO] = acting[self._layout.time] = 0.0
+        return bool(acting.any())
 
     @property
     def time(self) -> float:

@@ -75,7 +75,7 @@ def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
     # Eq. (17): D_ij couples the rotations of bodies i and j.
     D_ij: dict[tuple[int, int], ca.SX] = {}
     for i in bodies:
-        D_ii = kin.inertia[i]
+        D_ii = kin.mass_properties.inertia(i, kin.R[i])
         for k in bodies:
             D_ii = D_ii + kin.mass(k) * (ca.dot(v[i][k], v[i][k]) * one - v[i][k] @ v[i][k].T)
         D_ij[i, i] = D_ii
