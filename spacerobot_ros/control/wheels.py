@@ -413,6 +413,10 @@ class WheelControl:
         self._events.append(Event(kind, message, level, about=about))
 
 
+BUDGET_PARTS = ("base", "arm", "wheels", "sum")
+"""The contributions in :func:`momentum_budget`."""
+
+
 def momentum_budget(
     wheels: ReactionWheels,
     gyrostat: SpaceRobot,

@@ -152,11 +152,8 @@ def plan(
         A robot (its model, URDF file or name), or a scenario (or its file or name). If a scenario
         and a robot have the same name, the name denotes the robot if a goal is given, and the
         scenario otherwise.
-    goal
-        Base goal: a pose, a position (3,), m, or a position and quaternion (7,).
-    position, rotvec
-        Position (3,), m, and attitude (3,), rad, as exponential coordinates; they override
-        ``goal``.
+    goal, position, rotvec
+        Base goal, as for :func:`fly`.
     end_effector_position, end_effector_pose, end_effector
         End-effector goal: a position (3,), m, or a position and quaternion (7,), with the link
         name; for several end-effectors, their positions or poses by link name. Only the given
@@ -211,9 +208,7 @@ def plan(
     _require_goal(scenario)
     settings: dict[str, Any] = {} if method is None else {"method": method}
     name = method or scenario.planner.method
-    method_options(
-        name, options
-    )  # Names are checked here, so that messages contain the names as given.
+    method_options(name, options)  # Checked here, so that messages contain the names as given.
     settings |= {f"{name}.{option}": value for option, value in options.items()}
     problem = PlanningProblem.of(scenario.with_overrides("planner", settings))
     state, tolerance = robot_state_of(problem.plant()), problem.config.tolerance

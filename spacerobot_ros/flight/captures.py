@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from spacerobot_ros.control.wheels import momentum_budget
+from spacerobot_ros.control.wheels import BUDGET_PARTS, momentum_budget
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight
@@ -33,23 +33,12 @@ from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.simulation.capture import capturing_link
 from spacerobot_ros.simulation.loads import Surroundings
 
-BUDGET_PARTS = ("base", "arm", "wheels", "sum")
-"""Columns of :func:`momentum_budget_over_time`."""
-
 _SAME_TIME = 1e-6  # s
 
 
-@dataclass(frozen=True)
-class HeldTarget:
-    """The target while held by the robot.
-
-    Attributes
-    ----------
-    start, end
-        Capture and release times, s; ``end`` is infinite if there is no release.
-    payload
-        The body, according to the target's description.
-    """
+class HeldTarget(NamedTuple):
+    """The target, according to its description, while held by the robot from capture to release, s;
+    ``end`` is infinite if there is no release."""
 
     start: float
     end: float
@@ -84,34 +73,28 @@ def held_bodies(flight: Flight) -> tuple[HeldTarget, ...]:
     robot, target = flight.robot, flight.target
     if robot is None or target is None:
         return ()
-    held: list[HeldTarget] = []
-    start = math.nan
+    spans, start = list[tuple[float, float]](), math.nan
     for event in flight.events:
         if event.kind is EventKind.CAPTURED and event.time_s is not None:
             start = event.time_s
         elif event.kind is EventKind.RELEASED and event.time_s is not None:
-            held += _held_between(flight, robot, target, start, event.time_s)
+            spans.append((start, event.time_s))
             start = math.nan
-    return (*held, *_held_between(flight, robot, target, start, math.inf))
-
-
-def _held_between(
-    flight: Flight, robot: RobotDescription, target: RobotDescription, start: float, end: float
-) -> list[HeldTarget]:
-    """Return the body that was held between a capture and a release; none without states."""
-    if math.isnan(start):
-        return []
-    states = _states(flight, robot).between(start, end)
-    poses = flight.signal("target_pose")
-    _, own, other = np.intersect1d(states.time, poses.time, return_indices=True)
-    if not len(own):
-        return []
-    link, kinematics = capturing_link(robot, flight.scenario.plant), ForwardKinematics(robot)
-    first = _motion(states.values[own[0]])
-    hand = kinematics.link_in_world(link, first.pose, first.q)
-    held = relative_pose(hand, poses.values[other[0]])
-    grasp = Pose(matrix_from_quaternion(held[3:]), held[:3])
-    return [HeldTarget(start, end, Payload(link, target.bodies[0].inertia.moved(grasp)))]
+    spans.append((start, math.inf))
+    held = []
+    for start, end in spans:
+        # There are no states after a time that is NaN.
+        states, poses = _states(flight, robot).between(start, end), flight.signal("target_pose")
+        _, own, other = np.intersect1d(states.time, poses.time, return_indices=True)
+        if len(own):
+            link = capturing_link(robot, flight.scenario.plant)
+            first = _motion(states.values[own[0]])
+            hand = ForwardKinematics(robot).link_in_world(link, first.pose, first.q)
+            grasp = relative_pose(hand, poses.values[other[0]])
+            pose = Pose(matrix_from_quaternion(grasp[3:]), grasp[:3])
+            payload = Payload(link, target.bodies[0].inertia.moved(pose))
+            held.append(HeldTarget(start, end, payload))
+    return tuple(held)
 
 
 def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
@@ -123,22 +106,15 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
     from the true states. Values are in N m s. A held body is treated as part of the link that holds
     it.
 
-    Parameters
-    ----------
-    flight
-        The flight; if it has no robot description or no states, the returned signal is empty.
-    most
-        Maximum number of states to evaluate.
+    ``most`` is the largest number of states to evaluate. If the flight has no robot description or
+    no states, the returned signal is empty.
 
     Raises
     ------
     RobotDescriptionError
         The inertia of the described robot is not positive definite.
     """
-    if flight.robot is None:
-        return Signal.empty(len(BUDGET_PARTS))
-    states = _states(flight, flight.robot)
-    if not len(states):
+    if flight.robot is None or not len(states := _states(flight, flight.robot)):
         return Signal.empty(len(BUDGET_PARTS))
     rows = np.unique(np.linspace(0, len(states) - 1, most).round().astype(np.int64))
     wheels = ReactionWheels.of(flight.robot)
@@ -159,15 +135,8 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
     """Return the estimated parameters of each body held by the robot.
 
     The parameters are determined from conservation of momentum (:mod:`.model.payload_estimation`),
-    the measured base and joint motion, the robot's masses and the thrust. The target's description
-    is not used.
-
-    Parameters
-    ----------
-    flight
-        The flight.
-    most
-        Maximum number of states used per body.
+    the measured base and joint motion, the robot's masses and the thrust, at up to ``most`` states
+    per body. The target's description is not used.
 
     Raises
     ------
@@ -184,8 +153,8 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
     if loaded or plant.disturbances or Surroundings.of(plant.orbit, plant.table).has_loads:
         raise SpaceRobotError(
             "The parameters of the held body are not estimated: external loads (disturbances, an "
-            "orbit or a table) "
-            "acted on the robot, and their impulse is unknown; use a flight without such loads."
+            "orbit or a table) acted on the robot, and their impulse is unknown; use a flight "
+            "without such loads."
         )
     prefix = "measured_" if len(flight.signal("measured_pose")) else ""
     states, alone = _states(flight, robot, prefix), SpaceRobot(robot)
@@ -217,13 +186,8 @@ def _payload_estimate(
         regressors[at] = momentum_regressor(frame_motion(robot, link, motion), about)
     inertia = robot.inertia_matrix(_motion(states.values[0]).q)[3:6, 3:6]
     radius = math.sqrt(float(np.trace(inertia)) / 2 / robot.total_mass)
-    return estimate_payload(
-        link,
-        regressors.reshape(-1, 3, 6, 10),
-        (known - impulses[rows]).reshape(-1, 3, 6),
-        robot.total_mass,
-        radius,
-    )
+    of_triples = regressors.reshape(-1, 3, 6, 10), (known - impulses[rows]).reshape(-1, 3, 6)
+    return estimate_payload(link, *of_triples, robot.total_mass, radius)
 
 
 def _impulses(flight: Flight, states: Signal, about: Array) -> Array:
@@ -237,17 +201,13 @@ def _impulses(flight: Flight, states: Signal, about: Array) -> Array:
     turn = attitude_errors(q[:-1], q[1:])
     omega = twist[:, 3:]
     turn_to_middle = turn / 2 + step * (omega[:-1] - omega[1:]) / 8
-    middle = matrices_from_quaternions(
-        quaternion_multiply(q[:-1], quaternions_from_rotvecs(turn_to_middle))
-    )
+    q_middle = quaternion_multiply(q[:-1], quaternions_from_rotvecs(turn_to_middle))
+    R_middle = matrices_from_quaternions(q_middle)
     v = np.einsum("nij,nj->ni", R, twist[:, :3])
     r_middle = (r[:-1] + r[1:]) / 2 + step * (v[:-1] - v[1:]) / 8
     total = np.zeros((len(states), 6))
-    for share, rotation, place in (
-        (1 / 6, R[:-1], r[:-1]),
-        (4 / 6, middle, r_middle),
-        (1 / 6, R[1:], r[1:]),
-    ):
+    instants = (1 / 6, R[:-1], r[:-1]), (4 / 6, R_middle, r_middle), (1 / 6, R[1:], r[1:])
+    for share, rotation, place in instants:
         force = np.einsum("nij,nj->ni", rotation, wrench[:, :3])
         torque = np.einsum("nij,nj->ni", rotation, wrench[:, 3:])
         torque += np.cross(place - about, force)

@@ -18,26 +18,16 @@ from spacerobot_ros.control.status import CommandReport, ControllerStatus
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.series import Commands, SentGoal, Signal, pose_error
-from spacerobot_ros.measures import (
-    Outcome,
-    flown_time,
-    momentum_drift,
-)
+from spacerobot_ros.measures import Outcome, flown_time, momentum_drift
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import Array, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.model.rotations import attitude_errors, matrices_from_quaternions
 from spacerobot_ros.planning import METHODS, GaitSchedule, Goal, PoseError
-from spacerobot_ros.planning.core.goal import (
-    Controlled,
-    uncontrolled_parts,
-)
+from spacerobot_ros.planning.core.goal import Controlled, uncontrolled_parts
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.execution.status import (
-    PlannerState,
-    PlannerStatus,
-)
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.capture import capture_values, load_target
 from spacerobot_ros.simulation.clearance import FlightClearance
@@ -184,9 +174,8 @@ class FlightData:
         For the names, see :class:`~spacerobot_ros.simulation.sensors.ReportedState`: measured
         states (only if sensors have errors), the end-effector, thrusters, expected momenta.
         """
-        return {
-            name: self.series[name].values for name in self.series if name not in _TRUE_QUANTITIES
-        }
+        others = (name for name in self.series if name not in _TRUE_QUANTITIES)
+        return {name: self.series[name].values for name in others}
 
     def required_robot(self) -> RobotDescription:
         """Return the robot.
@@ -206,6 +195,13 @@ class FlightData:
     def target(self) -> RobotDescription | None:
         """The second floating body; None if there is no such body."""
         return load_target(self.scenario.plant.target)
+
+    @property
+    def target_pose(self) -> Signal:
+        """(M, 7) true positions (m) and quaternions of the target; empty if there is no target."""
+        if self.target is None:
+            return Signal.empty(7)
+        return self.signal("true_target_pose") or self.signal("target_pose")
 
     @cached_property
     def capture(self) -> dict[str, Any]:
@@ -255,8 +251,7 @@ class FlightData:
         the flight does not have them.
         """
         config = self.scenario.plant
-        hand, body = self.signal("end_effector_pose"), self.signal("true_target_pose")
-        body = body or self.signal("target_pose")
+        hand, body = self.signal("end_effector_pose"), self.target_pose
         of_link = config.capture.end_effector in ("", config.end_effector_frame)
         if self.target is None or not of_link or len(hand) != len(body):
             return np.zeros(0), np.zeros(0)
@@ -418,8 +413,8 @@ class FlightData:
     @property
     def resets(self) -> list[float]:
         """Times at which the plant was reset, s."""
-        resets = [event for event in self.events if event.kind is EventKind.RESET]
-        return [event.time_s for event in resets if event.time_s is not None]
+        resets = (event.time_s for event in self.events if event.kind is EventKind.RESET)
+        return [time for time in resets if time is not None]
 
     @cached_property
     def unexplained_momentum(self) -> Signal:
@@ -453,14 +448,8 @@ class FlightData:
         """
         if self.robot is None or not self.measures_clearance:
             return None
-        q, pose = self.signal("q"), self.signal("pose")
-        return FlightClearance.of(
-            self.robot,
-            self.joint_names,
-            (q.time, q.values),
-            (pose.time, pose.values),
-            mesh_of=self.mesh_of,
-        )
+        q, pose = ((x.time, x.values) for x in (self.signal("q"), self.signal("pose")))
+        return FlightClearance.of(self.robot, self.joint_names, q, pose, mesh_of=self.mesh_of)
 
     def mesh_of(self, shape: Shape) -> TriangleMesh:
         """Return the triangles of a shape, read from a file if the shape is a mesh.

@@ -47,20 +47,13 @@ _PARTS: frozenset[Controlled] = frozenset(("position", "attitude", "shape", "end
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a flight in words, according to its last true state.
+    """The outcome of a flight, according to its last true state, in a few words, such as ``Reached,
+    except for the position``, and in a sentence.
 
-    Attributes
-    ----------
-    word
-        The outcome in a few words, such as ``Reached, except for the position``.
-    sentence
-        The commander's message; if the goal is reached or the time limit has expired, a sentence
-        with the true errors and the tolerances.
-    succeeded
-        Whether the true state reaches all controlled components of the goal, and whether any
-        automatic capture has taken place.
-    complete
-        Whether every component of the goal was also controlled.
+    The sentence is the commander's message; if the goal is reached or the time limit has expired,
+    it states the true errors and the tolerances. ``succeeded``: the true state reaches all
+    controlled components of the goal, and any automatic capture has taken place. ``complete``:
+    every component of the goal was also controlled.
     """
 
     word: str
@@ -76,19 +69,16 @@ class Flight(FlightData):
     def __repr__(self) -> str:
         error, left = self.error, ""
         if error is not None:
+            parts = (("position", error.distance, "m"), ("attitude", error.angle, "rad"))
             distance, angle = (
                 quantity(value, unit) + " (not controlled)" * (part in self.not_controlled)
-                for part, value, unit in (
-                    ("position", error.distance, "m"),
-                    ("attitude", error.angle, "rad"),
-                )
+                for part, value, unit in parts
             )
-            left = f", {distance} and {angle} from "
+            left = f", {distance} and {angle} from the goal"
         return (
             f"<Flight of {self.scenario.name} by {self.method}: {self.outcome.value} after "
             f"{self.duration:.6g} s ({len(self.time) - 1} ticks, "
-            f"{counted(self.corrections, 'correction')}){left and f'{left}the goal'}. "
-            f"{self.verdict.sentence}>"
+            f"{counted(self.corrections, 'correction')}){left}. {self.verdict.sentence}>"
         )
 
     def summary(self) -> dict[str, Any]:
@@ -129,22 +119,20 @@ class Flight(FlightData):
             "angular_momentum_drift": angular,
             "peak_joint_velocities": measures.peak_rate.tolist(),
             "corrections": measures.corrections,
-            "gait": {}
-            if self.gait is None
-            else {"duration_s": self.gait.duration_s, **self.gait.notes},
+            "gait": {},
             "state": self.outcome.value,
             "message": self.message,
             "verdict": self.verdict.sentence,
             "succeeded": self.succeeded,
             "succeeded_by_measurement": self.succeeded_by_measurement,
         }
+        if self.gait is not None:
+            summary["gait"] = {"duration_s": self.gait.duration_s, **self.gait.notes}
         if errors := self.end_effector_errors:
+            angles = {link: errors[link].angle for link in self._turned_links}
             summary["end_effectors"] = {
-                link: {
-                    "position_error_m": each.distance,
-                    "attitude_error_rad": each.angle if link in self._turned_links else None,
-                }
-                for link, each in errors.items()
+                link: {"position_error_m": x.distance, "attitude_error_rad": angles.get(link)}
+                for link, x in errors.items()
             }
         elif math.isfinite(measures.end_effector_distance):
             end = self.signal("end_effector_pose").values[-1, :3]
@@ -152,14 +140,13 @@ class Flight(FlightData):
             summary["end_effector_position_error_m"] = measures.end_effector_distance
             if self.turns_end_effector:
                 summary["end_effector_attitude_error_rad"] = measures.end_effector_angle
-        if self.capture:
-            summary["capture"] = self.capture
-        if self.detumbling:
-            summary["detumbling"] = self.detumbling
-        if self.propellant is not None:
-            summary["propellant_kg"] = self.propellant
-        if self.planned_propellant is not None:
-            summary["planned_propellant_kg"] = self.planned_propellant
+        optional = {
+            "capture": self.capture or None,
+            "detumbling": self.detumbling or None,
+            "propellant_kg": self.propellant,
+            "planned_propellant_kg": self.planned_propellant,
+        }
+        summary |= {name: value for name, value in optional.items() if value is not None}
         if (found := self.detection) is not None:
             about = {"node": found.node, "time_s": found.time_s, "message": found.message}
             summary["detection"] = about
@@ -438,11 +425,7 @@ class Flight(FlightData):
 
     @property
     def _attributes(self) -> dict[str, str]:
-        return {
-            "scenario": self.scenario.name,
-            "method": self.method,
-            "message": self.message,
-        }
+        return {"scenario": self.scenario.name, "method": self.method, "message": self.message}
 
     def plot(self) -> Any:
         """Return a matplotlib figure with base pose and goal, joints, and efforts or rates."""
@@ -451,14 +434,8 @@ class Flight(FlightData):
         return figure(self)
 
     def animate(self, *, seconds: float = 8.0, frames: int = 80) -> Any:
-        """Return the robot in motion as an HTML animation for a notebook.
-
-        Parameters
-        ----------
-        seconds
-            Duration of the animation.
-        frames
-            Number of pictures, at most 1000.
+        """Return the robot in motion as an HTML animation for a notebook, which lasts some
+        ``seconds`` and consists of at most 1000 pictures (``frames``).
 
         Raises
         ------
@@ -477,9 +454,13 @@ class Flight(FlightData):
         Raises
         ------
         RecordingError
-            The file exists and may not be replaced, or cannot be written, or the flight has no
-            robot description.
+            The file exists and may not be replaced, or cannot be written, a message type is not
+            installed, or the flight has no robot description.
         """
-        from spacerobot_ros.flight.saved import save_flight
+        from spacerobot_ros.bag import BagWriter
+        from spacerobot_ros.flight.saved import write_flight
 
-        save_flight(self, path, overwrite=overwrite)
+        self.required_robot()
+        config = self.scenario.config("recorder")
+        with BagWriter.for_recorder(path, config, overwrite=overwrite) as writer:
+            write_flight(self, writer)

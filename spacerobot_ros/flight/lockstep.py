@@ -65,6 +65,9 @@ to end the flight."""
 
 _PROGRESS_PERIOD = 0.2  # wall s
 
+_Build = Callable[[str, RobotConfig], SpaceRobot | None]
+"""Returns the robot for a node and its configuration; None: none is configured."""
+
 
 @dataclass(frozen=True)
 class Robots:
@@ -79,15 +82,9 @@ class Robots:
 
     @classmethod
     def of(
-        cls,
-        scenario: Scenario,
-        built: Callable[[str, RobotConfig], SpaceRobot | None] = lambda node, config: robot_of(
-            config
-        ),
+        cls, scenario: Scenario, built: _Build = lambda node, config: robot_of(config)
     ) -> Robots:
         """Build the models named in a scenario; a commander without a model uses the plant's URDF.
-
-        ``built`` returns the robot for a node's configuration; None if not configured.
 
         Raises
         ------
@@ -99,24 +96,19 @@ class Robots:
             raise ParameterError(
                 f"The scenario '{scenario.name}' has no robot for its plant: set plant.robot."
             )
-        robots = {"plant": plant, "planner": plant, "controller": plant}
-        for name, node in (("planner", "planner"), ("controller", "coordinated_control")):
-            if node in scenario.commanders:
-                config = scenario.config(node)
-                own = built(node, config)
-                robots[name] = own or robot_from_text(plant.description.urdf, config)
-        return cls(robots["plant"], robots["planner"], robots["controller"])
+
+        def assumed(node: str) -> SpaceRobot:
+            if node not in scenario.commanders:
+                return plant
+            config = scenario.config(node)
+            return built(node, config) or robot_from_text(plant.description.urdf, config)
+
+        return cls(plant, assumed("planner"), assumed("coordinated_control"))
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Raise an error if a scenario requires ROS nodes, as it does for wall time, other processes or
-    a resumed flight.
-
-    Raises
-    ------
-    ParameterError
-        The scenario requires nodes; the message names the command to use.
-    """
+    """Raise ParameterError, naming the command to use, if a scenario requires ROS nodes, as it does
+    for wall time, other processes or a resumed flight."""
     why = ""
     if not scenario.lockstep:
         why = "plant.time_mode is realtime"
@@ -165,9 +157,7 @@ def fly_scenario(
     GoalError
         The goal's joint positions belong to another robot.
     """
-    require_flyable(scenario)
-    flight = LockstepFlight(scenario, robots or Robots.of(scenario))
-    return flight.fly(progress, longest)
+    return LockstepFlight(scenario, robots).fly(progress, longest)
 
 
 @dataclass(frozen=True)
@@ -202,24 +192,11 @@ class _Host:
 
 
 class LockstepFlight:
-    """One flight in lockstep, tick by tick.
+    """One flight in lockstep, tick by tick; for parameters and errors see :func:`fly_scenario`."""
 
-    Parameters
-    ----------
-    scenario
-        The scenario to fly; :func:`require_flyable` must accept it.
-    robots
-        The models.
-
-    Raises
-    ------
-    ParameterError
-        A parameter or the robot is invalid.
-    GoalError
-        The goal's joint positions belong to another robot.
-    """
-
-    def __init__(self, scenario: Scenario, robots: Robots) -> None:
+    def __init__(self, scenario: Scenario, robots: Robots | None = None) -> None:
+        require_flyable(scenario)
+        robots = robots or Robots.of(scenario)
         config = scenario.plant
         self._scenario, self._robots = scenario, robots
         self._period_ns = config.period_ns
@@ -254,24 +231,22 @@ class LockstepFlight:
         self._interrupted = False
         self._planner: PlannerCommander | None = None
         self._controller: ControllerCommander | None = None
-        commanders: dict[str, Commander] = {}
-        if "planner" in scenario.commanders:
-            send = self._send_setpoint
-            if "coordinated_control" in scenario.commanders:
-                send = self._send_reference
-            commanders["planner"] = self._planner = PlannerCommander(
-                scenario.planner, _Host(self, "planner", send), method=robots.method
-            )
-            self._planner.use_robot(robots.planner, ArrayDecoder())
-        if "coordinated_control" in scenario.commanders:
-            host = _Host(self, "coordinated_control", self._send_actuation)
-            commanders["coordinated_control"] = self._controller = ControllerCommander(
-                scenario.controller, host
-            )
-            self._controller.use_robot(robots.controller, ArrayDecoder())
-            if self._plant.capturing is not None:
-                self._controller.use_target(self._plant.capturing.target.description)
-        self._commanders = {name: commanders[name] for name in scenario.commanders}
+        self._commanders: dict[str, Commander] = {}
+        for name in scenario.commanders:
+            if name == "planner":
+                tracked = "coordinated_control" in scenario.commanders
+                send = self._send_reference if tracked else self._send_setpoint
+                host, method = _Host(self, name, send), robots.method
+                self._planner = PlannerCommander(scenario.planner, host, method=method)
+                self._planner.use_robot(robots.planner, ArrayDecoder())
+                self._commanders[name] = self._planner
+            else:
+                host = _Host(self, name, self._send_actuation)
+                self._controller = ControllerCommander(scenario.controller, host)
+                self._controller.use_robot(robots.controller, ArrayDecoder())
+                if self._plant.capturing is not None:
+                    self._controller.use_target(self._plant.capturing.target.description)
+                self._commanders[name] = self._controller
 
     # -- the flight ---------------------------------------------------------------------------
 
@@ -475,30 +450,18 @@ class LockstepFlight:
         if self._planner is not None:
             self._planner.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: given)
         if self._controller is not None:
-            unshaped = replace(
-                given,
-                joint_positions=None,
-                end_effectors=(),
-                base=POSE,
-                asked=goal.asked & goal.base,
-            )
+            receive, tool = self._controller.receive_goal, scenario.end_effector_goal
+            pose = replace(given, joint_positions=None, end_effectors=(), base=POSE)
+            unshaped = replace(pose, asked=goal.asked & goal.base)
             if given.base:
-                self._controller.receive_goal(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
-            heard = [
-                each
-                for each in goal.end_effectors
-                if self._planner is None or each.link in ("", DEFAULT_END_EFFECTOR)
-            ]
+                receive(BASE_GOAL_KEY, *_FIRST_GOAL_STAMP, lambda: unshaped)
+            own = ("", DEFAULT_END_EFFECTOR)
+            heard = [x for x in goal.end_effectors if self._planner is None or x.link in own]
             if heard:
-                aimed = Goal.of_end_effectors(heard)
-                self._controller.receive_goal(END_EFFECTOR, *_FIRST_GOAL_STAMP, lambda: aimed)
-            tool = scenario.end_effector_goal
+                receive(END_EFFECTOR, *_FIRST_GOAL_STAMP, lambda: Goal.of_end_effectors(heard))
             if tool is not None:
-                self._controller.receive_goal(
-                    END_EFFECTOR,
-                    *_FIRST_GOAL_STAMP,
-                    lambda: Goal.checked(tool.position, tool.quaternion),
-                )
+                r, q = tool.position, tool.quaternion
+                receive(END_EFFECTOR, *_FIRST_GOAL_STAMP, lambda: Goal.checked(r, q))
 
     def take_status(self, status: Status) -> None:
         """Track the status like a mission client."""

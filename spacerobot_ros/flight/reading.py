@@ -77,27 +77,18 @@ WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 
 
 class FlightBag(RecordedRobot):
-    """One robot's topics in a bag as signals over time.
+    """The topics of one robot in a bag as signals over time, in a namespace such as ``/robot_1``;
+    empty: none.
 
-    Times are stamps (s), or log times if stamps come from another clock.
-
-    Parameters
-    ----------
-    bag
-        The recording.
-    namespace
-        Namespace of the robot's topics, such as ``/robot_1``; empty if there is no namespace.
-    from_start
-        Whether times begin at the first state.
+    Times are stamps (s), or log times if stamps come from another clock; they begin at the first
+    state if ``from_start`` is set.
     """
 
     def __init__(self, bag: Bag, namespace: str = "", *, from_start: bool = False) -> None:
         super().__init__(bag, namespace)
         self.path = bag.path
         self.load(_FLIGHT_TOPICS)
-        states = [
-            series for name in ("odom", "joint_states", "momentum") if (series := self.get(name))
-        ]
+        states = [s for name in ("odom", "joint_states", "momentum") if (s := self.get(name))]
         self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK_TOLERANCE for s in states)
         self._zero = 0.0
         self.began = min((self._times(s)[0] for s in states), default=bag.start_time)
@@ -151,19 +142,10 @@ class FlightBag(RecordedRobot):
     def signal(
         self, name: str, fields: Sequence[str], width: int, joints: Sequence[str] | None = None
     ) -> Signal:
-        """Return fields of a topic over time, omitting messages that lack a field.
+        """Return fields of a topic over time (N, ``width``), omitting messages that lack a field.
 
-        Parameters
-        ----------
-        name
-            The topic.
-        fields
-            Paths of numbers, or of one array.
-        width
-            Number of columns.
-        joints
-            Names of the joints or thrusters, in the order of the columns; None: those in the first
-            message.
+        ``fields`` are the paths of numbers, or of one array; ``joints`` are the names of the joints
+        or thrusters, in the order of the columns; None: those in the first message.
         """
         series = self.get(name)
         if series is None:
@@ -264,14 +246,14 @@ class FlightBag(RecordedRobot):
                 if not poses:
                     continue
                 frame = poses[-1].header.frame_id or message.header.frame_id
-                *through, (position, attitude) = map(_pose_of, poses)
+                *through, (position, attitude) = map(pose_of, poses)
                 if topic != "goal_pose" and not any(attitude):
                     # Zeros request only the position of an end-effector.
                     attitude = _NO_GOAL.quaternion.tolist()
                 try:
                     goal = Goal.received(position, attitude, shape)
                     if odom is not None:
-                        goal = goal.kept_at(*map(np.array, _pose_of(odom[1].pose)))
+                        goal = goal.kept_at(*map(np.array, pose_of(odom[1].pose)))
                     if topic == "goal_path" and through:
                         goal = replace(goal, waypoints=np.array([x + q for x, q in through]))
                 except PlanningError:
@@ -311,12 +293,9 @@ def _completed(true: Signal, measured: Signal) -> Signal:
     if not (len(true) and len(measured)):
         return true if len(true) else measured
     before, after = measured.time < true.time[0], measured.time > true.time[-1]
-    parts = [
-        (measured.time[before], measured.values[before]),
-        (true.time, true.values),
-        (measured.time[after], measured.values[after]),
-    ]
-    return Signal(*map(np.concatenate, zip(*parts, strict=True)))
+    time = [measured.time[before], true.time, measured.time[after]]
+    values = [measured.values[before], true.values, measured.values[after]]
+    return Signal(np.concatenate(time), np.concatenate(values))
 
 
 # -- any bag ----------------------------------------------------------------------------------
@@ -325,17 +304,11 @@ def _completed(true: Signal, measured: Signal) -> Signal:
 def open_flight_bag(
     path: str | os.PathLike[str], namespace: str | None = None, *, from_start: bool = False
 ) -> FlightBag:
-    """Open a bag.
+    """Open a bag, whose path is as for :func:`~spacerobot_ros.bag.read_bag`; for ``from_start`` see
+    :class:`FlightBag`.
 
-    Parameters
-    ----------
-    path
-        As for :func:`~spacerobot_ros.bag.read_bag`.
-    namespace
-        Namespace of the robot's topics, with or without the leading slash; None selects the first
-        namespace with an ``odom`` topic, in alphabetical order.
-    from_start
-        Whether times begin at the first state.
+    ``namespace`` may have a leading slash; None selects the first namespace with an ``odom`` topic,
+    in alphabetical order.
 
     Raises
     ------
@@ -355,7 +328,7 @@ def open_flight_bag(
     return FlightBag(bag, chosen, from_start=from_start)
 
 
-def _pose_of(stamped: Any) -> tuple[list[float], list[float]]:
+def pose_of(stamped: Any) -> tuple[list[float], list[float]]:
     """Return the position and quaternion of a message with a pose."""
     p, o = stamped.pose.position, stamped.pose.orientation
     return [p.x, p.y, p.z], [o.x, o.y, o.z, o.w]
@@ -419,36 +392,35 @@ def read_flight(bag: FlightBag) -> Flight:
     )
     # A thruster table in a separate file is not read, because a bag may name any file.
     in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF
-    return with_propellant(flight, IN_URDF, bag.names("thrusters")) if in_urdf else flight
+    return _with_propellant(flight, IN_URDF, bag.names("thrusters")) if in_urdf else flight
 
 
-def require_states(bag: FlightBag, flight: Flight) -> None:
-    """Raise an error if a bag lacks the poses, the joint states or the momenta.
+def read_flown(bag: FlightBag, scenario: Scenario) -> Flight:
+    """Return the flight in the bag of a scenario, with the goals of the scenario.
 
     Raises
     ------
     RecordingError
-        The poses, joint states or momenta are missing.
+        A message is damaged, or there are no poses, joint states or momenta.
     """
+    flight = read_flight(bag)
     for topic, quantity in (("odom", "pose"), ("joint_states", "q"), ("momentum", "momentum")):
         if not len(flight.signal(quantity)):
             raise RecordingError(
                 f"The bag {bag.path} contains no states: there are no messages on /{topic}."
             )
+    flight = replace(
+        flight,
+        scenario=scenario,
+        goal=scenario.goal.kept_at(*np.split(flight.pose[0], [3])),
+        end_effector_goal=scenario.end_effector_goal,
+    )
+    return _with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))
 
 
-def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Flight:
-    """Return a flight with the quantity ``propellant`` (N, 1), kg, integrated from its thrusts.
-
-    Parameters
-    ----------
-    flight
-        A flight; it is returned unchanged if it has no thrusters or already contains that quantity.
-    thrusters
-        Source of the thruster table, as in the plant's parameters.
-    names
-        Thruster names in the flight; if they differ from the table, propellant is not computed.
-    """
+def _with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Flight:
+    """Return a flight with the quantity ``propellant`` (N, 1), kg, integrated from its thrusts, if
+    the table of ``thrusters`` (as in the plant's parameters) has the given names."""
     robot, series = flight.robot, flight.series
     if robot is None or "thruster_force" not in series or "propellant" in series:
         return flight
@@ -458,7 +430,6 @@ def with_propellant(flight: Flight, thrusters: str, names: Sequence[str]) -> Fli
         return flight
     if list(table.names) != list(names):
         return flight
-
     thrust = flight.signal("thruster_force")
     used = impulse(thrust, table.mass_flow / table.force, flight.resets)
     return replace(flight, series={**series, "propellant": used})
@@ -512,9 +483,7 @@ def _scenario_in_bag(bag: FlightBag) -> Scenario:
         if links:
             free = goal is None
             goal = goal or _NO_GOAL
-            aims = tuple(
-                EndEffectorGoal.of_numbers(str(link), pose) for link, pose in links.items()
-            )
+            aims = tuple(EndEffectorGoal.of_numbers(str(x), pose) for x, pose in links.items())
             goal = replace(goal, end_effectors=aims, base=frozenset() if free else POSE)
     return Scenario(
         name=about.get("name", "") or bag.path.stem,
@@ -547,13 +516,12 @@ def recorded_actuation(robot: FlightBag) -> str:
 
 def _recorded_values(kind: type[Any], texts: Mapping[str, str]) -> dict[str, Any]:
     """Return the recorded parameters of a node that this version can read."""
-    known = {parameter.name: parameter for parameter in declared(kind)}
     values = known_values(kind, {name: _parse_json(text) for name, text in texts.items()})
-    return {
-        name: value
-        for name, value in values.items()
-        if not (isinstance(value, str) and known[name].excludes(value))
-    }
+    for parameter in declared(kind):
+        value = values.get(parameter.name)
+        if isinstance(value, str) and parameter.excludes(value):
+            del values[parameter.name]
+    return values
 
 
 def recorded_target(robot: FlightBag) -> str:
@@ -571,23 +539,6 @@ def _parse_json(text: str) -> Any:
 
 
 # -- a bag of spacerobot run ------------------------------------------------------------------
-
-
-def recorded_scenario(bag: Bag) -> Scenario:
-    """Return a flight's scenario: parameters, goals and robot from its bag.
-
-    Raises
-    ------
-    RecordingError
-        The bag lacks the goal or the parameters.
-    """
-    scenario = _scenario_in_bag(FlightBag(bag))
-    if not scenario.has_goal or "plant" not in scenario.in_file:
-        raise RecordingError(
-            f"The bag {bag.path} lacks the goal or the parameters of its flight; bags recorded "
-            f"by 'spacerobot run' contain them."
-        )
-    return scenario
 
 
 def _sent_goal(about: Mapping[str, str], name: str) -> Goal | None:
@@ -623,19 +574,17 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
         Its robot is invalid.
     """
     bag = open_flight_bag(path)
-    scenario = recorded_scenario(bag.bag)
+    scenario = _scenario_in_bag(bag)
+    if not scenario.has_goal or "plant" not in scenario.in_file:
+        raise RecordingError(
+            f"The bag {bag.path} lacks the goal or the parameters of its flight; bags recorded "
+            f"by 'spacerobot run' contain them."
+        )
     urdf = bag.urdf
     if urdf is None:
         raise RecordingError(f"The bag {bag.path} contains no robot description.")
     robot = scenario.plant.assumed_robot(parse_robot(urdf.decode(errors="replace")))
-    flight = replace(
-        read_flight(bag),
-        scenario=scenario,
-        robot=robot,
-        end_effector_goal=scenario.end_effector_goal,
-    )
-    require_states(bag, flight)
-    flight = replace(flight, goal=scenario.goal.kept_at(*np.split(flight.pose[0], [3])))
+    flight = replace(read_flown(bag, scenario), robot=robot)
     if len(flight.pose) != len(flight.q):
         raise RecordingError(
             f"The bag {bag.path} has {len(flight.pose)} base poses and {len(flight.q)} "
@@ -643,4 +592,4 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
         )
     if not flight.goals and not scenario.goal.end_effectors:
         raise RecordingError(f"The bag {bag.path} contains no goal pose.")
-    return with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))
+    return flight

@@ -5,7 +5,6 @@ A table has the same columns and units as the bag's tables.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -83,23 +82,6 @@ class _Stream:
         return cls(topic, times, lambda rows: found[rows], stamp_ns)
 
 
-def save_flight(
-    flight: FlightData, path: str | os.PathLike[str], *, overwrite: bool = False
-) -> None:
-    """Write a bag for ``spacerobot verify`` and ``spacerobot report``.
-
-    Raises
-    ------
-    RecordingError
-        The file exists and may not be replaced, or cannot be written, or a message type is not
-        installed.
-    """
-    flight.required_robot()
-    config = flight.scenario.config("recorder")
-    with BagWriter.for_recorder(path, config, overwrite=overwrite) as writer:
-        write_flight(flight, writer)
-
-
 def write_flight(flight: FlightData, writer: BagWriter) -> None:
     """Write a flight into an empty bag: every topic that the nodes publish.
 
@@ -165,9 +147,9 @@ def _state_streams(flight: FlightData) -> Iterator[_Stream]:
         thrusters = tuple(find_thrusters(config.thrusters, robot).names)
     clock = TOPICS["/clock"]
     yield _stamped_stream(clock, stamps, encode(clock.type), {})
-    lost = {name: flight.quantities.get(name) for name in ("pose_lost", "target_lost")}
     every = config.ticks_of(config.base_pose_period) or 1
-    poses = {"odom", *(pose_topic(name).name for name in config.end_effectors)}
+    lost = dict.fromkeys(("odom", *(pose_topic(x).name for x in config.end_effectors)), "pose_lost")
+    lost["target/odom"] = "target_lost"
     for topic in state_topics(config.end_effectors):
         if not all(field.quantity in quantities for field in topic.state):
             continue
@@ -181,8 +163,7 @@ def _state_streams(flight: FlightData) -> Iterator[_Stream]:
             if quantities[field.quantity].shape[1]
         }
         rows = np.ones(len(stamps), dtype=bool)
-        name = "target_lost" if topic.name == "target/odom" else "pose_lost"
-        missing = lost[name] if topic.name in (*poses, "target/odom") else None
+        missing = flight.quantities.get(lost.get(topic.name, ""))
         if missing is not None:
             rows = missing[:, 0] == 0
         if not topic.every_tick:
@@ -243,37 +224,25 @@ def _frame_streams(flight: FlightData) -> Iterator[_Stream]:
             yield _Stream.of(TOPICS["/tf_static"], [(0, static)])
     every = config.ticks_of(config.marker_period)
     if every:
-        ticks = np.arange(0, len(flight.time), every)
+        shown = np.arange(0, len(flight.time), every)
         markers = RobotMarkers(robot, flight.target, config.world_frame)
+        kinematics = ForwardKinematics(robot)
+        order = [kinematics.links.index(link.name) for link in robot.links]
+        base, target = flight.pose, flight.target_pose.values
+
+        def make_markers(rows: slice) -> list[bytes]:
+            chosen = shown[rows]
+            R, r = (each[:, order] for each in kinematics.link_poses(flight.q[chosen]))
+            # The link attitudes are stacked side by side.
+            R = R.transpose(0, 2, 1, 3).reshape(len(chosen), 3, -1)
+            targets = target[chosen] if len(target) else [None] * len(chosen)
+            return [
+                markers.message(int(tick) * period, base[tick], R[k], r[k].T, targets[k])
+                for k, tick in enumerate(chosen)
+            ]
+
         if markers.draws_anything:
-            yield _Stream(TOPICS["markers"], ticks * period, _marker_maker(flight, markers, ticks))
-
-
-def _marker_maker(
-    flight: FlightData, markers: RobotMarkers, ticks: NDArray[np.int64]
-) -> Callable[[slice], list[bytes]]:
-    robot, period = flight.required_robot(), flight.scenario.plant.period_ns
-    kinematics = ForwardKinematics(robot)
-    order = [kinematics.links.index(link.name) for link in robot.links]
-    target = flight.quantities.get("true_target_pose", flight.quantities.get("target_pose"))
-
-    def make(rows: slice) -> list[bytes]:
-        chosen = ticks[rows]
-        R, r = (each[:, order] for each in kinematics.link_poses(flight.q[chosen]))
-        # The link attitudes are stacked side by side.
-        R = R.transpose(0, 2, 1, 3).reshape(len(chosen), 3, -1)
-        return [
-            markers.message(
-                tick * period,
-                flight.pose[tick],
-                R[k],
-                r[k].T,
-                None if target is None else target[tick],
-            )
-            for k, tick in enumerate(chosen.tolist())
-        ]
-
-    return make
+            yield _Stream(TOPICS["markers"], shown * period, make_markers)
 
 
 def topic_quantities(flight: FlightData) -> dict[str, Array]:
@@ -325,10 +294,8 @@ def _command_streams(flight: FlightData) -> Iterator[_Stream]:
         n = commands.values.shape[1]
         columns = {path: commands.values} if n else {}
         if n and commands.setpoints is not None:
-            columns |= {
-                "position": commands.setpoints[:, :n],
-                "velocity": commands.setpoints[:, n:],
-            }
+            q, qdot = np.split(commands.setpoints, [n], axis=1)
+            columns |= {"position": q, "velocity": qdot}
         yield _stamped_stream(TOPICS[name], stamps, encode(kind, values), columns)
 
 

@@ -161,14 +161,8 @@ def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal |
 
 
 class FlightLog:
-    """Collects the arrays of a :class:`~spacerobot_ros.flight.flight.Flight` tick by tick.
-
-    Parameters
-    ----------
-    plant, reported, commands
-        The plant, its reported quantities, and its commands.
-    period_ns
-        Duration of a tick, ns.
+    """Collects the arrays of a :class:`~spacerobot_ros.flight.flight.Flight` tick by tick: the
+    quantities that its plant reports, and the commands to it. A tick lasts ``period_ns``, ns.
     """
 
     def __init__(
@@ -187,36 +181,29 @@ class FlightLog:
         self.covariances: list[tuple[int, Array]] = []
         self.refusals: list[tuple[float, str, Refusal]] = []
         self._period_ns = period_ns
-        self._thrusters = plant.thrusters
+        self._plant, self._reported = plant, reported
         self._propellant = np.zeros(1)
         true = {"pose": plant.pose, "twist": plant.twist, "q": plant.q, "qdot": plant.qdot}
         # Without sensor errors, the measurements are the true arrays.
         unused = [f"true_{name}" for name in true]
         unused += [] if reported.sensors.used else [f"measured_{name}" for name in true]
-        sources = {
-            **{name: x for name, x in reported.quantities.items() if name not in unused},
-            **true,
-        }
-        if self._thrusters is not None:
+        sources = {name: x for name, x in reported.quantities.items() if name not in unused} | true
+        if plant.thrusters is not None:
             sources["propellant"] = self._propellant
         self._sources, self._parts = sources, tuple(sources.values())
         self._states: list[Array] = []
         """All quantities of each state, in one row per state."""
-        self._commands: dict[str, list[tuple[int, Array]]] = {
-            source.topic: [] for source in commands.sources
-        }
         self._sizes = {source.topic: len(source.limits) for source in commands.sources}
+        self._commands: dict[str, list[tuple[int, Array]]] = {topic: [] for topic in self._sizes}
         self._setpoints: dict[str, list[Array]] = {}
-        self._plant = plant
         self._faults_seen: object = None
         self._ticks_without_pose: list[int] = []
         self._ticks_without_target: list[int] = []
-        self._reported = reported
 
     def add_state(self, tick: int) -> None:
         """Add the current state."""
-        if self._thrusters is not None:
-            self._propellant[0] = self._thrusters.propellant
+        if self._plant.thrusters is not None:
+            self._propellant[0] = self._plant.thrusters.propellant
         self._states.append(np.concatenate(self._parts))
         sensors = self._reported.sensors
         if sensors.used and self._plant.active is not self._faults_seen:

@@ -41,19 +41,8 @@ _RANDOM_GOAL_TOLERANCE = 1e-5  # rad and m
 
 @dataclass(frozen=True)
 class PlanningProblem:
-    """A planning problem.
-
-    Attributes
-    ----------
-    name
-        Name of the scenario or robot.
-    robot, initial
-        The model and its initial state.
-    goal
-        The goal.
-    config
-        Planner parameters: control period, tolerance, method options.
-    """
+    """A planning problem, with the name of its scenario or robot, and the planner's parameters:
+    control period, tolerance, method options."""
 
     name: str
     robot: SpaceRobot
@@ -89,15 +78,9 @@ class PlanningProblem:
 
     def method(self, name: str) -> GaitMethod:
         """Build a gait method with its options."""
-        step = self.config.integration_step
-        return build_method(
-            name,
-            self.robot,
-            self.control_period,
-            step,
-            self.config.method_options,
-            Clearance.wanted(self.robot.description, self.config.clearance),
-        )
+        clearance = Clearance.wanted(self.robot.description, self.config.clearance)
+        times = self.control_period, self.config.integration_step
+        return build_method(name, self.robot, *times, self.config.method_options, clearance)
 
     def plant(self) -> VelocityPlant:
         """Return the plant in the initial state."""
@@ -108,24 +91,12 @@ class PlanningProblem:
 
 @dataclass(frozen=True)
 class PlanEvaluation:
-    """A method's plan for a problem, and its flight result in the plant.
+    """A gait method's plan for a problem, and its flight result in the plant.
 
-    Attributes
-    ----------
-    method
-        Name of the gait method.
-    pieces
-        Successive schedules; only one, unless the method plans in stages.
-    error
-        Final error in ``pose`` and in the joint positions.
-    pose
-        (7,) final base pose in W: position (m) and quaternion.
-    plan_time
-        Planning wall time, s.
-    reached
-        Whether the goal was reached within the planner's tolerance.
-    controls
-        The goal components that the schedules control.
+    ``pieces`` are successive schedules; only one, unless the method plans in stages. ``error`` is
+    the final error in the base ``pose`` (7,) in W, m and quaternion, and in the joint positions.
+    ``plan_time`` is a wall time, s. ``reached``: the goal was reached within the planner's
+    tolerance. ``controls`` are the goal components that the schedules control.
     """
 
     method: str
@@ -161,13 +132,8 @@ class PlanEvaluation:
 
 def robot_state_of(plant: VelocityPlant) -> RobotState:
     """Return a plant's state."""
-    return RobotState(
-        plant.pose[:3].copy(),
-        plant.pose[3:].copy(),
-        plant.q.copy(),
-        plant.expected_momenta[:3].copy(),
-        plant.expected_momenta[3:].copy(),
-    )
+    pose, momenta = plant.pose.copy(), plant.expected_momenta.copy()
+    return RobotState(pose[:3], pose[3:], plant.q.copy(), momenta[:3], momenta[3:])
 
 
 def try_method(
@@ -190,15 +156,9 @@ def try_method(
     while not pieces or (pieces[-1].partial and len(pieces) < _MAX_SCHEDULES):
         began = time.perf_counter()
         previous = pieces[-1] if pieces else None
-        schedule = method.plan(
-            PlanRequest(
-                robot_state_of(plant),
-                problem.goal,
-                tolerance,
-                correction=previous is not None,
-                previous=previous,
-            )
-        )
+        wanted = robot_state_of(plant), problem.goal, tolerance
+        corrects = previous is not None
+        schedule = method.plan(PlanRequest(*wanted, correction=corrects, previous=previous))
         plan_time += time.perf_counter() - began
         for rates in schedule.velocities:
             plant.step(rates)
@@ -292,13 +252,11 @@ def try_goals(
         for name, found in results.items():
             try:
                 trial = try_method(replace(problem, goal=goal), name, built[name])
+                off = f"{trial.error.angle:.2g} rad and {trial.error.distance:.2g} m off"
+                text = f"{trial.duration:.6g} s, {off}"
+                found.append(trial)
             except PlanningError as refusal:
                 found.append(refusal)
-                show(f"goal {number}, {name}: {refusal}")
-                continue
-            found.append(trial)
-            show(
-                f"goal {number}, {name}: {trial.duration:.6g} s, "
-                f"{trial.error.angle:.2g} rad and {trial.error.distance:.2g} m off"
-            )
+                text = str(refusal)
+            show(f"goal {number}, {name}: {text}")
     return results

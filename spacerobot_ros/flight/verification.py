@@ -4,6 +4,7 @@ states."""
 from __future__ import annotations
 
 import json
+import math
 import os
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -45,19 +46,10 @@ _COMPARED_FIRST = {"joint_states": 0, "odom": 1}
 
 @dataclass(frozen=True)
 class Difference:
-    """A value in the bag that does not follow from the commands, or that has the largest deviation.
+    """A value in the bag that does not follow from the commands, or that has the largest deviation,
+    with its simulated time (s) and the value ``expected`` from the re-simulation.
 
-    Attributes
-    ----------
-    time
-        Simulated time, s.
-    topic, field
-        Name of the number.
-    recorded, expected
-        The value in the bag, and the value in the re-simulation.
-    remark
-        Remark on the commands that cause the difference: a clause in parentheses, or an empty
-        string.
+    ``remark`` is a clause in parentheses on the commands that cause the difference, or empty.
     """
 
     time: float
@@ -76,24 +68,13 @@ class Difference:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of a verification.
+    """The result of a verification: the number of re-simulated ticks and their ``duration``, s of
+    simulated time, and the number and topics of the compared messages.
 
-    Attributes
-    ----------
-    ticks, duration
-        Number of re-simulated ticks, and their duration in s of simulated time.
-    messages, topics
-        Number of compared messages, and their topics.
-    missing
-        Message about states that are missing according to the message counts in the bag; empty if
-        none are missing.
-    second_opinion
-        The differences from another engine under the same commands, if requested.
-    largest, largest_at
-        The largest deviation before the first difference, relative to max(1, expected value), and
-        its location.
-    difference
-        The first difference, if any.
+    ``largest``, at ``largest_at``, is the largest deviation before the first ``difference``,
+    relative to max(1, expected value). ``missing`` is a message about states that are missing
+    according to the message counts in the bag; empty: none. ``second_opinion``, if requested,
+    contains the differences from another engine under the same commands.
     """
 
     ticks: int
@@ -144,8 +125,7 @@ def verify_bag(
             f" to {last * flight.config.period_ns} ns, and there are {states} of them: a complete "
             "flight has a state in every tick."
         )
-    initial, rates = _initial_state(first, published, flight)
-    resimulation = _resimulate(flight, initial, rates, first, last, mujoco=mujoco)
+    resimulation = _resimulate(flight, published, first, last, mujoco=mujoco)
     efforts = (p.values.any() for p in published if p.field.quantity == "effort")
     if flight.config.actuation == "velocity" and not any(efforts):
         # An earlier version did not compute servo efforts, and published zeros.
@@ -156,9 +136,7 @@ def verify_bag(
         # The first state is an input: the commands before it are not in the bag.
         published = [p.after(first) for p in published]
     _require_no_reset(resimulation, published)
-    return _compare(
-        resimulation, published, tolerance, missing, _second_opinion(resimulation, published)
-    )
+    return _compare(resimulation, published, tolerance, missing)
 
 
 # -- the contents of the bag ------------------------------------------------------------------
@@ -180,7 +158,7 @@ class _RecordedPlant:
     recorded: FlightBag
     config: PlantConfig
     robot: SpaceRobot
-    injections: tuple[dict[int, list[str]], dict[int, list[str]]]
+    injections: list[dict[int, list[str]]]
     grasps: dict[int, list[bool]]
 
     @classmethod
@@ -191,22 +169,18 @@ class _RecordedPlant:
         urdf = recorded.urdf
         if urdf is None:
             raise RecordingError(f"The bag {bag.path} contains no robot description.")
-        faults, disturbances = (
-            _injections(recorded, topic, config.period_ns)
-            for topic in ("fault_injection", "disturbance_injection")
-        )
         description = parse_robot(urdf.decode(errors="replace"))
         names = recorded.joint_names
         if names != list(description.joint_names):
             # This check comes before the slow derivation of the robot's equations.
             raise RecordingError(
                 f"The joint states in the bag {bag.path} have the joints {', '.join(names)}; its "
-                "robot has "
-                f"{', '.join(description.joint_names)}."
+                f"robot has {', '.join(description.joint_names)}."
             )
         robot = SpaceRobot(config.assumed_robot(description))
-        grasps = _requested_grasps(recorded, config)
-        return cls(recorded, config, robot, (faults, disturbances), grasps)
+        topics = ("fault_injection", "disturbance_injection")
+        injections = [_injections(recorded, topic, config.period_ns) for topic in topics]
+        return cls(recorded, config, robot, injections, _requested_grasps(recorded, config))
 
     def commands(self, source: CommandSource) -> dict[int, RecordedCommand]:
         """Return the first command of each tick; later commands and commands between ticks are
@@ -428,15 +402,10 @@ class _Resimulation:
 
 
 def _resimulate(
-    flight: _RecordedPlant,
-    initial: InitialState | None,
-    rates: Array,
-    first: int,
-    last: int,
-    *,
-    mujoco: bool,
+    flight: _RecordedPlant, published: list[_PublishedField], first: int, last: int, *, mujoco: bool
 ) -> _Resimulation:
     """Step the plant of a flight from tick ``first`` to tick ``last``, or as far as possible."""
+    initial, rates = _initial_state(first, published, flight)
     plant = build_plant(flight.robot, flight.config, initial)
     state = ReportedState(plant, flight.config)
     commands = CommandValidator(plant, flight.config)
@@ -536,33 +505,21 @@ def _require_no_reset(resimulation: _Resimulation, published: list[_PublishedFie
 
 
 def _compare(
-    done: _Resimulation,
-    published: list[_PublishedField],
-    tolerance: float,
-    missing: str,
-    second_opinion: EngineComparison | None,
+    done: _Resimulation, published: list[_PublishedField], tolerance: float, missing: str
 ) -> Verification:
     compared = [(p, *_deviation(p, done)) for p in published]
-    found: tuple[int, Difference] | None = None
+    difference, end = None, math.inf
     for p, expected, deviation in compared:
         # Not "greater": NaN is a difference.
         wrong = ~(deviation <= tolerance)
         rows = np.flatnonzero(wrong.any(axis=1))
-        if not rows.size:
-            continue
-        row = int(rows[np.argmin(p.ticks[rows])])
-        tick = int(p.ticks[row])
-        if found is None or tick < found[0]:
-            column = int(np.flatnonzero(wrong[row])[0])
-            found = (
-                tick,
-                _difference_at(done, p, expected, row, column, _command_remark(done, tick)),
-            )
-    end = np.inf if found is None else found[0]
+        if rows.size and p.ticks[rows].min() < end:
+            row = int(rows[np.argmin(p.ticks[rows])])
+            end, column = int(p.ticks[row]), int(np.flatnonzero(wrong[row])[0])
+            difference = _difference_at(done, p, expected, row, column, _command_remark(done, end))
     largest, largest_at = 0.0, None
     for p, expected, deviation in compared:
-        before = p.ticks < end
-        counted = np.where(before[:, np.newaxis], deviation, 0.0)
+        counted = np.where((p.ticks < end)[:, np.newaxis], deviation, 0.0)
         if counted.size and counted.max() > largest:
             row, column = map(int, np.unravel_index(int(counted.argmax()), counted.shape))
             largest = float(counted.max())
@@ -575,9 +532,9 @@ def _compare(
         topics=tuple(dict.fromkeys(p.name for p in published)),
         largest=largest,
         largest_at=largest_at,
-        difference=None if found is None else found[1],
+        difference=difference,
         missing=missing,
-        second_opinion=second_opinion,
+        second_opinion=_second_opinion(done, published),
     )
 
 

@@ -36,13 +36,7 @@ class Picture(Figure):
 
 
 class Animation:
-    """An HTML animation that notebooks display; :meth:`save` writes it as a page.
-
-    Attributes
-    ----------
-    html
-        The content that a notebook shows.
-    """
+    """An animation that notebooks display as ``html``; :meth:`save` writes it as a page."""
 
     def __init__(self, html: str) -> None:
         self.html = html
@@ -67,7 +61,6 @@ class Animation:
 
 def figure(flight: FlightData) -> Picture:
     """Draw the base pose and its goal, the joints, and their efforts or rates."""
-    efforts = flight.scenario.plant.actuation == "effort"
     thrust = flight.has_thrust
     rows = 4 + thrust
     made = Picture(figsize=(8.0, 1.9 * rows + 0.6), layout="constrained")
@@ -82,10 +75,10 @@ def figure(flight: FlightData) -> Picture:
     _plot_lines(panels[1], time, attitude, "xyz", "rotation vector, rad", target)
     names = flight.joint_names
     _plot_lines(panels[2], time, flight.q, names, "joints, m or rad")
-    if efforts:
-        _plot_lines(panels[3], time, flight.effort, names, "joint efforts, N or N m")
-    else:
-        _plot_lines(panels[3], time, flight.qdot, names, "joint rates, 1/s")
+    driven, label = flight.qdot, "joint rates, 1/s"
+    if flight.scenario.plant.actuation == "effort":
+        driven, label = flight.effort, "joint efforts, N or N m"
+    _plot_lines(panels[3], time, driven, names, label)
     if thrust:
         wrench = flight.wrench
         norms: Array = np.linalg.norm(wrench.values.reshape(-1, 2, 3), axis=2)
@@ -130,14 +123,8 @@ def animation(flight: FlightData, seconds: float, frames: int) -> Animation:
     everything = np.concatenate([shapes.reshape(-1, 3), ghost])
     middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
     half = max(float(np.ptp(everything, axis=0).max()) / 2, 0.1)
-    axes.set(
-        xlim=(middle[0] - half, middle[0] + half),
-        ylim=(middle[1] - half, middle[1] + half),
-        zlim=(middle[2] - half, middle[2] + half),
-        xlabel="x, m",
-        ylabel="y, m",
-        zlabel="z, m",
-    )
+    for name, at in zip("xyz", middle, strict=True):
+        axes.set(**{f"{name}lim": (at - half, at + half), f"{name}label": f"{name}, m"})
     for a, b in skeleton.links if len(ghost) else ():
         axes.plot(*ghost[[a, b]].T, color=_GOAL_COLOUR, alpha=0.35, linewidth=3)
     axes.plot(*flight.pose[:, :3].T, color="#8a919c", linewidth=0.8)
@@ -184,13 +171,11 @@ class _Skeleton:
     def __init__(self, robot: RobotDescription) -> None:
         self._kinematics = ForwardKinematics(robot)
         coms = {link.name: link.inertia.com for link in robot.links}
-        names = self._kinematics.links
+        names, count = self._kinematics.links, len(self._kinematics.links)
         self._com = np.array([coms[name] for name in names])
         # From a link's frame to its centre of mass, and from its parent's centre of mass to it.
-        self.links = [(i, len(names) + i) for i in range(len(names))]
-        self.links += [
-            (len(names) + names.index(j.parent), names.index(j.child)) for j in robot.joints
-        ]
+        self.links = [(i, count + i) for i in range(count)]
+        self.links += [(count + names.index(j.parent), names.index(j.child)) for j in robot.joints]
 
     def points(self, poses: Array, q: Array) -> Array:
         """Return the points (K, 2 L, 3) in the world, m: the origins of the frames, then the

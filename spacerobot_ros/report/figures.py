@@ -6,7 +6,7 @@ import io
 import logging
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -163,8 +163,11 @@ def _require_fonts(path: Path) -> None:
             f"The style file {path} is refused: text.usetex would interpret joint names as TeX "
             "and leave no editable text."
         )
-    families = mpl.rcParams["font.family"]
-    found = [family for family in families if _is_font_installed(family)]
+    families, found = mpl.rcParams["font.family"], []
+    for family in families:
+        with suppress(ValueError):  # Another family is not installed.
+            findfont(FontProperties(family=[family]), fallback_to_default=False)
+            found.append(family)
     if not found:
         raise SpaceRobotError(
             f"The style file {path} is refused: none of its fonts ({', '.join(families)}) is "
@@ -172,14 +175,6 @@ def _require_fonts(path: Path) -> None:
         )
     # DejaVu Sans comes with matplotlib and has signs that many fonts lack: 10⁻¹⁵, p₀.
     mpl.rcParams["font.family"] = list(dict.fromkeys([*found, "DejaVu Sans"]))
-
-
-def _is_font_installed(family: str) -> bool:
-    try:
-        findfont(FontProperties(family=[family]), fallback_to_default=False)
-    except ValueError:
-        return False
-    return True
 
 
 def width() -> float:
@@ -381,10 +376,7 @@ def draw_traces(
 
 
 def set_range(
-    axes: Axes,
-    values: Array,
-    extra: Sequence[float] = (),
-    axis: Literal["x", "y"] = "y",
+    axes: Axes, values: Array, extra: Sequence[float] = (), axis: Literal["x", "y"] = "y"
 ) -> None:
     """Set an axis to the value range with a margin, including nearby values of ``extra``.
 
@@ -563,9 +555,7 @@ class TraceGroup:
             unit=unit + self.unit.removeprefix("rad"),
             goals=[(start, end, k, factor * value) for start, end, k, value in self.goals],
             limits=[(k, factor * value) for k, value in self.limits],
-            window=None
-            if self.window is None
-            else (factor * self.window[0], factor * self.window[1]),
+            window=self.window and (factor * self.window[0], factor * self.window[1]),
         )
 
 

@@ -14,8 +14,9 @@ from typing import Literal
 import numpy as np
 from matplotlib.axes import Axes
 
+from spacerobot_ros.control.wheels import BUDGET_PARTS
 from spacerobot_ros.errors import RobotDescriptionError, enumeration, sentence_case, shortened
-from spacerobot_ros.flight.captures import BUDGET_PARTS, momentum_budget_over_time
+from spacerobot_ros.flight.captures import momentum_budget_over_time
 from spacerobot_ros.flight.reading import impulse
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import momentum_change
@@ -54,7 +55,7 @@ from spacerobot_ros.report.flight import (
     labels_of,
     pose_errors,
 )
-from spacerobot_ros.report.signals import Indices, thinned
+from spacerobot_ros.report.signals import thinned
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
@@ -279,9 +280,8 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     groups = joint_groups(flight, flight.signal("q"), "joint position", units, bounds, columns)
     if len(flight.qdot):
         units, columns = {"rad": "rad/s"}, flight.wheel_columns
-        groups += joint_groups(
-            flight, flight.signal("qdot"), "wheel rate", units, _rate_bounds, columns
-        )
+        rates = flight.signal("qdot")
+        groups += joint_groups(flight, rates, "wheel rate", units, _rate_bounds, columns)
     return groups
 
 
@@ -294,11 +294,8 @@ def joint_groups(
     columns: Sequence[int] | None = None,
     most: int = _JOINTS_PER_PANEL,
 ) -> list[TraceGroup]:
-    """Group the columns (N, n) of a signal by unit; ``units`` maps the position unit to the signal
-    unit.
-
-    ``columns`` selects the columns of the joints to include.
-    """
+    """Group the columns (N, n) of a signal, or the selected ``columns``, by unit; ``units`` maps
+    the position unit to the signal unit."""
     unknown = " or ".join(units.values())
     each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
     groups = []
@@ -314,11 +311,9 @@ def joint_groups(
                 if (joint := flight.joint(name)) is not None
                 for bound in bounds(joint)
             ]
-            part = Signal(signal.time, signal.values[:, chosen])
+            part, labels = Signal(signal.time, signal.values[:, chosen]), [*map(shortened, names)]
             colours = [colour(i) for i in chosen]
-            groups.append(
-                TraceGroup(part, list(map(shortened, names)), label, unit, colours, limits=limits)
-            )
+            groups.append(TraceGroup(part, labels, label, unit, colours, limits=limits))
     return groups
 
 
@@ -620,9 +615,12 @@ def error_group(
     of: str,
     line_colour: str,
 ) -> TraceGroup:
-    """Return the panel of a distance or an angle (N, 1) with its tolerance."""
+    """Return the panel of a distance or an angle (N, 1) with its tolerance; its axis shows the
+    largest error and the tolerance."""
     _, quantity, unit = next(each for each in _ERROR_PARTS if each[0] == part)
     tolerance = flight.tolerance(part)
+    _, top = log_range(signal.values, 0)
+    down_to = 0.1 * tolerance if tolerance else 1e-4 * top
     return TraceGroup(
         signal,
         [quantity],
@@ -631,7 +629,7 @@ def error_group(
         [line_colour],
         limits=[] if not tolerance else [(0, tolerance)],
         limit_name="tolerance",
-        decades=_error_decades(signal.values, tolerance),
+        decades=int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MAX_DECADES)),
     )
 
 
@@ -654,26 +652,17 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     return time_figure(flight, "link_errors", "Errors of end-effectors", caption, groups)
 
 
-def _error_decades(values: Array, tolerance: float | None) -> int:
-    """Return the number of decades of an axis that shows the largest error and the tolerance."""
-    _, top = log_range(values, 0)
-    down_to = 0.1 * tolerance if tolerance else 1e-4 * top
-    return int(np.clip(np.ceil(np.log10(top / down_to)), 3, _MAX_DECADES))
-
-
 def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Measured minus true poses and joint positions; None if sensors have no errors."""
-    true = flight.signal("pose")
-    pose, at = _match_times(flight.signal("measured_pose"), true)
-    turn = quaternion_multiply(pose.values[:, 3:], quaternion_inverse(true.values[at, 3:]))
-    offset = pose.values[:, :3] - true.values[at, :3]
-    errors = Signal(pose.time, np.hstack([offset, rotvecs_from_quaternions(turn)]))
-    groups = axis_groups(errors, (("base position error", "m"), ("base attitude error", "rad")))
-    shape, at = _match_times(flight.signal("measured_q"), flight.signal("q"))
+    time, pose, true = _at_same_times(flight.signal("measured_pose"), flight.signal("pose"))
+    turn = quaternion_multiply(pose[:, 3:], quaternion_inverse(true[:, 3:]))
+    errors = np.hstack([pose[:, :3] - true[:, :3], rotvecs_from_quaternions(turn)])
+    parts = (("base position error", "m"), ("base attitude error", "rad"))
+    groups = axis_groups(Signal(time, errors), parts)
+    time, shape, true = _at_same_times(flight.signal("measured_q"), flight.signal("q"))
     if len(shape):
-        off = Signal(shape.time, shape.values - flight.q[at])
         units = {"m": "m", "rad": "rad"}
-        groups += joint_groups(flight, off, "joint position error", units)
+        groups += joint_groups(flight, Signal(time, shape - true), "joint position error", units)
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]
     if not groups:
         return None
@@ -681,10 +670,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
     return time_figure(flight, "sensors", "Errors of the sensors", caption, groups)
 
 
-def _match_times(measured: Signal, true: Signal) -> tuple[Signal, Indices]:
-    """Return the measured samples with a true sample at the same time, and its index."""
-    if not len(true):
-        return Signal.empty(measured.width), np.zeros(0, int)
-    at = np.clip(np.searchsorted(true.time, measured.time - 1e-9), 0, len(true) - 1)
-    same = np.abs(true.time[at] - measured.time) < 1e-9
-    return Signal(measured.time[same], measured.values[same]), at[same]
+def _at_same_times(measured: Signal, true: Signal) -> tuple[Array, Array, Array]:
+    """Return the times of both signals, and the values of each at these times."""
+    time, rows, at = np.intersect1d(measured.time, true.time, return_indices=True)
+    return time, measured.values[rows], true.values[at]

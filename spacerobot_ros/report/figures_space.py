@@ -157,17 +157,11 @@ def draw_robot(axes: Axes, solids: Sequence[PlacedSolid], points: Array, view: V
     axes.axis("off")
     across = float(span[0])
     corner = low + 0.08 * across
+    arrow = {"arrowstyle": "-|>", "color": SECONDARY_COLOUR, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
     for direction, name in zip(np.eye(3), "xyz", strict=True):
         if float(np.linalg.norm(view(direction))) < 0.1:
             continue
         tip = corner + 0.1 * across * view(direction)
-        arrow = {
-            "arrowstyle": "-|>",
-            "color": SECONDARY_COLOUR,
-            "lw": 0.9,
-            "shrinkA": 0,
-            "shrinkB": 0,
-        }
         axes.annotate("", tip, corner, arrowprops=arrow)
         end = corner + 0.135 * across * view(direction)
         axes.text(end[0], end[1], name, color=SECONDARY_COLOUR, ha="center", va="center")
@@ -246,9 +240,9 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     everything = everything[~np.isnan(everything).any(axis=1)]
     middle = (everything.max(axis=0) + everything.min(axis=0)) / 2
     half = 0.56 * max(float(np.ptp(everything, axis=0).max()), 1e-6)
-    views = {"from above": (0, 1), "from the front": (0, 2), "from the side": (1, 2)}
-    if float(np.ptp(everything[:, 2])) < 1e-9:
-        views = {"from above": (0, 1)}
+    views = {"from above": (0, 1)}
+    if float(np.ptp(everything[:, 2])) >= 1e-9:
+        views |= {"from the front": (0, 2), "from the side": (1, 2)}
     count = len(views)
     figure, places = _square_panels(count, count, 2.6, 2.35 if count > 1 else 4.2)
     for axes, (title, (i, j)) in zip(places, views.items(), strict=True):
@@ -257,14 +251,9 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
             axes.plot(path[:, i], path[:, j], color=tint, lw=0.9, rasterized=dense)
             axes.plot(*path[0, [i, j]], "o", color=tint, mfc="white", ms=5, zorder=4)
             axes.plot(*path[-1, [i, j]], "o", color=tint, ms=5, zorder=4)
-        for planned in flight.planned:
+        for plan in flight.planned:
             axes.plot(
-                planned[:, i],
-                planned[:, j],
-                color=PLANNED_COLOUR,
-                lw=1.3,
-                ls=(0, DASHES),
-                zorder=3,
+                plan[:, i], plan[:, j], color=PLANNED_COLOUR, lw=1.3, ls=(0, DASHES), zorder=3
             )
         for goal in goals:
             axes.plot(*goal[[i, j]], "x", color=GHOST_COLOUR, ms=8, mew=2, zorder=5)
@@ -335,8 +324,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
     if cycles is not None:
         part = part.between(*cycles.last(_SHOWN_CYCLES))
     part = part.broken_at(flight.resets)
-    one = len(pairs) == 1
-    across, high = (2, 3.4) if one else (_LOOP_JOINTS, 2.35)
+    across, high = (2, 3.4) if len(pairs) == 1 else (_LOOP_JOINTS, 2.35)
     figure, places = _square_panels(len(pairs), across, 2.0, high)
     for axes, (i, j) in zip(places, pairs, strict=True):
         x, y = part.values[:, i], part.values[:, j]
@@ -357,11 +345,10 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
             unit = f"{factors[0]}²" if factors[0] == factors[1] else " ".join(factors)
             axes.set_title(f"area {area:+.4g} {unit}")
             _draw_direction(axes, x, y)
-    if cycles is None:
-        caption = (
-            "Joint positions in pairs; a circle marks the first shape, and a dot the last shape."
-        )
-    else:
+    heading = "Path in shape space"
+    caption = "Joint positions in pairs; a circle marks the first shape, and a dot the last shape."
+    if cycles is not None:
+        heading = "Loops in shape space"
         caption = (
             f"The last {_SHOWN_CYCLES} of {cycles.count} cycles in shape space. Each begins and "
             "ends at the circle and, to first order, displaces the base in proportion to the areas "
@@ -370,7 +357,6 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
         )
     if len(flight.shape_columns) > _LOOP_JOINTS:
         caption += f" The first three of {len(flight.shape_columns)} joints are shown."
-    heading = "Path in shape space" if cycles is None else "Loops in shape space"
     return ReportFigure("loops", heading, caption, figure)
 
 
@@ -378,12 +364,8 @@ def _draw_direction(axes: Axes, x: Array, y: Array) -> None:
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     steps = np.hypot(np.diff(x) / (high - low)[0], np.diff(y) / (high - low)[1])
     k = int(np.argmax(steps))
-    axes.annotate(
-        "",
-        (x[k + 1], y[k + 1]),
-        (x[k], y[k]),
-        arrowprops={"arrowstyle": "-|>", "color": colour(0), "mutation_scale": 12},
-    )
+    arrow = {"arrowstyle": "-|>", "color": colour(0), "mutation_scale": 12}
+    axes.annotate("", (x[k + 1], y[k + 1]), (x[k], y[k]), arrowprops=arrow)
 
 
 _CLOSED_LOOP_DISTANCE = 0.02

@@ -20,6 +20,7 @@ from spacerobot_ros.flight.reading import (
     FlightBag,
     namespaces,
     open_flight_bag,
+    pose_of,
     read_flight,
 )
 from spacerobot_ros.flight.series import SentGoal, Signal, reported_goal
@@ -104,12 +105,8 @@ class FlightReport(Flight):
     @cached_property
     def planned(self) -> list[Array]:
         """Planned base positions (K, 3), m, one array per schedule."""
-        return [
-            np.array([[getattr(p.pose.position, x) for x in "xyz"] for p in message.poses]).reshape(
-                -1, 3
-            )
-            for _, message in self.bag.messages("planned_path")
-        ]
+        paths = [message.poses for _, message in self.bag.messages("planned_path")]
+        return [np.array([pose_of(p)[0] for p in poses]).reshape(-1, 3) for poses in paths]
 
     # -- the bag and the robot ----------------------------------------------------------------
 
@@ -129,13 +126,6 @@ class FlightReport(Flight):
     def obstacles(self) -> tuple[tuple[Visual, Pose], ...]:
         """Obstacle solids, each with the pose of its link in the world."""
         return () if self.robot is None else obstacle_visuals(self.robot.world, self.mesh_of)
-
-    @property
-    def target_pose(self) -> Signal:
-        """True target pose (M, 7): position, m, and quaternion; empty if there is no target."""
-        if self.target is None:
-            return Signal.empty(7)
-        return self.signal("true_target_pose") or self.signal("target_pose")
 
     # -- names --------------------------------------------------------------------
 
@@ -240,7 +230,18 @@ class FlightReport(Flight):
         up to two thousand states. There are no angles if any attitude is acceptable. No links are
         returned if the bag lacks the robot description or states.
         """
-        return {link: self._errors_of_link(link) for link in self.link_poses}
+        found = {}
+        for link, poses in self.link_poses.items():
+            aims = [
+                (GoalSpan(target.start, target.end, aim.as_goal()), aim.quaternion is not None)
+                for target in self._all_targets
+                for aim in target.goal.end_effectors
+                if aim.link == link
+            ]
+            distances = pose_errors(poses, [span for span, _ in aims]).norms([0, 1, 2])
+            angles = pose_errors(poses, [span for span, turns in aims if turns]).norms([3, 4, 5])
+            found[link] = distances, angles
+        return found
 
     @cached_property
     def link_poses(self) -> dict[str, Signal]:
@@ -253,18 +254,6 @@ class FlightReport(Flight):
         poses = link_poses(self.robot, continuous(self.pose)[rows], self.joints[rows])
         time = self.time[rows]
         return {link: Signal(time, poses[link]) for link in links if link in poses}
-
-    def _errors_of_link(self, link: str) -> tuple[Signal, Signal]:
-        aims = [
-            (GoalSpan(target.start, target.end, aim.as_goal()), aim.quaternion is not None)
-            for target in self._all_targets
-            for aim in target.goal.end_effectors
-            if aim.link == link
-        ]
-        poses = self.link_poses[link]
-        distances = pose_errors(poses, [span for span, _ in aims]).norms([0, 1, 2])
-        angles = pose_errors(poses, [span for span, turns in aims if turns]).norms([3, 4, 5])
-        return distances, angles
 
     @property
     def tool_goals(self) -> tuple[SentGoal, ...]:

@@ -10,7 +10,7 @@ from html import escape
 from importlib.metadata import distribution
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -117,19 +117,13 @@ _MAX_CYCLE_INSTANTS = 300
 """Largest number of equal-phase instants between the cycles shown in full."""
 
 
-@dataclass(frozen=True)
-class KeyFrames:
-    """Recorded states to show; the motion between these states is interpolated.
+class KeyFrames(NamedTuple):
+    """Recorded states to show, in order from the first to the last; the motion in between is
+    interpolated.
 
-    Attributes
-    ----------
-    indices
-        State indices, ascending, including the first and last recorded state.
-    error
-        Largest deviation of an omitted state from the interpolation, in tolerances.
-    every
-        Number of cycles per shown state between the cycles shown in full, always at the same phase;
-        0 if all cycles are shown in full.
+    ``error`` is the largest deviation of an omitted state from the interpolation, in tolerances,
+    and ``every`` the number of cycles per shown state between the cycles shown in full; 0 if all
+    cycles are shown in full.
     """
 
     indices: Indices
@@ -138,15 +132,11 @@ class KeyFrames:
 
 
 def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
-    """Choose at most a thousand key frames such that linear interpolation is accurate enough.
+    """Choose at most a thousand key frames of a motion (N, k), in tolerances, such that linear
+    interpolation is accurate enough.
 
-    Parameters
-    ----------
-    motion
-        The visible motion (N, k), with each column divided by its tolerance.
-    cycles
-        Its equal cycles. All but the first and last few cycles are sampled at the same phase:
-        otherwise fast loops would look like slow loops (aliasing).
+    All but the first and last few equal ``cycles`` are sampled at the same phase: otherwise fast
+    loops would look like slow loops (aliasing).
     """
     shown, every = np.arange(len(motion)), 0
     if cycles is not None and cycles.count > 2 * FULL_CYCLES:
@@ -170,17 +160,13 @@ def _set_property(path: str, name: str, value: Any) -> Command:
     return {"type": "set_property", "path": path, "property": name, "value": value}
 
 
-def _set_transform(path: str, matrix: Array) -> Command:
-    """Set a matrix (4, 4), which is sent column by column."""
+def _place(path: str, r: Array, A: Array) -> Command:
+    """Move and turn (or scale) the object at a path by an offset (3,) and a matrix (3, 3)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = A, r
+    # The matrix is sent column by column.
     flat = [round(float(x), 9) for x in matrix.T.ravel()]
     return {"type": "set_transform", "path": path, "matrix": flat}
-
-
-def _place(path: str, pose: Array) -> Command:
-    """Set a pose (7,)."""
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = matrix_from_quaternion(pose[3:]), pose[:3]
-    return _set_transform(path, matrix)
 
 
 def _set_object(path: str, points: Array, material: Command, kind: str, index: Any = ()) -> Command:
@@ -240,17 +226,11 @@ def _see_through(opacity: float) -> Command:
 
 def _clip(path: str, time: Array, poses: Array) -> Command:
     """Return the motion of an object through poses (k, 7) at times (k,)."""
+    times = np.round(time, 4).tolist()
+    parts = ((".position", "vector3", poses[:, :3]), (".quaternion", "quaternion", poses[:, 3:]))
     tracks = [
-        {
-            "name": f".{name}",
-            "type": kind,
-            "times": np.round(time, 4).tolist(),
-            "values": _rounded(values),
-        }
-        for name, kind, values in (
-            ("position", "vector3", poses[:, :3]),
-            ("quaternion", "quaternion", poses[:, 3:]),
-        )
+        {"name": name, "type": kind, "times": times, "values": _rounded(values)}
+        for name, kind, values in parts
     ]
     return {"path": path, "clip": {"fps": 1, "name": "flight", "tracks": tracks}}
 
@@ -323,7 +303,8 @@ def _body_commands(bodies: Iterable[Body], opacity: float = 1.0) -> list[Command
     commands: list[Command] = []
     for body in bodies:
         path = _path_of(body)
-        commands.append(_place(path, body.poses[0]))
+        pose = body.poses[0]
+        commands.append(_place(path, pose[:3], matrix_from_quaternion(pose[3:])))
         for number, visual in enumerate(body.visuals):
             commands += _solid(f"{path}/{number}", visual, body.color_of(visual), opacity)
     return commands
@@ -358,9 +339,6 @@ def _camera_position(points: Array, flat: bool) -> Array:
 
 def _stage_commands(points: Array, center: Array, radius: float, flat: bool) -> list[Command]:
     """Background, camera, world axes and grid; the scene is moved and scaled to radius 1."""
-    world = np.eye(4)
-    world[:3, :3] /= radius
-    world[:3, 3] = -center / radius
     x, y, z = _camera_position((points - center) / radius, flat).tolist()
     camera = "/Cameras/default/rotated/<object>"
     spacing = 10.0 ** math.floor(math.log10(radius))
@@ -373,7 +351,7 @@ def _stage_commands(points: Array, center: Array, radius: float, flat: bool) -> 
         _set_property(camera, "fov", _FIELD_OF_VIEW),
         # The camera's own y axis is up.
         _set_property(camera, "position", [x, z, -y]),
-        _set_transform(WORLD, world),
+        _place(WORLD, -center / radius, np.eye(3) / radius),
         _lines(f"{WORLD}/grid", _grid_lines(center, radius, spacing, flat), LINE_COLOUR, 0.6),
         *_triad(f"{WORLD}/world", 0.25 * radius),
     ]
@@ -427,8 +405,8 @@ def _goal_commands(flight: FlightReport, most: int, radius: float) -> list[Comma
     ball = Shape("sphere", (0.03 * radius,), Pose())
     for mark, position, quaternion in marks:
         path = f"{WORLD}/{mark}"
-        attitude = [0.0, 0.0, 0.0, 1.0] if quaternion is None else quaternion
-        commands.append(_place(path, np.concatenate([position, attitude])))
+        R = np.eye(3) if quaternion is None else matrix_from_quaternion(quaternion)
+        commands.append(_place(path, position, R))
         commands += _solid(f"{path}/mark", Visual("", 0, ball, solid_mesh(ball)), GHOST_COLOUR, 0.4)
         commands += [] if quaternion is None else _triad(path, 0.12 * radius)
     return commands

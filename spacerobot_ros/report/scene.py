@@ -28,19 +28,11 @@ _FLATNESS_STATES = 25
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body in the scene.
+    """A rigid body in the scene, with a unique name, its solids in the body frame, and a color
+    ``#rrggbb``; empty if each solid has its own.
 
-    Attributes
-    ----------
-    name
-        Its unique name.
-    visuals
-        Solids of the body, in the body frame.
-    poses
-        World poses (K, 7) of the body at the scene instants, m and quaternion; (1, 7) if it is at
-        rest.
-    color
-        ``#rrggbb``; empty if each solid has its own color.
+    ``poses`` (K, 7) are in the world at the scene instants, m and quaternion; (1, 7) if the body is
+    at rest.
     """
 
     name: str
@@ -60,28 +52,20 @@ def robot_bodies(
     q: Array,
     most: int,
 ) -> list[Body]:
-    """Return the robot links that have solids, with the colours of the joints that move them.
+    """Return the robot links that have solids, with the colours of the joints that move them, at
+    base poses (K, 7) in the world and joint positions (K, n), m or rad.
 
-    Parameters
-    ----------
-    robot
-        The robot.
-    meshes
-        Triangles of its meshes, by URI.
-    base, q
-        (K, 7) base poses in the world, and (K, n) joint positions, m or rad.
-    most
-        Largest number of mesh faces.
+    ``meshes`` are the triangles of the robot's meshes by URI, and ``most`` is the largest number
+    of mesh faces.
     """
-    poses = link_poses(robot, base, q)
     visuals = visuals_of(robot, meshes, most)
     found = []
-    for link, of_link in poses.items():
+    for link, poses in link_poses(robot, base, q).items():
         solids = tuple(each for each in visuals if each.link == link)
         body = robot.frames[link][0]
         if solids:
             color = _BASE_COLOUR if body == 0 else colour(body - 1)
-            found.append(Body(link, solids, of_link, color))
+            found.append(Body(link, solids, poses, color))
     return found
 
 
@@ -98,9 +82,7 @@ def bodies_of(flight: FlightReport, rows: Sequence[int], most: int) -> list[Body
     if target is not None and len(seen):
         times = np.searchsorted(seen.time, flight.time[at] - 1e-9)
         poses = continuous(seen.values)[np.minimum(times, len(seen) - 1)]
-        solids = (
-            _moved(each, target.frames[each.link][1]) for each in visuals_of(target, {}, most)
-        )
+        solids = [_moved(x, target.frames[x.link][1]) for x in visuals_of(target, {}, most)]
         found.append(Body("target", tuple(solids), poses))
     return found
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,19 +32,10 @@ _ROUNDING = 1e-9
 plane the first is visible."""
 
 
-@dataclass(frozen=True, eq=False)
-class PlacedSolid:
-    """A solid in the world.
-
-    Attributes
-    ----------
-    corners, normals
-        (F, 3, 3) triangle corners, and outward normals (F, 3).
-    edges, edge_normals
-        (E, 2, 3) ends of sharp edges, and normals (E, 2, 3) of the two adjacent faces; an edge is
-        visible if one of these faces is visible.
-    fill
-        (3,) color: red, green and blue, 0 to 1.
+class PlacedSolid(NamedTuple):
+    """A solid in the world: triangle corners (F, 3, 3) and their outward normals (F, 3), ends
+    (E, 2, 3) of its sharp edges and normals (E, 2, 3) of the two adjacent faces, and its colour
+    (3,), red, green and blue, 0 to 1.
     """
 
     corners: Array
@@ -107,17 +98,8 @@ class View:
 
 
 class Canvas:
-    """Pixels over a rectangle in the image plane, ``low`` to ``high`` (2,) in m.
-
-    Parameters
-    ----------
-    view
-        The projection.
-    low, high
-        Corners of the rectangle.
-    width
-        Pixels across.
-    """
+    """Pixels over a rectangle in the image plane of a view, ``low`` to ``high`` (2,) in m;
+    ``width`` is the number of pixels across."""
 
     def __init__(self, view: View, low: Array, high: Array, width: int) -> None:
         self._view = view
@@ -135,6 +117,7 @@ class Canvas:
                 if normal @ self._view.viewing_direction > _MIN_FACING_COSINE:
                     self._fill_face(corners, self._view.shade(solid.fill, normal))
         for solid in solids:
+            # An edge is visible if one of the adjacent faces is.
             seen = solid.edge_normals @ self._view.viewing_direction > _MIN_FACING_COSINE
             for ends in solid.edges[seen.any(axis=1)]:
                 self._draw_edge(ends)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -39,7 +39,6 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     """Return the label, value and note of each key figure."""
     rows: list[tuple[str, str, str]] = []
     error, sensed = flight.error, pose_error(flight.signal("measured_pose"), flight.base_goal)
-    tool = flight.end_effector_error if flight.tool_goals else None
     if error is not None:
         measured = "" if sensed is None else f"measured: {quantity(sensed.distance, 'm')}"
         near = quantity(error.distance, "m"), measured
@@ -49,7 +48,7 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
             measured = "; ".join(filter(None, (f"{math.degrees(error.angle):.3g}°", measured)))
         turned = quantity(error.angle, "rad"), measured
         rows.append(("Attitude error", *_error_with_tolerance(flight, "attitude", *turned)))
-    if tool is not None:
+    if flight.tool_goals and (tool := flight.end_effector_error) is not None:
         turns = bool(set(flight.controls("end_effector")) & {3, 4, 5})
         rows.append(_end_effector_row(flight, "End-effector error", tool, turns))
     for link, left in flight.end_effector_errors.items():
@@ -58,13 +57,8 @@ def headline(flight: FlightReport) -> list[tuple[str, str, str]]:
     if flight.time_flown is not None:
         schedules = len(flight.executing)
         notes = [f"{schedules} schedules in the whole flight"] if schedules > 1 else []
-        rows.append(
-            (
-                "Manoeuvre",
-                f"{flight.time_flown:.6g} s",
-                "; ".join([*notes, *_time_to_end_texts(flight)]),
-            )
-        )
+        notes += _time_to_end_texts(flight)
+        rows.append(("Manoeuvre", f"{flight.time_flown:.6g} s", "; ".join(notes)))
     if len(flight.unexplained_momentum) > 1:
         linear, angular = flight.momentum_drift.tolist()
         label = "Momentum not explained by thrusters" if flight.has_thrust else "Momentum drift"
@@ -142,8 +136,7 @@ def result_table(flight: FlightReport) -> Table:
         rows.append((f"Goal {part}{refused if part != _FREE_BASE else ''}", text))
     if len(flight.time):
         rows.append(("Final position", _position_text(flight.pose[-1, :3])))
-        attitude = rotvec_from_quaternion(flight.pose[-1, 3:])
-        rows.append(("Final attitude", _format_attitude(attitude)))
+        rows.append(("Final attitude", _attitude_text(flight.pose[-1, 3:])))
     if flight.tool_goals and len(flight.tool):
         goal = flight.tool_goals[-1].goal
         rows.append(("End-effector goal", _position_text(goal.position)))
@@ -171,17 +164,14 @@ def _base_goal_texts(flight: FlightReport) -> dict[str, str]:
         return {_FREE_BASE: "not controlled"} if flight.link_goals else {}
     if not flight.controls("base") and flight.outputs:
         return {}
-    attitude = _format_attitude(rotvec_from_quaternion(goal.quaternion))
     poses = goal.path_values[:-1]
     through = {f"waypoint {i + 1}": _pose_text(x[:3], x[3:]) for i, x in enumerate(poses)}
+    attitude = _attitude_text(goal.quaternion)
     return through | {"position": _position_text(goal.position), "attitude": attitude}
 
 
 def _pose_text(position: Array, quaternion: Array | None) -> str:
-    attitude = "any attitude"
-    if quaternion is not None:
-        attitude = _format_attitude(rotvec_from_quaternion(quaternion))
-    return f"{_position_text(position)}, {attitude}"
+    return f"{_position_text(position)}, {_attitude_text(quaternion)}"
 
 
 def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
@@ -292,7 +282,10 @@ def _position_text(position: Array) -> str:
     return f"({numbers(position)}) m"
 
 
-def _format_attitude(rotvec: Iterable[float]) -> str:
+def _attitude_text(quaternion: Array | None) -> str:
+    if quaternion is None:
+        return "any attitude"
+    rotvec = rotvec_from_quaternion(quaternion)
     angle = math.degrees(math.hypot(*rotvec))
     return f"rotation vector ({numbers(rotvec)}) rad, {angle:.3f}° in total"
 

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import GetState
@@ -22,12 +21,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.reading import (
-    open_flight_bag,
-    read_flight,
-    require_states,
-    with_propellant,
-)
+from spacerobot_ros.flight.reading import open_flight_bag, read_flown
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.nodes.common.process import start_ros, use_loopback_discovery
 from spacerobot_ros.planning import Goal
@@ -94,24 +88,19 @@ def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
     scenario, client = stack.scenario, stack.client
     assert stack.bag is not None
     bag = open_flight_bag(stack.bag)
-    flight = read_flight(bag)
-    require_states(bag, flight)
+    flight = read_flown(bag, scenario)
     outcome, message = client.outcome or Outcome.INTERRUPTED, client.message
     if outcome is Outcome.INTERRUPTED:
         message = f"Interrupted after {flight.duration:.6g} s of simulated time."
     flight = replace(
         flight,
-        scenario=scenario,
         outcome=outcome,
         message=message,
-        goal=scenario.goal.kept_at(*np.split(flight.pose[0], [3])),
-        end_effector_goal=scenario.end_effector_goal,
         status=client.status,
         gait=client.gait,
         plan_time=stack.statistics.plan_time_s,
         wall_time=wall_time,
     )
-    flight = with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))
     recorded = {"messages_recorded": bag.message_count, "bag": str(bag.path)}
     return {**flight.summary(), **recorded}
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from spacerobot_ros.bag import BagWriter, free_name
 from spacerobot_ros.errors import SpaceRobotError, describe_exception
-from spacerobot_ros.flight.lockstep import LockstepFlight, Robots, require_flyable
+from spacerobot_ros.flight.lockstep import LockstepFlight
 from spacerobot_ros.flight.saved import write_flight
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.termination import graceful_shutdown
@@ -76,8 +76,7 @@ def run_scenario(
         from spacerobot_ros.session.live import fly_by_nodes  # This import loads ROS.
 
         return RunResult(fly_by_nodes(scenario, bag, report, longest))
-    require_flyable(scenario)
-    flight = LockstepFlight(scenario, Robots.of(scenario))
+    flight = LockstepFlight(scenario)
     if scenario.parameters("recorder").get("when_exists") == "next":
         bag = free_name(bag)
     writer = BagWriter.for_recorder(bag, scenario.config("recorder"))

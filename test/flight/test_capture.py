@@ -14,10 +14,10 @@ from support.oracles import Array
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.bag.salvage import salvage_bag
+from spacerobot_ros.control.wheels import BUDGET_PARTS
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.captures import (
-    BUDGET_PARTS,
     held_bodies,
     momentum_budget_over_time,
     payload_estimates,

@@ -15,7 +15,7 @@ from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
-from spacerobot_ros.flight.reading import read_run, recorded_scenario
+from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
@@ -77,7 +77,7 @@ def assert_same(flight: Flight, other: Flight, tolerance: float = 0.0) -> None:
 @pytest.mark.parametrize("bag", BAGS)
 def test_reference_bags_are_flown_again_without_ros(bag: Path) -> None:
     """They were flown through the nodes. Plans may differ in the last digits between machines."""
-    flight, recorded = fly_scenario(recorded_scenario(read_bag(bag))), read_run(bag)
+    flight, recorded = fly_scenario(read_run(bag).scenario), read_run(bag)
     assert len(recorded.time) > 25
     assert_same(flight, recorded, 1e-9)
     worlds = (str(each.get("world")) for each in read_bag(bag).metadata.values())

@@ -17,9 +17,8 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.flight.reading import (
     open_flight_bag,
-    read_flight,
+    read_flown,
     read_run,
-    with_propellant,
 )
 from spacerobot_ros.measures import Outcome, flown_time
 from spacerobot_ros.model.thrusters import find_thrusters
@@ -78,12 +77,7 @@ def summary(path: Path, wall_time: float = 0.5, **options: Any) -> dict[str, Any
 def summed_up(path: Path, scenario: Scenario, wall_time: float, **known: Any) -> dict[str, Any]:
     """Sum up a bag, with what a client knows at the end."""
     bag = open_flight_bag(path)
-    flight = replace(
-        read_flight(bag),
-        scenario=scenario, goal=scenario.goal, end_effector_goal=scenario.end_effector_goal,
-        plan_time=0.75, wall_time=wall_time, **known,
-    )  # fmt: skip
-    flight = with_propellant(flight, scenario.plant.thrusters, bag.names("thrusters"))
+    flight = replace(read_flown(bag, scenario), plan_time=0.75, wall_time=wall_time, **known)
     return {**flight.summary(), "messages_recorded": bag.message_count, "bag": str(bag.path)}
 
 
