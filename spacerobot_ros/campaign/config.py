@@ -66,16 +66,14 @@ class Criterion:
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign.
+    """A campaign, as in its file, whose content is ``section``.
 
     Attributes
     ----------
-    name
-        Name of its file.
     scenario
         Scenario, including the parameters common to all flights.
-    flights, seed, sampler
-        Number of draws, seed and sampler.
+    flights
+        Number of draws.
     max_flight_time
         Simulated time after which a flight is interrupted, s.
     dispersions
@@ -87,10 +85,6 @@ class Campaign:
     engine
         Name of the engine: ``auto``, ``lanes``, ``flights``, or of a device
         (:func:`.device_named`).
-    description
-        Description for readers of the report.
-    section
-        Content of the file.
     """
 
     name: str

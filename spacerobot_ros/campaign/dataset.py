@@ -60,20 +60,9 @@ ERROR = "error"
 class Row:
     """The result of one draw.
 
-    Attributes
-    ----------
-    draw
-        The drawn values.
-    outcome, reason
-        Goal outcome, or ``error``, and the message.
-    metrics
-        Metrics by name; empty if nothing was flown.
-    passed
-        Whether the goal was reached and all criteria were met.
-    engine
-        Name of the engine used.
-    wall_time, plan_time
-        Wall time of the flight, and wall time of its planning, s.
+    ``outcome`` and ``reason`` are the goal outcome, or ``error``, and the message. ``metrics``, by
+    name, are empty if nothing was flown. ``passed``: the goal was reached and all criteria were
+    met. Wall times of the flight and of its planning are in s.
     """
 
     draw: Draw
@@ -140,14 +129,8 @@ class Row:
 @lru_cache(maxsize=1)
 def versions_json() -> str:
     """Return the software versions, including the hash of this package's code."""
-    return json.dumps(
-        {
-            "spacerobot_ros": __version__,
-            "source": source_hash(),
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        }
-    )
+    ours = {"spacerobot_ros": __version__, "source": source_hash()}
+    return json.dumps({**ours, "numpy": np.__version__, "python": platform.python_version()})
 
 
 class Dataset:
@@ -155,11 +138,6 @@ class Dataset:
 
     ``campaign.yaml`` and ``scenario.yaml`` describe the flights; ``flights/*.parquet`` contain one
     row per flight.
-
-    Parameters
-    ----------
-    folder
-        Path of the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -204,9 +182,7 @@ class Dataset:
                     f"The flights in {self.folder} were flown with different software "
                     f"({flown_by}): the results of further flights may differ."
                 )
-            self._write_description(
-                campaign, max([campaign.flights, *(number + 1 for number in done)])
-            )
+            self._write_description(campaign, max(campaign.flights, 1 + max(done, default=0)))
             return done
         except OSError as error:
             self.close()
@@ -256,13 +232,12 @@ class Dataset:
             "versions": versions_json(),
             "scenario": campaign.scenario.name,
         }
-        content = {"campaign": section}
-        texts = {
-            _SCENARIO_FILE: scenario_text(self_contained(campaign).scenario),
-            _CAMPAIGN_FILE: yaml.safe_dump(content, sort_keys=False, allow_unicode=True),
-            _ABOUT_FILE: json.dumps(facts, indent=1),
-        }
-        for name, text in texts.items():
+        content = yaml.safe_dump({"campaign": section}, sort_keys=False, allow_unicode=True)
+        for name, text in (
+            (_SCENARIO_FILE, scenario_text(self_contained(campaign).scenario)),
+            (_CAMPAIGN_FILE, content),
+            (_ABOUT_FILE, json.dumps(facts, indent=1)),
+        ):
             write_whole(self.folder / name, text.encode(), mode=0o666)
 
     def _lock(self) -> None:
@@ -296,11 +271,9 @@ class Dataset:
         facts = self._read_identity()
         try:
             content = load_yaml((self.folder / _CAMPAIGN_FILE).read_text(encoding="utf-8"))
-            section = dict(content["campaign"])
-            scenario = replace(
-                load_scenario(str(self.folder / _SCENARIO_FILE)), name=facts["scenario"]
-            )
-            return parse_campaign(facts["name"], section, self.folder, scenario)
+            scenario = load_scenario(str(self.folder / _SCENARIO_FILE))
+            named = replace(scenario, name=facts["scenario"])
+            return parse_campaign(facts["name"], dict(content["campaign"]), self.folder, named)
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise _damaged_file_error(self.folder / _CAMPAIGN_FILE, error) from error
         except ParameterError as error:
@@ -434,11 +407,8 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
     """Return the settings, other than the scenario, that determine the rows of a campaign."""
     own = {"flights", "engine", "description", "scenario", "set", "method"}
     section = {key: value for key, value in campaign.section.items() if key not in own}
-    section |= {
-        "seed": campaign.seed,
-        "sampler": campaign.sampler,
-        "longest": campaign.max_flight_time,
-    }
+    section |= {"seed": campaign.seed, "sampler": campaign.sampler}
+    section["longest"] = campaign.max_flight_time
     if campaign.sampler in FIXED_SIZE_SAMPLERS:
         section["flights"] = campaign.flights
     return section

@@ -24,17 +24,8 @@ _TABLE, _CORRELATED = "table", "multivariate_normal"
 
 @dataclass(frozen=True)
 class Distribution:
-    """Probability distribution of a value: one of scipy.stats, a choice, or table rows.
-
-    Attributes
-    ----------
-    name
-        Name in ``scipy.stats``, ``choice``, or ``table``.
-    arguments
-        Arguments by name, as in ``scipy.stats``.
-    choices
-        Equally likely values of a ``choice``, or the values in a ``table``, one per flight.
-    """
+    """Probability distribution of a value: one of scipy.stats, with its arguments by name; equally
+    likely choices (``choice``); or table rows, one per flight (``table``)."""
 
     name: str
     arguments: Mapping[str, float] = field(default_factory=dict)
@@ -55,10 +46,8 @@ class Distribution:
             return [self.choices[min(int(u * (last + 1)), last)] for u in shares.tolist()]
         # Values that are not finite are refused when a flight draws them.
         with np.errstate(all="ignore"):
-            found = np.asarray(
-                _load_scipy_distribution(self.name).ppf(shares, **self.arguments), dtype=float
-            )
-        return list(found.tolist())
+            found = _load_scipy_distribution(self.name).ppf(shares, **self.arguments)
+        return list(np.asarray(found, dtype=float).tolist())
 
     def __str__(self) -> str:
         if self.name == _TABLE:
@@ -118,11 +107,8 @@ def read_distributions(section: Mapping[str, Any], scenario: Scenario) -> Iterat
         A name, a distribution, or one of its arguments is invalid.
     """
     for names, given in section.items():
-        targets = [
-            target
-            for name in str(names).split(",")
-            for target in targets_of(name.strip(), scenario)
-        ]
+        parts = (name.strip() for name in str(names).split(","))
+        targets = [target for name in parts for target in targets_of(name, scenario)]
         if isinstance(given, dict) and set(given) == {_CORRELATED}:
             yield from _read_correlated(str(names), targets, given[_CORRELATED])
             continue
@@ -261,19 +247,18 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
     distribution = _load_scipy_distribution(str(kind))
     shapes = (distribution.shapes or "").replace(" ", "").split(",")
     words = [*filter(None, shapes), "loc", *(["scale"] if hasattr(distribution, "pdf") else [])]
-    if isinstance(arguments, list):
-        if kind == "uniform":
-            if len(arguments) != 2:
-                raise ParameterError(f"'{name}': uniform takes two numbers, [smallest, largest].")
-            least, most = (read_real_number(f"{name}: uniform", each) for each in arguments)
-            if not least < most:
-                raise ParameterError(
-                    f"'{name}': uniform ranges from {least:g} to {most:g}; the first number must "
-                    "be smaller."
-                )
-            arguments = [least, most - least]
-        if len(arguments) <= len(words):
-            arguments = dict(zip(words, arguments, strict=False))
+    if isinstance(arguments, list) and kind == "uniform":
+        if len(arguments) != 2:
+            raise ParameterError(f"'{name}': uniform takes two numbers, [smallest, largest].")
+        least, most = (read_real_number(f"{name}: uniform", each) for each in arguments)
+        if not least < most:
+            raise ParameterError(
+                f"'{name}': uniform ranges from {least:g} to {most:g}; the first number must "
+                "be smaller."
+            )
+        arguments = [least, most - least]
+    if isinstance(arguments, list) and len(arguments) <= len(words):
+        arguments = dict(zip(words, arguments, strict=False))
     required = set(filter(None, shapes))
     if not isinstance(arguments, dict) or not required <= arguments.keys() <= set(words):
         named = arguments if isinstance(arguments, dict) else {}
@@ -295,13 +280,12 @@ def _read_distribution(target: DispersionTarget, given: Any) -> Distribution:
 
 
 def _read_choice(target: DispersionTarget, value: Any, where: str = "choice") -> Any:
-    if target.is_text:
-        if not isinstance(value, str):
-            raise ParameterError(f"'{target.name}' is a string; the {where} has {value!r}.")
-        return value
-    return read_real_number(
-        f"{target.name}: {where}", number_in(value) if isinstance(value, str) else value
-    )
+    if not target.is_text:
+        number = number_in(value) if isinstance(value, str) else value
+        return read_real_number(f"{target.name}: {where}", number)
+    if not isinstance(value, str):
+        raise ParameterError(f"'{target.name}' is a string; the {where} has {value!r}.")
+    return value
 
 
 def _require_node_accepts(target: DispersionTarget, value: Any, scenario: Scenario) -> None:
@@ -314,15 +298,11 @@ def _load_scipy_distribution(name: str) -> Any:
     """Return a distribution of scipy.stats, which takes a second to load."""
     from scipy import stats
 
-    found = getattr(stats, name, None)
-    if not isinstance(found, (stats.rv_continuous, stats.rv_discrete)):
-        known = [
-            each
-            for each, value in vars(stats).items()
-            if isinstance(value, (stats.rv_continuous, stats.rv_discrete))
-        ]
+    kinds = stats.rv_continuous, stats.rv_discrete
+    known = {each: value for each, value in vars(stats).items() if isinstance(value, kinds)}
+    if name not in known:
         raise ParameterError(
             f"scipy.stats has no distribution '{name}'."
             f"{suggestion(_SCIPY_NAMES.get(name.lower(), name), [*known, 'choice'])}"
         )
-    return found
+    return known[name]

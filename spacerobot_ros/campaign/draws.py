@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
@@ -35,20 +36,12 @@ _SEED = "plant.sensors.seed"
 
 @dataclass(frozen=True)
 class Draw:
-    """The drawn values of one flight.
+    """The drawn values of the flight with some number, by dispersion name, and the seed of its
+    sensor and actuator noise.
 
-    Attributes
-    ----------
-    number
-        Flight number.
-    seed
-        Seed of sensor and actuator noise.
-    values
-        Values by dispersion name.
-    fallback
-        Reason why engine ``flights`` flies the draw instead of the campaign's engine, which
-        completes "the flight ..." (for example "needed corrections"), or is an error message; empty
-        for the campaign's engine.
+    ``fallback`` is the reason why engine ``flights`` flies the draw instead of the campaign's
+    engine, which completes "the flight ..." (for example "needed corrections"), or is an error
+    message; empty for the campaign's engine.
     """
 
     number: int
@@ -58,13 +51,7 @@ class Draw:
 
 
 class Draws:
-    """All draws in a campaign.
-
-    Raises
-    ------
-    ParameterError
-        The sampler requires more flights than the campaign has.
-    """
+    """All draws in a campaign; ParameterError: the sampler requires more flights."""
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign
@@ -184,12 +171,10 @@ def drawn_flights(
                 # Other values are refused below.
                 dispersion.target.weigh(factors, np.where(np.isfinite(drawn), drawn, 1.0))
         parameters, differ = factors.applied_to(nominal), factors.differ.tolist()
-        suspicious = False
-        if any(differ):
-            try:
-                parameters.require_physical(bodies)
-            except RobotDescriptionError:
-                suspicious = True
+        suspicious = any(differ)
+        with suppress(RobotDescriptionError):
+            parameters.require_physical(bodies)
+            suspicious = False
         for row, draw in enumerate(block):
             seed = draw.seed if has_own_seed else None
             flight = replace(common, inertial=parameters[row] if differ[row] else None, seed=seed)

@@ -77,32 +77,19 @@ _EXTERNAL_LOAD_PREFIXES = "plant.disturbances", "plant.orbit.", "plant.table."
 _GAIN_PREFIX = "coordinated_control.gains."
 """Prefix of controller parameters that may differ between lanes."""
 
-_COMMON_PARAMETERS = (
-    "plant.tick_rate",
-    "plant.integration_step",
-    "plant.actuation",
-    "plant.engine",
-)
+_COMMON_PARAMETERS = "plant.tick_rate", "plant.integration_step", "plant.actuation", "plant.engine"
 """Prefixes of parameters that are the same in all lanes."""
 
 _PARAMETERS_COMMON_TO_CONTROLLERS = (
     *_COMMON_PARAMETERS,
-    "plant.thrusters",
-    "plant.end_effector_frame",
-    "plant.beyond_limits",
-    "plant.latched_faults",
-    "plant.robot",
+    *("plant.thrusters", "plant.end_effector_frame", "plant.beyond_limits"),
+    *("plant.latched_faults", "plant.robot"),
 )
 
 _PARAMETERS_COMMON_TO_SCHEDULES = (
     *_COMMON_PARAMETERS,
-    "planner.tick_rate",
-    "planner.averaging",
-    "planner.drift",
-    "planner.replan",
-    "planner.shape_",
-    "planner.max_corrections",
-    "planner.output",
+    *("planner.tick_rate", "planner.averaging", "planner.drift", "planner.replan"),
+    *("planner.shape_", "planner.max_corrections", "planner.output"),
 )
 
 _OUTCOME_OF_DECISION = {
@@ -160,11 +147,8 @@ class LanesEngine:
             return "it has disturbances, an orbit or a table; use engine 'flights'"
         if campaign.measures_clearance:
             return "it uses the metric clearance_m, and lanes measure no distances between links"
-        if campaign.own_metrics:
-            return (
-                f"the metric '{campaign.own_metrics[0]}' requires whole flights; use engine "
-                "'flights'"
-            )
+        if own := campaign.own_metrics:
+            return f"the metric '{own[0]}' requires whole flights; use engine 'flights'"
         match scenario.commanders, plant.actuation:
             case ("planner",), "velocity":
                 return self._scheduled.refusal(campaign)
@@ -278,16 +262,17 @@ class _ScheduledLanes:
 
     def flights(self, campaign: Campaign, batch: Sequence[_PreparedDraw]) -> Flights:
         planner = batch[0].flight.scenario.planner
-        first, ticks = batch[0].schedule, [each.schedule.ticks for each in batch]
+        schedules = [each.schedule for each in batch]
+        ticks = {each.ticks for each in schedules}
         most = max(ticks)
-        if all(each.schedule is first for each in batch):
-            positions = first.positions
-        else:
-            schedules = [each.schedule for each in batch]
-            padding = [((0, most - each.ticks), (0, 0)) for each in schedules]
-            shapes = zip((each.positions for each in schedules), padding, strict=True)
-            positions = np.array([np.pad(each, rows, "edge") for each, rows in shapes])
-        instants = np.unique(np.concatenate([_evaluated_ticks(each) for each in set(ticks)]))
+        positions = schedules[0].positions
+        if any(each is not schedules[0] for each in schedules):
+            padded = (
+                np.pad(each.positions, ((0, most - each.ticks), (0, 0)), "edge")
+                for each in schedules
+            )
+            positions = np.array([*padded])
+        instants = np.unique(np.concatenate([_evaluated_ticks(each) for each in ticks]))
         return _batch_of_flights(
             [each.flight for each in batch],
             FollowedSchedule(positions, planner.shape_gain, planner.shape_deadband),
@@ -463,10 +448,7 @@ class _ControlledLanes:
         n, end = flights.robot.n, result.end_state[row]
         q, pose = end[:n], end[2 * n : 2 * n + 7]
         hand = _end_effector_error(flights.robot, ready.flight, q, pose)
-        distance = angle = math.nan
-        if hand is not None:
-            distance = hand.distance
-            angle = hand.angle if _turns_end_effector(flights) else math.nan
+        turns = hand is not None and _turns_end_effector(flights)
         duration = int(result.end_tick[row]) * period_ns / SECOND
         if decision is Decision.NONE:
             outcome, flown = Outcome.INTERRUPTED, duration
@@ -488,8 +470,8 @@ class _ControlledLanes:
             lowest=np.minimum(result.lowest[row], q),
             highest=np.maximum(result.highest[row], q),
             momentum_drift=result.momentum_drift[row],
-            end_effector_distance=distance,
-            end_effector_angle=angle,
+            end_effector_distance=math.nan if hand is None else hand.distance,
+            end_effector_angle=math.nan if hand is None or not turns else hand.angle,
             plan_time=0.0,
         )
 

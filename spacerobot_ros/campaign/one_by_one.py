@@ -92,9 +92,8 @@ def nominal_robots(scenario: Scenario) -> Robots:
     plant = description_of(scenario).urdf
 
     def build(node: str, config: RobotConfig) -> SpaceRobot | None:
-        text = config.robot_description
-        if not (config.robot or text):
-            text = plant  # Commanders without a robot parameter use the plant's robot.
+        # Commanders without a robot parameter use the plant's robot.
+        text = config.robot_description or ("" if config.robot else plant)
         error, seed = 0.0, 0
         if isinstance(config, AssumedRobotConfig):
             error, seed = config.model_error, config.model_error_seed
@@ -115,11 +114,9 @@ def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
         known, method = _last_planner_method[1:]
         if known is config or known == config:
             return method
-    method = build_method(
-        *(config.method, robot, config.control_period, config.integration_step),
-        config.method_options,
-        Clearance.wanted(robot.description, config.clearance),
-    )
+    times = config.control_period, config.integration_step
+    clearance = Clearance.wanted(robot.description, config.clearance)
+    method = build_method(config.method, robot, *times, config.method_options, clearance)
     _last_planner_method = robot, config, method
     return method
 
@@ -161,10 +158,8 @@ class FirstPlans:
         if values is None:
             return _first_plan(flight)
         others, depends_on_masses = values
-        masses = None
-        if depends_on_masses and flight.inertial is not None:
-            masses = flight.inertial.vector.tolist()
-        key = others, masses
+        masses = flight.inertial if depends_on_masses else None
+        key = others, None if masses is None else masses.vector.tolist()
         if self._last_plan is None or self._last_plan[0] != key:
             self._last_plan = key, _first_plan(flight)
         return self._last_plan[1]

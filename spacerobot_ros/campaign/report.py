@@ -233,10 +233,8 @@ def _histograms_section(results: Results) -> str:
         there = values[np.isfinite(values)]
         bins = min(60, max(8, int(np.sqrt(len(there)))))
         panel.hist(there, bins=bins, color=PALETTE[0], alpha=0.75)
-        for level in (5, 50, 95):
-            panel.axvline(
-                np.percentile(there, level), color=TEXT_COLOUR, linewidth=0.8, linestyle=":"
-            )
+        for level in np.percentile(there, (5, 50, 95)):
+            panel.axvline(level, color=TEXT_COLOUR, linewidth=0.8, linestyle=":")
         if name in bounds:
             for bound in (bounds[name].minimum, bounds[name].maximum):
                 if np.isfinite(bound) and abs(bound) < 10 * (np.abs(there).max() + 1e-12):
@@ -309,10 +307,11 @@ def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> st
     figure, axes = _figure_with_axes(len(drawn), 3, 2.4)
     for panel, name in zip(axes, drawn, strict=True):
         bins = results.success_by_bins(name)
-        shares = np.array([each.passed.value for each in bins])
-        low = np.array([each.passed.interval_low for each in bins])
-        high = np.array([each.passed.interval_high for each in bins])
-        at: Sequence[Any] = [each.low for each in bins]
+        passed = [each.passed for each in bins]
+        shares, low, high = np.array(
+            [(each.value, each.interval_low, each.interval_high) for each in passed]
+        ).T
+        at: Any = [each.low for each in bins]
         half = None
         if not isinstance(at[0], str):
             half = np.array([(each.high - each.low) / 2.0 for each in bins])
@@ -350,20 +349,14 @@ def _convergence_section(results: Results) -> list[str]:
         return []
     shares = [share(results.passed[:k]) for k in at]
     figure, axes = _figure_with_axes(2, 2, 2.4)
-    axes[0].fill_between(
-        at,
-        [s.interval_low for s in shares],
-        [s.interval_high for s in shares],
-        color=LINE_COLOUR,
-        alpha=0.6,
-    )
+    low, high = [s.interval_low for s in shares], [s.interval_high for s in shares]
+    axes[0].fill_between(at, low, high, color=LINE_COLOUR, alpha=0.6)
     axes[0].plot(at, [s.value for s in shares], color=PALETTE[0])
     axes[0].set_ylabel("success, with 95 % interval")
     for i, name in enumerate(results.distributed_metrics[:3]):
-        values = results.columns[name]
-        final = percentiles(values)[PERCENTILES.index(95.0)] or 1.0
-        line = [percentiles(values[:k])[PERCENTILES.index(95.0)] / final for k in at]
-        axes[1].plot(at, line, color=PALETTE[i], label=name)
+        values, place = results.columns[name], PERCENTILES.index(95.0)
+        line = np.array([percentiles(values[:k])[place] for k in at])
+        axes[1].plot(at, line / (line[-1] or 1.0), color=PALETTE[i], label=name)
     axes[1].set_ylabel("95th percentile, relative to the final value")
     if results.distributed_metrics:
         axes[1].legend(fontsize=7, frameon=False)
@@ -409,14 +402,10 @@ def require_same_draws(first: Campaign, second: Campaign) -> None:
         if ours != theirs:
             raise ParameterError(f"{sentence}'{key}' is {ours} and {theirs}.")
     # The order matters, because numbers are assigned to dispersions in order.
-    for ours_is, theirs_is in zip_longest(first.dispersions, second.dispersions):
-        a, b = (
-            "nothing" if each is None else f"{each.name}: {each}" for each in (ours_is, theirs_is)
-        )
-        same = a == b and all(
-            getattr(ours_is, key) == getattr(theirs_is, key) for key in ("distribution", "weights")
-        )
-        if not same:
+    for pair in zip_longest(first.dispersions, second.dispersions):
+        a, b = ("nothing" if each is None else f"{each.name}: {each}" for each in pair)
+        ours, theirs = (each and (each.name, each.distribution, each.weights) for each in pair)
+        if ours != theirs:
             raise ParameterError(f"{sentence}'disperse' has {a} and {b} in the same position.")
 
 
@@ -508,18 +497,12 @@ def _notes_on_control(first: Results, second: Results) -> list[str]:
 
 def _difference_table(found: list[PairedDifference], first: Results, second: Results) -> str:
     free = [part for part in first.not_controlled if part in second.not_controlled]
-    rows = [
-        [
-            metric_label(each.metric, free),
-            str(each.count),
-            f"{each.first:.5g}",
-            f"{each.second:.5g}",
-            f"{each.difference:+.4g}",
-            f"{each.interval_low:+.4g} to {each.interval_high:+.4g}",
-            "yes" if each.is_significant else "no",
-        ]
-        for each in found
-    ]
+    rows = []
+    for each in found:
+        cells = [metric_label(each.metric, free), str(each.count)]
+        cells += [f"{each.first:.5g}", f"{each.second:.5g}", f"{each.difference:+.4g}"]
+        cells.append(f"{each.interval_low:+.4g} to {each.interval_high:+.4g}")
+        rows.append([*cells, "yes" if each.is_significant else "no"])
     names = [f"mean of {each.campaign.name}" for each in (first, second)]
     head = ["metric", "pairs", *names, "difference"]
     return table("paired", [*head, "95 % interval", "interval excludes 0"], rows)

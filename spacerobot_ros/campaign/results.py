@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -57,22 +58,12 @@ _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
 
 @dataclass(frozen=True)
 class Results:
-    """Campaign rows as columns.
+    """The rows of a campaign, from the folder of its dataset, as columns.
 
-    Attributes
-    ----------
-    campaign
-        The campaign.
-    folder
-        Folder of the dataset.
-    columns
-        The report's columns (N,) by name, in flight order: numbers, with NaN for missing values,
-        or strings.
-    messages
-        Each outcome with a message and its number of flights, the most frequent first. Numbers are
-        omitted from a message unless they are the same in all these flights.
-    planned_flights
-        Number of flights in the whole campaign.
+    ``columns`` are those of the report (N,) by name, in flight order: numbers, with NaN for missing
+    values, or strings. ``messages`` are each outcome with a message and its number of flights, the
+    most frequent first; numbers are omitted from a message unless they are the same in all these
+    flights. ``planned_flights`` is the number of flights in the whole campaign.
     """
 
     campaign: Campaign
@@ -175,10 +166,6 @@ class Results:
         flags = {name: self.columns.get(name, np.full(1, np.nan)) for name in _FLAG_METRICS}
         return {name: share(x == 1.0) for name, x in flags.items() if np.isfinite(x).any()}
 
-    def metrics(self) -> dict[str, Array]:
-        """Return the columns of the report metrics."""
-        return {name: self.columns[name] for name in self.shown_metrics}
-
     def share_meeting(self, criterion: Criterion) -> Share:
         """Return the share of flights that meet a criterion."""
         values = self.columns[criterion.metric]
@@ -186,7 +173,8 @@ class Results:
 
     def influences(self) -> list[Influence]:
         """Return the sensitivities, strongest first, with Sobol indices if available."""
-        metrics = {PASSING: self.passed.astype(float), **self.metrics()}
+        shown = {name: self.columns[name] for name in self.shown_metrics}
+        metrics = {PASSING: self.passed.astype(float), **shown}
         found = corrected_for_multiple_tests(influences(self.drawn_numbers, metrics))
         whole = self.campaign.sampler == "saltelli" and len(self) == self.planned_flights
         if whole and len(self.drawn_numbers) == len(self.campaign.dispersions):
@@ -238,17 +226,13 @@ def _messages(table: Any) -> list[tuple[str, int, str]]:
     groups = table.group_by(["outcome", "form"], use_threads=False).aggregate(
         [("reason", "count"), ("reason", "min"), ("reason", "max")]
     )
-    kinds: dict[str, list[tuple[int, str]]] = {}
+    found, counts = [], Counter[str]()
     for group in groups.to_pylist():
-        same = group["reason_min"] == group["reason_max"]
-        text = group["reason_min"] if same else group["form"]
-        kinds.setdefault(group["outcome"], []).append((group["reason_count"], text))
-    by_count = sorted(kinds.items(), key=lambda kind: -sum(count for count, _ in kind[1]))
-    return [
-        (outcome, count, text)
-        for outcome, found in by_count
-        for count, text in sorted(found, key=lambda each: -each[0])
-    ]
+        outcome, count, text = group["outcome"], group["reason_count"], group["reason_min"]
+        found.append((outcome, count, text if text == group["reason_max"] else group["form"]))
+        counts[outcome] += count
+    places = {outcome: place for place, (outcome, _) in enumerate(counts.most_common())}
+    return sorted(found, key=lambda each: (places[each[0]], -each[1]))
 
 
 def _values(column: Any) -> npt.NDArray[Any]:

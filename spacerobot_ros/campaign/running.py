@@ -19,8 +19,8 @@ import numpy.typing as npt
 from spacerobot_ros.campaign.config import FLIGHTS, Campaign, parse_campaign, scenario_of_section
 from spacerobot_ros.campaign.dataset import ERROR, Dataset, Row
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.engines import engine_by_name, fly_all, select_engine
-from spacerobot_ros.campaign.workers import KILLED, TaskDistributor, Workers, open_workers
+from spacerobot_ros.campaign.engines import fly_all, select_engine
+from spacerobot_ros.campaign.workers import KILLED, TaskDistributor, open_workers
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import scenario_to_fly
 from spacerobot_ros.flight.lockstep import fly_scenario
@@ -33,19 +33,11 @@ from spacerobot_ros.scenario import Scenario
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a campaign.
+    """Progress of a campaign: flights ``flown`` of ``total``, after some ``seconds`` of wall time,
+    at ``flights_per_second`` in this process.
 
-    Attributes
-    ----------
-    flown, total
-        Flights.
-    flights_per_second
-        Flights per second of wall time, in this process.
-    seconds
-        Wall time so far.
-    unflown
-        Number of flights in the dataset whose draw or goal was refused or that ended with an error;
-        counted at the end of the campaign.
+    ``unflown`` is the number of flights in the dataset whose draw or goal was refused or that ended
+    with an error; it is counted at the end of the campaign.
     """
 
     flown: int
@@ -121,8 +113,14 @@ def run_campaign(
             return Progress(before + flown, len(draws), rate, seconds)
 
         flown = 0
+        selected = (draws[number] for number in numbers)  # Each draw is created when it is flown.
         try:
-            for batch in _fly_rows(campaign, draws, numbers, chosen.name, crew, stopped):
+            batches: Iterator[list[Row]]
+            if crew is None:
+                batches = ([row] for row in fly_all(chosen, campaign, selected, stopped))
+            else:
+                batches = TaskDistributor(crew, campaign, draws, chosen.name, stopped).rows(numbers)
+            for batch in batches:
                 dataset.add(batch)
                 flown += len(batch)
                 show(progress(flown))
@@ -133,24 +131,6 @@ def run_campaign(
         return replace(progress(flown), unflown=sum(each in unflown for each in outcomes))
 
 
-def _fly_rows(
-    campaign: Campaign,
-    draws: Draws,
-    numbers: list[int],
-    engine: str,
-    workers: Workers | None,
-    stopped: Callable[[], bool],
-) -> Iterator[list[Row]]:
-    if not numbers:
-        return
-    if workers is None:
-        selected = (draws[number] for number in numbers)  # Each draw is created when it is flown.
-        for row in fly_all(engine_by_name(engine), campaign, selected, stopped):
-            yield [row]
-        return
-    yield from TaskDistributor(workers, campaign, draws, engine, stopped).rows(numbers)
-
-
 RERUN_TOLERANCE = 1e-9
 """Largest deviation between identical flights: absolute for values below 1 (SI units), relative for
 larger values."""
@@ -158,22 +138,11 @@ larger values."""
 
 @dataclass(frozen=True)
 class Rerun:
-    """A repeated flight, compared with its row in the dataset.
+    """The row and the bag of a repeated flight, compared with its row in the dataset.
 
-    Attributes
-    ----------
-    row
-        Row of the repeated flight.
-    deviation
-        Largest deviation of a metric; None if the flight is not in the dataset.
-    worst_metric
-        Name of that metric.
-    outcome
-        Outcome in the dataset; empty if the flight is not in the dataset.
-    bag
-        Path of the bag.
-    note
-        Reason why the metrics may differ from those in the dataset; empty if both must agree.
+    ``deviation`` and ``worst_metric`` are the largest deviation of a metric and the name of that
+    metric, and ``outcome`` is the outcome in the dataset; None and empty if the flight is not in
+    the dataset. ``note`` is the reason why the metrics may differ; empty if they must agree.
     """
 
     row: Row
@@ -231,8 +200,7 @@ def rerun_flight(folder: Path, number: int, bag: Path) -> Rerun:
         )
     draw = draws[number]
     flight = drawn_flight(campaign, draw)
-    scenario = flight.with_draws_in_scenario().scenario
-    flown = fly_scenario(scenario, longest=campaign.max_flight_time)
+    flown = fly_scenario(flight.scenario_with_draws, longest=campaign.max_flight_time)
     flown.save(bag)
     row = Row.of(campaign, draw, flown, FLIGHTS)
     known = stored_flight(dataset, number)

@@ -25,11 +25,8 @@ _MAX_PERMUTED_VALUES = 8
 
 @dataclass(frozen=True)
 class Share:
-    """A share of flights and its confidence intervals.
-
-    ``interval_low`` to ``interval_high`` is the Wilson interval; ``exact_interval`` is the
-    Clopper-Pearson interval.
-    """
+    """A share of flights with its Wilson interval (``interval_low`` to ``interval_high``) and
+    Clopper-Pearson interval (``exact_interval``)."""
 
     count: int
     total: int
@@ -57,11 +54,9 @@ def share(flags: Flags) -> Share:
     from scipy.stats import binomtest
 
     test = binomtest(count, total)
-    wilson = test.proportion_ci(CONFIDENCE, "wilson")
-    exact = test.proportion_ci(CONFIDENCE, "exact")
-    return Share(
-        count, total, float(wilson.low), float(wilson.high), (float(exact.low), float(exact.high))
-    )
+    wilson, exact = (test.proportion_ci(CONFIDENCE, kind) for kind in ("wilson", "exact"))
+    bounds = float(exact.low), float(exact.high)
+    return Share(count, total, float(wilson.low), float(wilson.high), bounds)
 
 
 _MAX_BINS, _FLIGHTS_OF_BIN = 8, 10
@@ -138,12 +133,8 @@ class Influence:
         """Whether the total index is significant or, if there is none, the larger correlation."""
         if self.total_order_index is not None:
             return self.total_order_index[0] > self.total_order_index[1]
-        p = (
-            self.p_value
-            if abs(self.correlation) >= abs(self.distance_correlation)
-            else self.distance_p_value
-        )
-        return p < _SIGNIFICANCE
+        nearer = abs(self.correlation) >= abs(self.distance_correlation)
+        return (self.p_value if nearer else self.distance_p_value) < _SIGNIFICANCE
 
     @property
     def strength(self) -> float:
@@ -176,12 +167,8 @@ def influences(causes: Mapping[str, Array], metrics: Mapping[str, Array]) -> lis
                 continue
             x, y = drawn[there], values[there]
             away = np.abs(x - np.median(x))
-            departure, p_distance_from_median = 0.0, 1.0
-            if np.ptp(away) > 0.0:
-                departure, p_distance_from_median = rank_correlation(away, y)
-            found.append(
-                Influence(cause, metric, *rank_correlation(x, y), departure, p_distance_from_median)
-            )
+            departure = rank_correlation(away, y) if np.ptp(away) > 0.0 else (0.0, 1.0)
+            found.append(Influence(cause, metric, *rank_correlation(x, y), *departure))
     return found
 
 
@@ -221,8 +208,8 @@ def corrected_for_multiple_tests(found: Sequence[Influence]) -> list[Influence]:
     chances = np.array([[each.p_value, each.distance_p_value] for each in found])
     adjusted = false_discovery_control(np.nan_to_num(chances, nan=1.0).ravel()).reshape(-1, 2)
     return [
-        replace(each, p_value=p, distance_p_value=p_distance_from_median)
-        for each, (p, p_distance_from_median) in zip(found, adjusted.tolist(), strict=True)
+        replace(each, p_value=p, distance_p_value=p_of_distance)
+        for each, (p, p_of_distance) in zip(found, adjusted.tolist(), strict=True)
     ]
 
 
@@ -234,12 +221,9 @@ def sobol_indices(names: Sequence[str], values: Array) -> dict[str, dict[str, An
     """
     if not np.all(np.isfinite(values)) or np.ptp(values) == 0.0:
         return {}
-    problem = sobol_problem(names)
-    result = require_module("SALib.analyze.sobol").analyze(
-        problem, values, calc_second_order=False, seed=1
-    )
-    keys = ("S1", "S1_conf", "ST", "ST_conf")
-    rows = np.array([result[key] for key in keys]).T.tolist()
+    analyze, problem = require_module("SALib.analyze.sobol").analyze, sobol_problem(names)
+    result = analyze(problem, values, calc_second_order=False, seed=1)
+    rows = np.array([result[key] for key in ("S1", "S1_conf", "ST", "ST_conf")]).T.tolist()
     return {
         name: {"first_order_index": (a, b), "total_order_index": (c, d)}
         for name, (a, b, c, d) in zip(names, rows, strict=True)
@@ -287,15 +271,8 @@ def paired_difference(metric: str, first: Array, second: Array) -> PairedDiffere
     difference = second[there] - first[there]
     mean, spread = float(difference.mean()), float(difference.std(ddof=1))
     half = float(t.ppf(0.5 + CONFIDENCE / 2, count - 1)) * spread / np.sqrt(count)
-    return PairedDifference(
-        metric,
-        count,
-        float(first[there].mean()),
-        float(second[there].mean()),
-        mean,
-        mean - half,
-        mean + half,
-    )
+    means = float(first[there].mean()), float(second[there].mean())
+    return PairedDifference(metric, count, *means, mean, mean - half, mean + half)
 
 
 def paired_success(first: Flags, second: Flags) -> tuple[int, int, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
@@ -20,7 +20,6 @@ from spacerobot_ros.model.shared_parameters import RobotConfig
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.core.goal import Controlled
 from spacerobot_ros.resources import robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
 from spacerobot_ros.simulation.capture import load_target, target_parameters
@@ -58,43 +57,40 @@ class DispersionTarget:
 
     Attributes
     ----------
-    name
-        Name of its column.
+    name, unit
+        Name of its column, and unit, for people.
     apply
         Function that applies a drawn value to a flight.
-    unit
-        Unit, for people.
-    is_text
-        Whether the values are strings.
-    assigned_parameters
-        Names of the values that the target sets; targets that set the same value share a name.
     weigh
         Function that applies the drawn values (N,) of N flights to their mass properties; if given,
         the target changes nothing else.
+    assigned_parameters
+        Names of the values that the target sets; targets that set the same value share a name. By
+        default, the name of the target.
+    is_text
+        Whether the values are strings.
     order
         Targets are applied in ascending order.
     """
 
     name: str
-    apply: Callable[[DrawnFlight, Any], DrawnFlight]
     unit: str
-    is_text: bool
-    assigned_parameters: frozenset[str]
+    apply: Callable[[DrawnFlight, Any], DrawnFlight] = lambda flight, drawn: flight
     weigh: Callable[[MassFactors, Array], None] | None = None
+    assigned_parameters: frozenset[str] = frozenset()
+    is_text: bool = False
     order: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.assigned_parameters:
+            object.__setattr__(self, "assigned_parameters", frozenset({self.name}))
 
 
 @dataclass(frozen=True)
 class MassFactors:
-    """Changes in the mass properties of N flights; targets write into the arrays.
-
-    Attributes
-    ----------
-    mass, inertia
-        (N, B) factors for each body; the inertia is multiplied by both.
-    com
-        (N, B, 3) centre of mass offsets, m.
-    """
+    """Changes in the mass properties of N flights; targets write into the arrays: factors ``mass``
+    and ``inertia`` (N, B) for each body, where the inertia is multiplied by both, and offsets
+    ``com`` (N, B, 3) of the centres of mass, m."""
 
     mass: Array
     inertia: Array
@@ -129,9 +125,8 @@ class DrawnFlight:
     Attributes
     ----------
     scenario
-        The scenario; it includes the plant's masses and the seed only after
-        :meth:`with_draws_in_scenario`. Flights whose draws do not change the scenario share one
-        object.
+        The scenario without the plant's masses and the seed; flights whose draws do not change it
+        share one object.
     nominal
         The robot without dispersions.
     inertial
@@ -166,14 +161,12 @@ class DrawnFlight:
             return self.scenario
         return self.scenario.with_overrides("plant", {"sensors.seed": self.seed})
 
-    def with_draws_in_scenario(self) -> DrawnFlight:
-        """Return the flight with the seed included in the scenario and the masses included in the
-        plant's URDF.
+    @property
+    def scenario_with_draws(self) -> Scenario:
+        """The scenario, including the flight's seed, with the masses in the plant's URDF.
 
-        Commanders keep the nominal robot unless a separate robot is configured for them.
-
-        Building such a robot takes milliseconds, so engines without ROS use :attr:`inertial`
-        directly.
+        Commanders keep the nominal robot unless a separate robot is configured for them. Building
+        such a robot takes milliseconds, so engines without ROS use :attr:`inertial` directly.
         """
         scenario, parameters = self.seeded_scenario, self.inertial
         if parameters is not None:
@@ -184,7 +177,7 @@ class DrawnFlight:
                 if not (config.robot or config.robot_description):
                     believed = {"robot_description": self.nominal.urdf}
                     scenario = scenario.with_overrides(node, believed)
-        return replace(self, scenario=scenario, seed=None)
+        return scenario
 
 
 def description_of(scenario: Scenario) -> RobotDescription:
@@ -265,9 +258,7 @@ def _targets_by_name(kind: str, scenario: Scenario) -> dict[str, DispersionTarge
         case "mass" | "inertia":
             every = list(range(len(bodies)))
             chosen = {kind: every, **{f"{kind}.{name}": [k] for k, name in enumerate(bodies)}}
-            found = [
-                _mass_property_target(kind, name, places, bodies) for name, places in chosen.items()
-            ]
+            found = [_mass_property_target(kind, x, chosen[x], bodies) for x in chosen]
         case "com":
             found = [
                 _center_target(k, column, f"com.{name}.{axis}")
@@ -275,10 +266,8 @@ def _targets_by_name(kind: str, scenario: Scenario) -> dict[str, DispersionTarge
                 for column, axis in enumerate(AXES)
             ]
         case "target":
-            found = [
-                _floating_target(part)
-                for part in ("mass", "inertia", *(f"com.{axis}" for axis in AXES))
-            ]
+            parts = ("mass", "inertia", *(f"com.{axis}" for axis in AXES))
+            found = [_floating_target(part) for part in parts]
         case _ if kind in _POSE_TARGET_NAMES:
             found = [
                 _pose_target(kind, part, column, scenario)
@@ -316,25 +305,18 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Di
     if isinstance(value, tuple) is not bool(index):
         how = f"name an element of the list, such as {name}[0]" if not index else "it is not a list"
         raise ParameterError(f"'{name}': {how}.")
-    if not index:
-        return _scalar_target(name, node, declaration, value)
-    assert isinstance(value, tuple)
-    return _list_entry_target(name, node, declaration, index, scenario)
+    if index:
+        return _list_entry_target(name, node, declaration, index, scenario)
+    whole = isinstance(declaration.default, int)
+
+    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
+        return flight.with_overrides(node, {bare: round(drawn) if whole else drawn})
+
+    return DispersionTarget(name, declaration.unit, apply, is_text=isinstance(value, str))
 
 
 def _declared(node: str) -> dict[str, Parameter]:
     return {parameter.name: parameter for parameter in declared(CONFIGS[node])}
-
-
-def _scalar_target(name: str, node: str, declaration: Parameter, value: Any) -> DispersionTarget:
-    whole = isinstance(declaration.default, int)
-
-    def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        return flight.with_overrides(node, {declaration.name: round(drawn) if whole else drawn})
-
-    return DispersionTarget(
-        name, apply, declaration.unit, isinstance(value, str), frozenset({name})
-    )
 
 
 def _list_entry_target(
@@ -368,7 +350,7 @@ def _entry_target(
         return flight.with_overrides(node, {declaration.name: values})
 
     one = frozenset({f"{node}.{declaration.name}[{place}]"})
-    return DispersionTarget(name, apply, declaration.unit, False, one)
+    return DispersionTarget(name, declaration.unit, apply, assigned_parameters=one)
 
 
 def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenario) -> list[float]:
@@ -394,14 +376,8 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
 def _start_positions(scenario: Scenario) -> list[float]:
     """Return the joint positions at the start; by default, as close to zero as limits allow."""
     given, robot = scenario.plant.initial_joint_positions, description_of(scenario)
-    if given:
-        return list(given)
-    zero = np.zeros(len(robot.joint_names))
-    return [float(x) for x in np.clip(zero, robot.limits("lower"), robot.limits("upper"))]
-
-
-def _unchanged(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-    return flight
+    lower, upper = robot.limits("lower"), robot.limits("upper")
+    return list(given) or np.clip(np.zeros(len(lower)), lower, upper).tolist()
 
 
 def _mass_property_target(
@@ -411,14 +387,14 @@ def _mass_property_target(
         getattr(factors, kind)[:, places] *= drawn[:, np.newaxis]
 
     sets = frozenset(f"{kind}.{bodies[k]}" for k in places)
-    return DispersionTarget(name, _unchanged, "1", False, sets, weigh)
+    return DispersionTarget(name, "1", weigh=weigh, assigned_parameters=sets)
 
 
 def _center_target(index: int, column: int, name: str) -> DispersionTarget:
     def weigh(factors: MassFactors, drawn: Array) -> None:
         factors.com[:, index, column] += drawn
 
-    return DispersionTarget(name, _unchanged, "m", False, frozenset({name}), weigh)
+    return DispersionTarget(name, "m", weigh=weigh)
 
 
 def _floating_target(part: str) -> DispersionTarget:
@@ -437,7 +413,7 @@ def _floating_target(part: str) -> DispersionTarget:
         given = target_parameters(urdf_with(target, parameters))
         return replace(flight.with_overrides("plant", given), has_target_masses=True)
 
-    return DispersionTarget(name, apply, "m" if column >= 0 else "1", False, frozenset({name}))
+    return DispersionTarget(name, "m" if column >= 0 else "1", apply)
 
 
 def _pose_target(kind: str, part: str, column: int, scenario: Scenario) -> DispersionTarget:
@@ -458,17 +434,14 @@ def _pose_target(kind: str, part: str, column: int, scenario: Scenario) -> Dispe
             return flight.with_overrides("plant", {"initial_orientation": turned.tolist()})
         goal: Goal = getattr(flight.scenario, kind)
         if part == "position":
-            goal = replace(goal, position=goal.position + offset)
+            goal = replace(goal, position=goal.position + offset, asked=goal.asked | {"position"})
         else:
             turned = quaternion_multiply(goal.quaternion, quaternion_from_rotvec(offset))
-            goal = replace(goal, quaternion=turned)
-        asked: set[Controlled] = {"position" if part == "position" else "attitude"}
-        goal = replace(goal, asked=goal.asked | asked)
+            goal = replace(goal, quaternion=turned, asked=goal.asked | {"attitude"})
         changed: dict[str, Any] = {kind: goal}
         return replace(flight, scenario=replace(flight.scenario, **changed))
 
-    unit = "m" if part == "position" else "rad"
-    return DispersionTarget(name, apply, unit, False, frozenset({name}))
+    return DispersionTarget(name, "m" if part == "position" else "rad", apply)
 
 
 def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> DispersionTarget:
@@ -497,7 +470,7 @@ def _fault_target(name: str, index: int, part: str, scenario: Scenario) -> Dispe
     unit = "s" if part in ("at", "until") else ""
     # Absent faults are removed last, from the end of the list, so that indices stay valid.
     order = len(faults) - index if part == "present" else 0
-    return DispersionTarget(name, apply, unit, is_text, frozenset({name}), order=order)
+    return DispersionTarget(name, unit, apply, is_text=is_text, order=order)
 
 
 def _require_fault(line: str, scenario: Scenario) -> Fault:
@@ -516,9 +489,7 @@ def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
     inertia.
     """
     root = ET.fromstring(robot.urdf)
-    weights: Iterable[Any] = zip(
-        parameters.masses, parameters.centers, parameters.inertias, strict=True
-    )
+    weights: Any = zip(parameters.masses, parameters.centers, parameters.inertias, strict=True)
     of_body = {body.name: weight for body, weight in zip(robot.bodies, weights, strict=True)}
     for link in root.findall("link"):
         for inertial in link.findall("inertial"):
@@ -526,17 +497,10 @@ def urdf_with(robot: RobotDescription, parameters: InertialParameters) -> str:
         if link.get("name") in of_body:
             mass, center, tensor = of_body[link.get("name", "")]
             inertial = ET.SubElement(link, "inertial")
-            ET.SubElement(inertial, "origin", xyz=_format_numbers(center), rpy="0 0 0")
+            xyz = " ".join(map(repr, center.tolist()))
+            ET.SubElement(inertial, "origin", xyz=xyz, rpy="0 0 0")
             ET.SubElement(inertial, "mass", value=repr(float(mass)))
-            entries = {
-                f"i{a}{b}": repr(float(tensor[i, j]))
-                for i, a in enumerate(AXES)
-                for j, b in enumerate(AXES)
-                if i <= j
-            }
+            upper = [(i, j) for i in range(3) for j in range(i, 3)]
+            entries = {f"i{AXES[i]}{AXES[j]}": repr(float(tensor[i, j])) for i, j in upper}
             ET.SubElement(inertial, "inertia", entries)
     return ET.tostring(root, encoding="unicode")
-
-
-def _format_numbers(values: Array) -> str:
-    return " ".join(repr(float(x)) for x in values)

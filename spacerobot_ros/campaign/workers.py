@@ -85,16 +85,11 @@ def this_code() -> str:
 def fly_task(
     packed: bytes, code: str, draws: list[Draw], engine: str, include_fallbacks: bool
 ) -> list[Row | Draw]:
-    """Fly some draws: a worker task.
+    """Fly some draws with the engine of a name, and with ``include_fallbacks`` its fallbacks: a
+    worker task.
 
-    Parameters
-    ----------
-    packed, code
-        Result of :func:`serialise_campaign`, and of :func:`this_code` in the same process.
-    draws, engine
-        Draws, and engine name.
-    include_fallbacks
-        Whether this task also flies the fallbacks of the engine.
+    ``packed`` and ``code`` are the results of :func:`serialise_campaign` and, in the same process,
+    of :func:`this_code`.
 
     Raises
     ------
@@ -132,14 +127,8 @@ class _RecordingContext(SpawnContext):
 
 
 class LocalWorkers:
-    """Processes on this machine, each connected by anonymous pipes that no other process can
-    access.
-
-    Parameters
-    ----------
-    count
-        The number of processes.
-    """
+    """Some processes on this machine, each connected by anonymous pipes that no other process can
+    access."""
 
     tasks_per_worker = 1
 
@@ -181,7 +170,7 @@ class LocalWorkers:
 @contextmanager
 def _settings_of_workers() -> Iterator[None]:
     """Limit processes started here to one thread and block Ctrl-C, after which they are ended."""
-    before = os.environ.copy()
+    before = {name: os.environ[name] for name in _THREAD_COUNT_VARIABLES if name in os.environ}
     os.environ.update(dict.fromkeys(_THREAD_COUNT_VARIABLES, "1"))
     # The resource tracker would unblock the signal when it starts.
     resource_tracker.ensure_running()
@@ -191,9 +180,8 @@ def _settings_of_workers() -> Iterator[None]:
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name in _THREAD_COUNT_VARIABLES:
-            os.environ.pop(name)
-            if name in before:
-                os.environ[name] = before[name]
+            del os.environ[name]
+        os.environ.update(before)
 
 
 def _end_with_campaign() -> None:
@@ -201,15 +189,10 @@ def _end_with_campaign() -> None:
 
 
 class DaskWorkers:
-    """Workers of a dask.distributed scheduler.
+    """Workers of the scheduler of a dask.distributed ``client``.
 
     A scheduler runs code from anyone who can reach its port: protect it with a private network or
     TLS.
-
-    Parameters
-    ----------
-    client
-        A client of dask.distributed.
     """
 
     tasks_per_worker = 2  # The running task, and one that can follow without a round trip.
@@ -223,13 +206,8 @@ class DaskWorkers:
         worker."""
 
     def count(self) -> int:
-        """Return the number of workers, at least 1 because workers may join later.
-
-        Raises
-        ------
-        SpaceRobotError
-            The scheduler is no longer available, or a worker does not have this package.
-        """
+        """Return the number of workers, at least 1 because workers may join later; raise
+        SpaceRobotError if the scheduler is gone or a worker does not have this package."""
         try:
             if self._client.status != "running":
                 raise _lost_scheduler_error()
@@ -249,15 +227,8 @@ class DaskWorkers:
         return self._executor.submit(fly_task, *arguments)
 
     def result(self, task: _Task) -> list[Row | Draw]:
-        """Return the result of a finished task.
-
-        Raises
-        ------
-        WorkerDeath
-            The worker died.
-        SpaceRobotError
-            The scheduler is no longer available, or cannot load the task.
-        """
+        """Return the result of a finished task; raise WorkerDeath, or SpaceRobotError if the
+        scheduler is no longer available or cannot load the task."""
         from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
@@ -362,14 +333,7 @@ class TaskDistributor:
     If a worker dies, each flight in its lost tasks is repeated alone, while no other task runs.
     If a worker dies again, the flight that it was flying is the cause and is reported.
 
-    Parameters
-    ----------
-    workers
-        The workers.
-    campaign, draws, engine
-        The campaign, its draws, and the engine name.
-    stopped
-        Function that returns whether to stop; it is called a few times per second.
+    ``stopped`` returns whether to stop; it is called a few times per second.
     """
 
     def __init__(
@@ -396,9 +360,8 @@ class TaskDistributor:
     def rows(self, numbers: list[int]) -> Iterator[list[Row]]:
         """Yield the rows of draws as their tasks finish; empty lists while none finishes."""
         waiting = deque(numbers)
-        while (
-            waiting or self._fallbacks or self._retry_alone or self._running
-        ) and not self._stopped():
+        queues = waiting, self._fallbacks, self._retry_alone, self._running
+        while any(queues) and not self._stopped():
             self._submit_tasks(waiting)
             yield from self._finished_rows(_POLL_PERIOD) or [[]]
         # Tasks that have finished since.

@@ -222,7 +222,7 @@ def test_samplers_are_those_of_scipy(sampler: str) -> None:
 def test_a_draw_changes_its_flight() -> None:
     flight = drawn_flight(MADE, Draw(3, 17, {"mass.mass_1": 1.25}))
     assert flight.seeded_scenario.plant.sensors.seed == 17
-    assert flight.with_draws_in_scenario().scenario.plant.sensors.seed == 17
+    assert flight.scenario_with_draws.plant.sensors.seed == 17
     assert flight.inertial is not None
     usual = [body.inertia.mass for body in flight.nominal.bodies]
     np.testing.assert_allclose(flight.inertial.masses / usual, [1.0, 1.25, 1.0, 1.0])

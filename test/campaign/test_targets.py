@@ -272,13 +272,13 @@ def test_masses_go_into_the_description_of_the_plant_alone(scenario: Scenario) -
     """Commanders that have no robot of their own believe in the one without dispersions."""
     flight = DrawnFlight.of(scenario)
     assert flight.inertial is None
-    assert flight.with_draws_in_scenario().scenario is scenario
+    assert flight.scenario_with_draws is scenario
     values = {"mass.mass_2": 1.5, "inertia.mass_2": 2.0, "com.mass_2.x": 0.25}
     drawn = campaign(disperse={name: {"choice": [value]} for name, value in values.items()})
     flight = drawn_flight(drawn, Draws(drawn)[0])
     heavier, usual = flight.inertial, InertialParameters.of(flight.nominal)
     assert heavier is not None
-    described = InertialParameters.of(description_of(flight.with_draws_in_scenario().scenario))
+    described = InertialParameters.of(description_of(flight.scenario_with_draws))
     for found in (heavier, described):
         np.testing.assert_allclose(found.masses, usual.masses * [1.0, 1.0, 1.5, 1.0])
         np.testing.assert_allclose(found.inertias[2], 3.0 * usual.inertias[2])
