@@ -22,12 +22,11 @@ __all__ = ["__version__", "fly", "load_scenario", "plan", "read_bag", "read_run"
 __getattr__ = lazy_names(
     __name__,
     {
-        "fly": "spacerobot_ros.flight.api",
-        "load_scenario": "spacerobot_ros.scenario",
-        "plan": "spacerobot_ros.flight.api",
-        "read_bag": "spacerobot_ros.bag",
-        "read_run": "spacerobot_ros.flight.reading",
-        "sweep": "spacerobot_ros.campaign.running",
+        "bag": ["read_bag"],
+        "campaign.running": ["sweep"],
+        "flight.api": ["fly", "plan"],
+        "flight.reading": ["read_run"],
+        "scenario": ["load_scenario"],
     },
 )
 

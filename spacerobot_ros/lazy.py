@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
 from spacerobot_ros.errors import SpaceRobotError
 
 
-def lazy_names(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+def lazy_names(package: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
     """Return the ``__getattr__`` of a package whose names are defined in other modules.
 
     Parameters
     ----------
     package
         Package name, for messages about missing names.
-    modules
-        Module of each name.
+    names
+        Names in each module, which is below ``spacerobot_ros``.
     """
+    modules = {name: module for module, those in names.items() for name in those}
 
     def get(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(modules[name]), name)
+        return getattr(import_module(f"spacerobot_ros.{modules[name]}"), name)
 
     return get
 

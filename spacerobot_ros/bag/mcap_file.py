@@ -1,8 +1,4 @@
-"""Bag file: MCAP with rosbag2 metadata.
-
-Files are locked, never overwritten, and complete up to the last record even if the process is
-killed or the disk is full.
-"""
+"""Bag file: MCAP with rosbag2 metadata."""
 
 from __future__ import annotations
 

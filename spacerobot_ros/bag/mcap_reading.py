@@ -130,11 +130,6 @@ class BagFile:
     A file compressed as a whole, such as rosbag2's ``NAME.mcap.zstd``, is unpacked to a
     temporary file, which is deleted with this object.
 
-    Parameters
-    ----------
-    path
-        Path of the file; error messages include it.
-
     Raises
     ------
     RecordingError
@@ -149,8 +144,13 @@ class BagFile:
                 descriptor, name = tempfile.mkstemp(".mcap", "spacerobot_")
                 self._content = Path(name)
                 weakref.finalize(self, self._content.unlink, missing_ok=True)
+                limit = ChunkUnpacker(file_size(file))
+                file.seek(0)
+                packed = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
                 with os.fdopen(descriptor, "wb") as unpacked:
-                    _unpack(file, unpacked)
+                    while block := packed.read(_UNPACKED_AT_ONCE):
+                        limit.count(len(block), 0)
+                        unpacked.write(block)
         with self.open() as file:
             self.size = file_size(file)
             self.summary, self.statistics = _read_summary(path, file)
@@ -167,22 +167,30 @@ class BagFile:
 
         Raises
         ------
-        RecordingError See the class; also raised if a damaged record is found while the context is
-        open.
+        RecordingError
+            See the class; also raised if a damaged record is found while the context is open.
         """
-        with open_file(self.path, self._content) as file:
-            _require_magic_bytes(self.path, file)
+        path, size = self.path, len(MCAP0_MAGIC)
+        with open_file(path, self._content) as file:
+            start = file.read(size)
+            if not start:
+                raise RecordingError(
+                    f"The bag {path} is empty: its writer stopped before it wrote anything."
+                )
+            require_mcap(path, start)
+            length = file_size(file)
+            file.seek(max(length - size, 0))
+            if length < 2 * size or file.read(size) != MCAP0_MAGIC:
+                if _is_being_written(file):
+                    raise RecordingError(
+                        f"The bag {path} is still being written: stop its recorder first."
+                    )
+                raise RecordingError(
+                    f"The bag {path} was cut short, because its writer was killed or its disk was "
+                    f"full: 'spacerobot salvage {shlex.quote(str(path))}' recovers its content."
+                )
+            file.seek(0)
             yield file
-
-
-def _unpack(file: BinaryIO, unpacked: BinaryIO) -> None:
-    """Write the content of a file that is compressed as a whole to another file."""
-    limit = ChunkUnpacker(file_size(file))
-    file.seek(0)
-    packed = zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)
-    while block := packed.read(_UNPACKED_AT_ONCE):
-        limit.count(len(block), 0)
-        unpacked.write(block)
 
 
 def require_mcap(path: Path, start: bytes) -> None:
@@ -197,26 +205,6 @@ def require_mcap(path: Path, start: bytes) -> None:
         )
     if start != MCAP0_MAGIC[: len(start)]:
         raise RecordingError(f"{path} is not an MCAP file.")
-
-
-def _require_magic_bytes(path: Path, file: BinaryIO) -> None:
-    size = len(MCAP0_MAGIC)
-    start = file.read(size)
-    if not start:
-        raise RecordingError(
-            f"The bag {path} is empty: its writer stopped before it wrote anything."
-        )
-    require_mcap(path, start)
-    length = file_size(file)
-    file.seek(max(length - size, 0))
-    if length < 2 * size or file.read(size) != MCAP0_MAGIC:
-        if _is_being_written(file):
-            raise RecordingError(f"The bag {path} is still being written: stop its recorder first.")
-        raise RecordingError(
-            f"The bag {path} was cut short, because its writer was killed or its disk was full: "
-            f"'spacerobot salvage {shlex.quote(str(path))}' recovers its content."
-        )
-    file.seek(0)
 
 
 def _is_being_written(file: BinaryIO) -> bool:
@@ -454,7 +442,13 @@ def blocks_in_time_order(
                 for place_in_file, data in _unpacked(opened, section.chunk):
                     block = _messages_in(data, place_in_file, numbers[n], start_ns, end_ns)
                     blocks.append(block)
-        yield _in_time_order(blocks)
+        nothing: MessageBlock = np.zeros(0, np.intp), np.zeros(0, np.uint64), []
+        topics_of, log_times, parts = zip(nothing, *blocks, strict=True)
+        times = np.concatenate(log_times)
+        order = np.argsort(times, kind="stable")
+        messages = [message for part in parts for message in part]
+        in_order = [messages[k] for k in order.tolist()]
+        yield np.concatenate(topics_of)[order], times[order], in_order
 
 
 def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
@@ -511,13 +505,3 @@ def _messages_in(
     ends = begins + _RECORD_HEAD.size + heads["length"][rows].astype(np.int64)
     spans = zip((begins + size).tolist(), ends.tolist(), strict=True)
     return topics[rows], times[rows], [data[a:b] for a, b in spans]
-
-
-def _in_time_order(blocks: Iterable[MessageBlock]) -> MessageBlock:
-    """Merge blocks into one by log time; messages with equal times keep their order."""
-    nothing: MessageBlock = np.zeros(0, np.intp), np.zeros(0, np.uint64), []
-    numbers, log_times, data = zip(nothing, *blocks, strict=True)
-    times = np.concatenate(log_times)
-    order = np.argsort(times, kind="stable")
-    messages = [message for part in data for message in part]
-    return np.concatenate(numbers)[order], times[order], [messages[k] for k in order.tolist()]

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice, starmap
 
+from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.mcap_file import QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import LATEST_TIME_NS
 from spacerobot_ros.bag.reader import Bag
@@ -15,6 +16,8 @@ from spacerobot_ros.events import SECONDS, KeyValueField, KeyValueFormat, number
 from spacerobot_ros.times import SECOND
 
 _MAX_AGE_REPUBLISHED_AFTER_SEEK_NS = SECOND
+
+_DEFAULTS = ReplayConfig()
 
 _MAX_REPLAYED_TOPICS = 1000
 """Largest number of replayed topics: each requires a publisher, memory and discovery."""
@@ -138,16 +141,8 @@ class Playback:
     ----------
     bag
         What to play.
-    topics
-        Topics to play; empty for all.
-    rate
-        Bag seconds per second of clock time.
-    start
-        Start time relative to the first message, in seconds.
-    duration
-        Duration to play, in seconds of bag time; 0 for all.
-    loop
-        Whether to restart at the end.
+    config
+        Topics, time span and rate, and whether to restart at the end.
 
     Raises
     ------
@@ -155,16 +150,8 @@ class Playback:
         A topic is not in the bag, or there is no message to replay.
     """
 
-    def __init__(
-        self,
-        bag: Bag,
-        *,
-        topics: Collection[str] = (),
-        rate: float = 1.0,
-        start: float = 0.0,
-        duration: float = 0.0,
-        loop: bool = False,
-    ) -> None:
+    def __init__(self, bag: Bag, config: ReplayConfig = _DEFAULTS) -> None:
+        topics, start, duration = config.topics.split(), config.start, config.duration
         if not bag.message_count():
             raise RecordingError(f"The bag {bag.path} has no messages to replay.")
         if len(topics or bag.topics) > _MAX_REPLAYED_TOPICS:
@@ -173,7 +160,7 @@ class Playback:
                 f"{_MAX_REPLAYED_TOPICS} can be replayed at once: name the topics to replay."
             )
         self._bag = bag
-        self._loop = loop
+        self._loop, self._rate = config.loop, config.rate
         self.start_ns = min(bag.start_time_ns + round(start * SECOND), LATEST_TIME_NS)
         """Log time at which the replay starts, ns."""
         end_ns = self.start_ns + round(duration * SECOND) if duration else LATEST_TIME_NS
@@ -185,7 +172,6 @@ class Playback:
         profiles = {name: [*bag.qos(name), QosProfile()][0] for name in self._names}
         self.topics = [RecordedTopic(name, bag.topics[name], profiles[name]) for name in profiles]
         """The topics to publish."""
-        self._rate = rate
         self._bag_ns = self.start_ns
         self._clock_ns: int | None = None
         """Clock time at bag time `_bag_ns`; None if bag time is paused."""

@@ -76,7 +76,19 @@ def bag_files(path: Path) -> list[Path]:
         A folder contains no MCAP file, or several that are not listed in its ``metadata.yaml``.
     """
     if path.is_dir():
-        return _files_of_folder(path)
+        listed = [path / name for name in _listed_files(path)]
+        if listed and all(file.is_file() for file in listed):
+            return _salvaged(listed)
+        # Files in other formats are rejected individually, with a remedy.
+        found = (sorted(path.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
+        files = next(filter(None, found), [])
+        if not files:
+            raise RecordingError(f"The folder {path} contains no bag: name an MCAP file.")
+        if len(files) != 1:
+            raise RecordingError(
+                f"The folder {path} contains {len(files)} MCAP files: name one of them."
+            )
+        return files
     if path.exists():
         whole = _listed_files(path.parent)
         if len(whole) > 1 and path.name in whole:
@@ -94,22 +106,6 @@ def bag_files(path: Path) -> list[Path]:
 def _salvaged(files: list[Path]) -> list[Path]:
     copies = map(salvaged_copy, files)
     return [copy if copy.exists() else file for file, copy in zip(files, copies, strict=True)]
-
-
-def _files_of_folder(folder: Path) -> list[Path]:
-    listed = [folder / name for name in _listed_files(folder)]
-    if listed and all(file.is_file() for file in listed):
-        return _salvaged(listed)
-    # Files in other formats are rejected individually, with a remedy.
-    found = (sorted(folder.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
-    files = next(filter(None, found), [])
-    if not files:
-        raise RecordingError(f"The folder {folder} contains no bag: name an MCAP file.")
-    if len(files) != 1:
-        raise RecordingError(
-            f"The folder {folder} contains {len(files)} MCAP files: name one of them."
-        )
-    return files
 
 
 def _listed_files(folder: Path) -> list[str]:
@@ -315,7 +311,19 @@ class Bag(Mapping[str, TopicSeries]):
         ``euler``: whether to add ``roll``, ``pitch`` and ``yaw`` for attitudes.
         """
         series = self[topic]
-        found = table_of(series, self._prismatic_joints(series.topic.rpartition("/")[0]))
+        namespace = series.topic.rpartition("/")[0]
+        if namespace not in self._prismatic_by_namespace:
+            # Importing the robot model doubles the import time of this module.
+            from spacerobot_ros.model.description import JointKind
+            from spacerobot_ros.model.urdf import parse_robot
+
+            kinds = self._prismatic_by_namespace.setdefault(namespace, {})
+            with suppress(RecordingError):
+                for text in self.robot_descriptions(namespace):
+                    with suppress(RobotDescriptionError, UnicodeDecodeError):
+                        for joint in parse_robot(text.decode()).movable_joints:
+                            kinds.setdefault(joint.name, joint.kind is JointKind.PRISMATIC)
+        found = table_of(series, self._prismatic_by_namespace[namespace])
         return with_euler_angles(found) if euler else found
 
     def tables(self, *, euler: bool = False) -> dict[str, TopicTable]:
@@ -361,20 +369,6 @@ class Bag(Mapping[str, TopicSeries]):
         if self.topics.get(topic) == _STRING_TYPE:
             found += [text.encode() for text in self[topic].field("data")[-1:]]
         return [*found, *attached.values()] if others else found
-
-    def _prismatic_joints(self, namespace: str) -> dict[str, bool]:
-        if namespace not in self._prismatic_by_namespace:
-            # Importing the robot model doubles the import time of this module.
-            from spacerobot_ros.model.description import JointKind
-            from spacerobot_ros.model.urdf import parse_robot
-
-            kinds = self._prismatic_by_namespace.setdefault(namespace, {})
-            with suppress(RecordingError):
-                for text in self.robot_descriptions(namespace):
-                    with suppress(RobotDescriptionError, UnicodeDecodeError):
-                        for joint in parse_robot(text.decode()).movable_joints:
-                            kinds.setdefault(joint.name, joint.kind is JointKind.PRISMATIC)
-        return self._prismatic_by_namespace[namespace]
 
     def __getitem__(self, topic: str) -> TopicSeries:
         topic = self._recorded_name(topic)

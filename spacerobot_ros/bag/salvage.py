@@ -154,22 +154,19 @@ class _Copy:
                 if opcode == Opcode.DATA_END:
                     # The summary repeats earlier records.
                     return
-                if opcode == Opcode.CHUNK:
-                    self._add_chunk(record, place, chunks)
-                else:
+                if opcode != Opcode.CHUNK:
                     self._add(record)
+                    continue
+                try:
+                    data = chunks.unpack(cast("Chunk", parse_record(record)), place)
+                except DAMAGE_ERRORS as error:
+                    self.lost_chunks += 1
+                    self.loss_reason = self.loss_reason or str(error)
+                    continue
+                with suppress(ValueError):
+                    for begin, end in records_in_chunk(data, place):
+                        self._add(data[begin:end])
         self.lost_bytes = size - whole
-
-    def _add_chunk(self, record: bytes, place: int, chunks: ChunkUnpacker) -> None:
-        try:
-            data = chunks.unpack(cast("Chunk", parse_record(record)), place)
-        except DAMAGE_ERRORS as error:
-            self.lost_chunks += 1
-            self.loss_reason = self.loss_reason or str(error)
-            return
-        with suppress(ValueError):
-            for begin, end in records_in_chunk(data, place):
-                self._add(data[begin:end])
 
     def _add(self, record: bytes) -> None:
         found = None

@@ -245,19 +245,17 @@ def with_euler_angles(table: TopicTable) -> TopicTable:
         parts = [values.get(f"{head}orientation.{axis}") for axis in "xyzw"]
         if last != "x" or any(part is None for part in parts):
             continue
-        turns = zip(("roll", "pitch", "yaw"), _euler_angles(np.array(parts, float)), strict=True)
-        found += [Field(f"{head}{name}", angle, ("rad",)) for name, angle in turns]
+        quaternions = np.array(parts, float)
+        with np.errstate(invalid="ignore"):
+            x, y, z, w = quaternions / np.linalg.norm(quaternions, axis=0)
+        across, along = 2 * (x * y + w * z), 1 - 2 * (y * y + z * z)
+        turns = {
+            "roll": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            "pitch": np.arctan2(2 * (w * y - x * z), np.hypot(along, across)),
+            "yaw": np.arctan2(across, along),
+        }
+        found += [Field(f"{head}{name}", angle, ("rad",)) for name, angle in turns.items()]
     return replace(table, fields=tuple(found))
-
-
-def _euler_angles(quaternions: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Return roll, pitch and yaw (N,), rad, of quaternions x, y, z, w (4, N)."""
-    with np.errstate(invalid="ignore"):
-        x, y, z, w = quaternions / np.linalg.norm(quaternions, axis=0)
-    across, along = 2 * (x * y + w * z), 1 - 2 * (y * y + z * z)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arctan2(2 * (w * y - x * z), np.hypot(along, across))
-    return roll, pitch, np.arctan2(across, along)
 
 
 def _json_value(value: Any) -> Any:
@@ -358,10 +356,24 @@ def export(
         written, or a library is not installed.
     """
     target = Path(path)
-    _require_suffix(target, format)
+    suffix = target.suffix.lower()
+    if format is ExportFormat.MAT:
+        if suffix not in ("", ".mat"):
+            raise RecordingError(
+                f"The name of a MATLAB file must end in .mat; '{target.name}' does not."
+            )
+    elif suffix in {f".{each.value}" for each in ExportFormat}:
+        raise RecordingError(
+            f"Tables in {format.value} are written to a folder with one file per topic; "
+            f"'{target.name}' is a file name."
+        )
     if os.path.lexists(target):
         raise RecordingError(f"{target} already exists: name another file or folder.")
-    named = _tables_by_file_name(tables)
+    named: dict[str, TopicTable] = {}
+    for table in filter(len, tables):
+        topic = table.topic.strip("/").replace("/", ".")
+        name = _UNSAFE_CHARACTERS.sub("_", topic).lstrip("._-")
+        named[_unused_name(name[:100] or "topic", named)] = table
     if format is ExportFormat.MAT:
         write_output(target, _mat_content(named))
     else:
@@ -377,32 +389,6 @@ def export(
                 raise
             raise RecordingError(f"{target} cannot be written: {error.strerror}.") from error
     return {table.topic: len(table) for table in named.values()}
-
-
-def _require_suffix(target: Path, format: ExportFormat) -> None:
-    suffix = target.suffix.lower()
-    if format is ExportFormat.MAT:
-        if suffix not in ("", ".mat"):
-            raise RecordingError(
-                f"The name of a MATLAB file must end in .mat; '{target.name}' does not."
-            )
-    elif suffix in {f".{each.value}" for each in ExportFormat}:
-        raise RecordingError(
-            f"Tables in {format.value} are written to a folder with one file per topic; "
-            f"'{target.name}' is a file name."
-        )
-
-
-def _tables_by_file_name(tables: Iterable[TopicTable]) -> dict[str, TopicTable]:
-    """Return the tables that have rows, by unique and safe file names."""
-    found: dict[str, TopicTable] = {}
-    for table in tables:
-        if len(table):
-            name = _UNSAFE_CHARACTERS.sub("_", table.topic.strip("/").replace("/", ".")).lstrip(
-                "._-"
-            )
-            found[_unused_name(name[:100] or "topic", found)] = table
-    return found
 
 
 def _unused_name(name: str, taken: Mapping[str, Any]) -> str:

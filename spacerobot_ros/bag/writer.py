@@ -15,8 +15,7 @@ from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.messages.definitions import type_hash
 from spacerobot_ros.times import SECOND
 
-_RECORDER_CHUNK_SIZE = 262_144
-"""Chunk size before compression, bytes; larger chunks have less overhead, but slow down seeking."""
+_DEFAULTS = RecorderConfig()
 
 
 def free_name(path: Path) -> Path:
@@ -44,22 +43,17 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     ----------
     path
         Path of the bag, usually ``*.mcap``; parent folders are created.
-    compression
-        Chunk compression: ``zstd``, ``lz4`` or ``none``.
+    config
+        Compression, and the file size and log time at which a new file is started, checked after
+        every chunk. If the bag may be split, its files are ``NAME_0.mcap``, ``NAME_1.mcap``, ...,
+        each complete, with all attachments and metadata.
     chunk_size
-        Uncompressed chunk size, bytes.
+        Uncompressed chunk size, bytes; larger chunks have less overhead, but slow down seeking.
     overwrite
         Whether to replace an existing file, unless it is being written.
     next_free
         Whether to use the next free name if the name is already used: ``NAME-1.mcap``,
         ``NAME-2.mcap``, ...
-    max_size
-        File size, in bytes, at which a new file is started; 0: unlimited. If the bag may be split,
-        its files are ``NAME_0.mcap``, ``NAME_1.mcap``, ..., each complete, with all attachments and
-        metadata.
-    max_duration_ns
-        Log time per file, in nanoseconds, after which a new file is started; 0: unlimited. Both
-        limits are checked after every chunk.
 
     Raises
     ------
@@ -70,18 +64,17 @@ class BagWriter(AbstractContextManager["BagWriter"]):
     def __init__(
         self,
         path: str | os.PathLike[str],
+        config: RecorderConfig = _DEFAULTS,
         *,
-        compression: str = "zstd",
-        chunk_size: int = 65536,
+        chunk_size: int = 262_144,
         overwrite: bool = True,
         next_free: bool = False,
-        max_size: int = 0,
-        max_duration_ns: int = 0,
     ) -> None:
         self._unsplit_path = Path(path)
-        self._limits = max_size, max_duration_ns
+        self._limits = round(config.max_size * 1e6), round(config.max_duration * SECOND)
+        """File size in bytes and log time in ns at which a new file is started; 0: unlimited."""
         self._file_number = 0
-        self._compression, self._overwrite = compression, overwrite and not next_free
+        self._compression, self._overwrite = config.compression, overwrite and not next_free
         self._chunk_size = chunk_size
         self._next_free = next_free
         self._earlier_counts: Counter[int] = Counter()
@@ -99,26 +92,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         except RecordingError:
             self._file.close()
             raise
-
-    @classmethod
-    def for_recorder(
-        cls,
-        path: str | os.PathLike[str],
-        config: RecorderConfig,
-        *,
-        overwrite: bool = False,
-        next_free: bool = False,
-    ) -> BagWriter:
-        """Return a new bag with a recorder's compression and file limits."""
-        return cls(
-            path,
-            compression=config.compression,
-            chunk_size=_RECORDER_CHUNK_SIZE,
-            overwrite=overwrite,
-            next_free=next_free,
-            max_size=round(config.max_size * 1e6),
-            max_duration_ns=round(config.max_duration * SECOND),
-        )
 
     @property
     def path(self) -> Path:
@@ -269,25 +242,23 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         asked, number = self._unsplit_path, 0
         while True:
             try:
+                whole = self._unsplit_path
+                numbered = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
+                others: list[str] = []
                 if any(self._limits) and not self._overwrite:
-                    self._require_no_numbered_files()
+                    with suppress(OSError):
+                        others = sorted(filter(numbered.fullmatch, os.listdir(whole.parent)))
+                if others:
+                    raise BagExistsError(
+                        f"Cannot create the bag {whole.with_name(others[0])}: File exists; name "
+                        "another one, or remove it."
+                    )
                 return self._open_numbered_file()
             except BagExistsError:
                 if not self._next_free:
                     raise
             number += 1
             self._unsplit_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
-
-    def _require_no_numbered_files(self) -> None:
-        whole = self._unsplit_path
-        pattern = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
-        with suppress(OSError):
-            for name in sorted(os.listdir(whole.parent)):
-                if pattern.fullmatch(name):
-                    raise BagExistsError(
-                        f"Cannot create the bag {whole.with_name(name)}: File exists; name another "
-                        "one, or remove it."
-                    )
 
     def check(self) -> None:
         """Check that the bag file still exists and has its full size.

@@ -55,4 +55,4 @@ __all__ = [
 ]
 
 # Laws of other packages import names from here.
-__getattr__ = lazy_names(__name__, {"LAWS": "spacerobot_ros.control.laws.registry"})
+__getattr__ = lazy_names(__name__, {"control.laws.registry": ["LAWS"]})

@@ -462,5 +462,5 @@ class Flight(FlightData):
 
         self.required_robot()
         config = self.scenario.config("recorder")
-        with BagWriter.for_recorder(path, config, overwrite=overwrite) as writer:
+        with BagWriter(path, config, overwrite=overwrite) as writer:
             write_flight(self, writer)

@@ -29,30 +29,28 @@ __all__ = [
     "ViewerNode",
 ]
 
-_CLASSES_BY_NODE = {
-    "plant": "PlantNode",
-    "planner": "PlannerNode",
-    "coordinated_control": "CoordinatedControlNode",
-    "recorder": "RecorderNode",
-    "viewer": "ViewerNode",
-}
-
 # Without the modules of the other nodes, a node starts in half the time.
 _class_named = lazy_names(
     __name__,
     {
-        "CoordinatedControlNode": "spacerobot_ros.nodes.controller",
-        "FlightNode": "spacerobot_ros.nodes.common.node",
-        "PlannerNode": "spacerobot_ros.nodes.planner",
-        "PlantNode": "spacerobot_ros.nodes.plant.node",
-        "RecorderNode": "spacerobot_ros.nodes.recorder",
-        "ReplayNode": "spacerobot_ros.nodes.replay",
-        "ViewerNode": "spacerobot_ros.nodes.viewer.node",
+        "nodes.common.node": ["FlightNode"],
+        "nodes.controller": ["CoordinatedControlNode"],
+        "nodes.planner": ["PlannerNode"],
+        "nodes.plant.node": ["PlantNode"],
+        "nodes.recorder": ["RecorderNode"],
+        "nodes.replay": ["ReplayNode"],
+        "nodes.viewer.node": ["ViewerNode"],
     },
 )
 
 
 def __getattr__(name: str) -> Any:
     if name == "NODE_TYPES":
-        return {node: _class_named(each) for node, each in _CLASSES_BY_NODE.items()}
+        return {
+            "plant": _class_named("PlantNode"),
+            "planner": _class_named("PlannerNode"),
+            "coordinated_control": _class_named("CoordinatedControlNode"),
+            "recorder": _class_named("RecorderNode"),
+            "viewer": _class_named("ViewerNode"),
+        }
     return _class_named(name)

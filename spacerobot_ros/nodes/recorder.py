@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -128,28 +128,34 @@ class RecorderNode(FlightNode):
         """Open the bag and subscribe to topics, which are recorded once the node is active."""
         config = self.config
         # Checks that may fail come before the bag is opened, as it would stay open.
-        descriptions = _read_descriptions(config.describe)
+        descriptions: dict[str, dict[str, str]] = {}
+        if config.describe:
+            try:
+                records = json.loads(Path(config.describe).read_text(encoding="utf-8"))
+                for title, values in records.items():
+                    descriptions[title] = {name: str(value) for name, value in values.items()}
+            except (OSError, ValueError, AttributeError) as error:
+                raise ParameterError(
+                    f"Parameter 'describe' is '{config.describe}', which is not a JSON file with "
+                    f"named objects: {error}."
+                ) from error
         self._clock_topic = self.resolve_topic_name(_CLOCK_TOPIC)
         self._chosen_topics = {self.resolve_topic_name(topic) for topic in config.topics.split()}
         self._shared_topics = {self._clock_topic, *map(self.resolve_topic_name, _SHARED_TOPICS)}
-        writer = BagWriter.for_recorder(
+        writer = BagWriter(
             config.bag or time.strftime("spacerobot-%Y%m%d-%H%M%S.mcap"),
             config,
+            overwrite=False,
             next_free=config.when_exists == "next",
         )
-        self.recording = Recording(writer, config.clock_wait, self._on_failure)
+        recording = self.recording = Recording(writer, config.clock_wait, self._on_failure)
         self._parameter_requests = {}
         self._topics_without_owner = set()
-        frames = tuple(map(self.resolve_topic_name, (TRANSFORMS, STATIC_TRANSFORMS)))
-        self._transforms: _RecordedTransforms | None = None
-        if config.tf_period and self._is_chosen(frames[0], TRANSFORM_TYPE):
-            self._transforms = _RecordedTransforms(
-                self.recording,
-                config.tf_period,
-                (frames[0], frames[1]),
-                lambda: frames[0] in self.topics,
-                map(self.resolve_topic_name, ("odom", "joint_states", _DESCRIPTION_TOPIC)),
-            )
+        self._listeners: dict[str, RawCallback] = {}
+        """Functions that also receive the messages on a topic."""
+        frames = self.resolve_topic_name(TRANSFORMS)
+        if config.tf_period and self._is_chosen(frames, TRANSFORM_TYPE):
+            self._listeners = _RecordedTransforms(self, recording).listeners
         self.topics: set[str] = set()
         """Full names of the subscribed topics."""
         self._unreadable_topics: set[str] = set()
@@ -168,10 +174,16 @@ class RecorderNode(FlightNode):
         if config.diagnostics_period:
             self.create_timer(config.diagnostics_period, self._publish_state, clock=steady)
         self.describe("spacerobot", {"version": __version__})
-        for title, values in descriptions:
+        for title, values in descriptions.items():
             self.describe(title, values)
         if self._chosen_topics and self._clock_topic not in self._chosen_topics:
-            self._follow_clock(self.recording)
+            self.create_subscription(
+                Clock,
+                self._clock_topic,
+                lambda raw: recording.set_clock(first_time_ns(raw)),
+                QoSProfile(depth=_QUEUE_DEPTH),
+                raw=True,
+            )
         self.scan()
 
     def activate(self) -> None:
@@ -267,7 +279,13 @@ class RecorderNode(FlightNode):
         if self.recording is not None:
             clocks = self.count_publishers(self._clock_topic)
             self.recording.flush(clock_is_published=clocks > 0)
-            self._publish_losses(self.recording)
+            if self.recording.lost:
+                lost = sorted(self.recording.lost.items())
+                counts = {topic: str(count) for topic, count in lost}
+                listed = ", ".join(f"{count} on '{topic}'" for topic, count in lost)
+                message = f"Messages were lost on their way to the recorder: {listed}."
+                self.get_logger().warning(message, throttle_duration_sec=_LOSS_LOG_PERIOD)
+                self._publish_diagnostics(self.recording, "lost messages", 1, message, counts)
             self._warn_of_clocks(self.recording, clocks)
 
     def _warn_of_clocks(self, recording: Recording, publishers: int) -> None:
@@ -315,14 +333,6 @@ class RecorderNode(FlightNode):
             if record not in self._parameter_requests:
                 self._parameter_requests[record] = RemoteParameters(self, full)
 
-    def _follow_clock(self, recording: Recording) -> None:
-
-        def on_clock(raw: bytes) -> None:
-            recording.set_clock(first_time_ns(raw))
-
-        qos = QoSProfile(depth=_QUEUE_DEPTH)
-        self.create_subscription(Clock, self._clock_topic, on_clock, qos, raw=True)
-
     def _record(self, recording: Recording, topic: str, type_name: str) -> None:
         publishers = self.get_publishers_info_by_topic(topic)
         offered = [info.qos_profile for info in publishers]
@@ -330,7 +340,10 @@ class RecorderNode(FlightNode):
             return  # The topic has no publisher yet, so its quality of service is unknown.
         try:
             kind = message_class(type_name)
-            channel = recording.writer.add_topic(topic, type_name, _recorded_qos(offered[0]))
+            policies = ("history", "reliability", "durability", "liveliness")
+            words = {name: getattr(offered[0], name).name.lower() for name in policies}
+            recorded = QosProfile(depth=offered[0].depth, **words)
+            channel = recording.writer.add_topic(topic, type_name, recorded)
         except SpaceRobotError as error:
             self._unreadable_topics.add(topic)
             self.get_logger().warning(f"Topic '{topic}' is not recorded: {error}")
@@ -342,16 +355,37 @@ class RecorderNode(FlightNode):
         if topic.endswith(_PRELIMINARY_TOPICS) and not alone:
             recording.preliminary.add(channel)
         self._request_parameters(topic, publishers[0])
-        listener = None
-        if self._transforms is not None:
-            listener = self._transforms.listener(topic)
-        take = _recording_callback(recording, topic, kind, channel, self._clock_topic, listener)
-        qos = _subscribed_qos(offered)
-        if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        take = self._recording_callback(recording, topic, kind, channel)
+        qos = QoSProfile(depth=_QUEUE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        if all(each.reliability == ReliabilityPolicy.RELIABLE for each in offered):
+            qos.reliability = ReliabilityPolicy.RELIABLE
+        if all(each.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in offered):
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
             recording.latched[channel] = None
         # Latched topics keep their last message: a message replaced in transit is not lost.
         events = None if channel in recording.latched else loss_events(recording, topic)
         self.create_subscription(kind, topic, take, qos, event_callbacks=events, raw=True)
+
+    def _recording_callback(
+        self, recording: Recording, topic: str, kind: Any, channel: int
+    ) -> RawCallback:
+        """Return the callback for a topic's messages; the clock sets the time of all others."""
+        is_clock, listener = topic == self._clock_topic, self._listeners.get(topic)
+        is_description = topic.endswith(f"/{_DESCRIPTION_TOPIC}")
+        urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
+        header = next(iter(kind.get_fields_and_field_types().values()), "")
+        is_stamped = header == "std_msgs/Header"
+
+        def take(raw: bytes) -> None:
+            if is_clock:
+                recording.set_clock(first_time_ns(raw))
+            elif is_description and urdf_name not in recording.attached:
+                recording.attach_robot(urdf_name, read_text(raw, _TEXT_TYPE, "data").encode())
+            recording.record(channel, raw, first_time_ns(raw) if is_stamped else 0)
+            if listener is not None:
+                listener(raw)
+
+        return take
 
     # -- reports ------------------------------------------------------------------------------
 
@@ -375,15 +409,6 @@ class RecorderNode(FlightNode):
     def _report_bag_event(self, kind: EventKind, message: str, level: int = 0) -> None:
         bag = str(self.recording.writer.path) if self.recording is not None else ""
         self.report_event(Event(kind, message, level, about={"bag": bag}))
-
-    def _publish_losses(self, recording: Recording) -> None:
-        if not recording.lost:
-            return
-        counts = {topic: str(count) for topic, count in sorted(recording.lost.items())}
-        listed = ", ".join(f"{count} on '{topic}'" for topic, count in counts.items())
-        message = f"Messages were lost on their way to the recorder: {listed}."
-        self.get_logger().warning(message, throttle_duration_sec=_LOSS_LOG_PERIOD)
-        self._publish_diagnostics(recording, "lost messages", 1, message, counts)
 
     def _publish_state(self) -> None:
         recording = self.recording
@@ -415,41 +440,27 @@ class _RecordedTransforms:
     """Writes transforms of one robot, computed from its recorded topics.
 
     A state is used once its odom and its joint_states have arrived, in either order. So the
-    transforms have the stamps of states, and are at least ``period`` s of bag time apart.
-    ``topics`` are the names of /tf and /tf_static in the bag, ``sources`` those of odom,
-    joint_states and robot_description. While ``is_published``, a node publishes /tf itself: its
-    messages are recorded, and none are written here.
+    transforms have the stamps of states, and are at least ``tf_period`` of bag time apart. While a
+    node publishes /tf itself, its messages are recorded, and none are written here.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        period: float,
-        topics: tuple[str, str],
-        is_published: Callable[[], bool],
-        sources: Iterable[str],
-    ) -> None:
-        self._recording, self._topics, self._is_published = recording, topics, is_published
-        self._period_ns = round(period * SECOND)
-        callbacks = self._on_odom, self._on_joint_states, self._on_description
-        self._callbacks = dict(zip(sources, callbacks, strict=True))
-        self._odom, self._joint_states = b"", b""
+    def __init__(self, node: RecorderNode, recording: Recording) -> None:
+        self._node, self._recording = node, recording
+        self._period_ns = round(node.config.tf_period * SECOND)
+        self._topics = [node.resolve_topic_name(name) for name in (TRANSFORMS, STATIC_TRANSFORMS)]
+        callbacks: dict[str, RawCallback] = {
+            "odom": partial(self._on_state, "odom"),
+            "joint_states": partial(self._on_state, "joint_states"),
+            _DESCRIPTION_TOPIC: self._on_description,
+        }
+        self.listeners = {node.resolve_topic_name(name): f for name, f in callbacks.items()}
+        """Functions that take the messages, by topic."""
+        self._latest = {"odom": b"", "joint_states": b""}
         self._last_ns, self._next_ns = 0, 0
         self._description: RobotDescription | None = None
         self._state: StateFrames | None = None
         self._frames: RobotTransforms | None = None
         self._channel = -1
-
-    def listener(self, topic: str) -> RawCallback | None:
-        return self._callbacks.get(topic)
-
-    def _on_odom(self, raw: bytes) -> None:
-        self._odom = raw
-        self._write_complete_state()
-
-    def _on_joint_states(self, raw: bytes) -> None:
-        self._joint_states = raw
-        self._write_complete_state()
 
     def _on_description(self, raw: bytes) -> None:
         try:
@@ -459,17 +470,20 @@ class _RecordedTransforms:
         self._description, self._frames = description, None
         self._state = StateFrames(description)
 
-    def _write_complete_state(self) -> None:
-        """Write the transforms if the period is over, or time has jumped back."""
-        if self._odom[HEADER_STAMP] != self._joint_states[HEADER_STAMP]:
+    def _on_state(self, topic: str, raw: bytes) -> None:
+        """Write the transforms of a complete state if the period is over, or time has jumped
+        back."""
+        self._latest[topic] = raw
+        odom, joint_states = self._latest.values()
+        if odom[HEADER_STAMP] != joint_states[HEADER_STAMP]:
             return
-        state, time_ns = self._state, first_time_ns(self._odom)
+        state, time_ns = self._state, first_time_ns(odom)
         if self._last_ns <= time_ns < self._next_ns or state is None:
             return
-        if not self._recording.running or self._is_published():
+        if not self._recording.running or self._topics[0] in self._node.topics:
             return
         try:
-            state.accept(self._odom, self._joint_states)
+            state.accept(odom, joint_states)
             frames = self._frames or self._begin(state, time_ns)
         except (CommandError, RecordingError):
             return  # The state is of another robot. The next message reports a failed write.
@@ -490,51 +504,6 @@ class _RecordedTransforms:
         return frames
 
 
-def _recording_callback(
-    recording: Recording,
-    topic: str,
-    kind: Any,
-    channel: int,
-    clock: str,
-    listener: RawCallback | None,
-) -> RawCallback:
-    """Return the callback for a topic's messages; the clock sets the time of all others."""
-    record = recording.record
-    urdf_name = f"{topic.strip('/').replace('/', '.')}.urdf"
-
-    def on_clock(raw: bytes) -> None:
-        recording.set_clock(first_time_ns(raw))
-        record(channel, raw)
-
-    def on_stamped(raw: bytes) -> None:
-        record(channel, raw, first_time_ns(raw))
-
-    def on_description(raw: bytes) -> None:
-        if urdf_name not in recording.attached:
-            urdf = read_text(raw, _TEXT_TYPE, "data").encode()
-            recording.attach_robot(urdf_name, urdf)
-        record(channel, raw)
-
-    def on_other(raw: bytes) -> None:
-        record(channel, raw)
-
-    if topic == clock:
-        take = on_clock
-    elif topic.endswith(f"/{_DESCRIPTION_TOPIC}"):
-        take = on_description
-    else:
-        header = next(iter(kind.get_fields_and_field_types().values()), "")
-        take = on_stamped if header == "std_msgs/Header" else on_other
-    if listener is None:
-        return take
-
-    def record_and_listen(raw: bytes) -> None:
-        take(raw)
-        listener(raw)
-
-    return record_and_listen
-
-
 def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
     """Return callbacks for subscription events, which count lost messages.
 
@@ -546,39 +515,6 @@ def loss_events(recording: Recording, topic: str) -> SubscriptionEventCallbacks:
         recording.lost[topic] += info.total_count_change
 
     return SubscriptionEventCallbacks(message_lost=on_loss)
-
-
-def _recorded_qos(offered: QoSProfile) -> QosProfile:
-    return QosProfile(
-        history=offered.history.name.lower(),
-        depth=offered.depth,
-        reliability=offered.reliability.name.lower(),
-        durability=offered.durability.name.lower(),
-        liveliness=offered.liveliness.name.lower(),
-    )
-
-
-def _subscribed_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
-    reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
-    latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-    return QoSProfile(
-        depth=_QUEUE_DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def _read_descriptions(path: str) -> list[tuple[str, dict[str, str]]]:
-    if not path:
-        return []
-    try:
-        records = json.loads(Path(path).read_text(encoding="utf-8"))
-        return [(n, {k: str(v) for k, v in values.items()}) for n, values in records.items()]
-    except (OSError, ValueError, AttributeError) as error:
-        raise ParameterError(
-            f"Parameter 'describe' is '{path}', which is not a JSON file with named objects: "
-            f"{error}."
-        ) from error
 
 
 main = partial(run_node, RecorderNode)

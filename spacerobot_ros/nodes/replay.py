@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,7 +23,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 
-from spacerobot_ros.bag import Playback, QosProfile, ReplayMessage, read_bag
+from spacerobot_ros.bag import Playback, ReplayMessage, read_bag
 from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import ReplayStatus, SubscriberWait, renamed_topics
 from spacerobot_ros.errors import (
@@ -39,7 +40,7 @@ from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.watchdog import Role
-from spacerobot_ros.times import LATEST_NS, SECOND, set_stamp
+from spacerobot_ros.times import LATEST_NS, SECOND
 
 _READER_CHECK_PERIOD = 0.05  # wall s
 _MAX_MESSAGES_AT_ONCE = 500
@@ -96,14 +97,7 @@ class ReplayNode(FlightNode):
             raise ParameterError("Parameter 'bag' is empty; name the MCAP file to replay.")
         self.messages_replayed = 0
         bag = read_bag(config.bag)
-        self._playback = Playback(
-            bag,
-            topics=config.topics.split(),
-            rate=config.rate,
-            start=config.start,
-            duration=config.duration,
-            loop=config.loop,
-        )
+        self._playback = Playback(bag, config)
         self._close_bag = self._playback.close
         self._outputs: list[Publisher] = []
         self._sends = {}
@@ -182,10 +176,16 @@ class ReplayNode(FlightNode):
             if topic.name in own:
                 continue  # The bag contains the status of another replay, which is omitted.
             name = new_names.get(topic.name, topic.name)
+            latched = topic.qos.durability == "transient_local"
+            # Without a depth in the bag, the stack's depth is used.
+            depth = min(topic.qos.depth, _MAX_QUEUE_DEPTH) or (1 if latched else STREAM.depth)
+            qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
+            if topic.qos.reliability == "best_effort":
+                qos.reliability = ReliabilityPolicy.BEST_EFFORT
+            if latched:
+                qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
             try:
-                publisher = self.create_publisher(
-                    message_class(topic.type_name), name, _publisher_qos(topic.qos)
-                )
+                publisher = self.create_publisher(message_class(topic.type_name), name, qos)
             except InvalidTopicNameException:
                 raise ParameterError(
                     f"Topic '{topic.name}' cannot be replayed as '{name}': it is not a valid "
@@ -201,13 +201,19 @@ class ReplayNode(FlightNode):
                 continue
             self._outputs.append(publisher)
             send: Callable[[bytes], None] = publisher.publish
-            described = topic.type_name == _TEXT_TYPE and topic.name.endswith(_DESCRIPTION_TOPIC)
-            if described and self._mesh_folder is not None:
-                folder = Path(self._mesh_folder.name)
-                send = _with_mesh_files(send, self._attachments, folder)
+            if topic.type_name == _TEXT_TYPE and topic.name.endswith(_DESCRIPTION_TOPIC):
+                send = partial(self._publish_description, publisher)
             self._sends[topic.name] = send
         if not self._outputs and not own_clock:
             raise SpaceRobotError("None of the bag's message types is installed here.")
+
+    def _publish_description(self, publisher: Publisher, data: bytes) -> None:
+        assert self._mesh_folder is not None
+        text = ""
+        with suppress(RuntimeError):  # A description that cannot be read is replayed unchanged.
+            text = deserialize_message(data, String).data
+        located = with_attached_meshes(text, self._attachments, Path(self._mesh_folder.name))
+        publisher.publish(data if located == text else serialize_message(String(data=located)))
 
     def _on_reader_check(self) -> None:
         matched = [p.get_subscription_count() for p in self._outputs]
@@ -269,7 +275,7 @@ class ReplayNode(FlightNode):
             return
         self._last_clock = time_ns
         message = ClockMessage()
-        set_stamp(message.clock, time_ns)
+        message.clock.sec, message.clock.nanosec = divmod(time_ns, SECOND)
         self._clock_publisher.publish(message)
 
     def _end_if_done(self) -> None:
@@ -349,33 +355,6 @@ class ReplayNode(FlightNode):
         self._send(message)
         self._end_if_done()
         return f"{message.topic} at {message.log_time_ns / SECOND:.9f} s"
-
-
-def _with_mesh_files(
-    send: Callable[[bytes], None], attachments: Mapping[str, bytes], folder: Path
-) -> Callable[[bytes], None]:
-
-    def send_with_files(data: bytes) -> None:
-        try:
-            text = deserialize_message(data, String).data
-        except RuntimeError:  # A description that cannot be read is replayed unchanged.
-            send(data)
-            return
-        located = with_attached_meshes(text, attachments, folder)
-        send(data if located == text else serialize_message(String(data=located)))
-
-    return send_with_files
-
-
-def _publisher_qos(qos: QosProfile) -> QoSProfile:
-    """Return the QoS of a publisher; without a depth in the bag, the stack's depth is used."""
-    latched = qos.durability == "transient_local"
-    best_effort = qos.reliability == "best_effort"
-    return QoSProfile(
-        depth=min(qos.depth, _MAX_QUEUE_DEPTH) or (1 if latched else STREAM.depth),
-        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
 
 
 main = partial(run_node, ReplayNode)

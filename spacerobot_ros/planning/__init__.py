@@ -37,9 +37,7 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "METHODS": "spacerobot_ros.planning.methods.registry",
-        "build_method": "spacerobot_ros.planning.methods.registry",
-        "method_options": "spacerobot_ros.planning.methods.registry",
-        "plan": "spacerobot_ros.planning.api",
+        "planning.api": ["plan"],
+        "planning.methods.registry": ["METHODS", "build_method", "method_options"],
     },
 )

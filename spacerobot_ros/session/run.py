@@ -79,23 +79,13 @@ def run_scenario(
     flight = LockstepFlight(scenario)
     if scenario.parameters("recorder").get("when_exists") == "next":
         bag = free_name(bag)
-    writer = BagWriter.for_recorder(bag, scenario.config("recorder"))
-    with graceful_shutdown(flight.interrupt) as stopped:
+    writer = BagWriter(bag, scenario.config("recorder"), overwrite=False)
+    with graceful_shutdown(flight.interrupt) as stopped, writer:
 
         def look(now: float, end: float) -> bool:
             report(now, end)
             return stopped()
 
-        return RunResult(_fly_and_write(flight, writer, look, longest))
-
-
-def _fly_and_write(
-    flight: LockstepFlight,
-    writer: BagWriter,
-    look: Callable[[float, float], bool],
-    longest: float,
-) -> dict[str, Any]:
-    with writer:
         began = time.perf_counter()
         try:
             flown = flight.fly(look, longest)
@@ -107,4 +97,4 @@ def _fly_and_write(
             raise SpaceRobotError(message) from error
         write_flight(flown, writer)
     recorded = {"messages_recorded": writer.messages_written, "bag": str(writer.path)}
-    return {**flown.summary(), **recorded}
+    return RunResult({**flown.summary(), **recorded})

@@ -22,6 +22,7 @@ from spacerobot_ros.bag import (
     mcap_file,
     read_bag,
 )
+from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.mcap_file import McapFile
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
 
@@ -47,7 +48,7 @@ def test_a_bag_that_is_there_is_kept_and_the_next_name_taken(tmp_path: Path) -> 
     path = tmp_path / "crash.mcap"
     before = make_bag(path)
     for number in (1, 2):
-        with BagWriter(path, overwrite=False, next_free=True) as writer:
+        with BagWriter(path, next_free=True) as writer:
             assert writer.path == tmp_path / f"crash-{number}.mcap"
     assert path.read_bytes() == before
     assert free_name(path) == tmp_path / "crash-3.mcap"
@@ -75,18 +76,18 @@ def test_a_bag_is_read_after_its_recorder_has_stopped(tmp_path: Path) -> None:
     assert numbers(path) == [1]
 
 
-@pytest.mark.parametrize("limits", [{}, {"max_size": 10_000}])
+@pytest.mark.parametrize("max_size", [0.0, 0.01])
 @pytest.mark.parametrize("overwrite", [True, False])
 def test_two_recorders_do_not_share_a_file(
-    tmp_path: Path, limits: dict[str, Any], overwrite: bool
+    tmp_path: Path, max_size: float, overwrite: bool
 ) -> None:
-    path = tmp_path / "a.mcap"
-    with BagWriter(path, overwrite=overwrite, **limits) as first:
+    path, config = tmp_path / "a.mcap", RecorderConfig(max_size=max_size)
+    with BagWriter(path, config, overwrite=overwrite) as first:
         channel = first.add_topic("/a", STRING)
         first.write(channel, string("000007"), 1, 1)
         with pytest.raises(RecordingError, match=r"is being written by another|File exists"):
-            BagWriter(path, overwrite=overwrite, **limits)
-        with BagWriter(path, overwrite=overwrite, next_free=True, **limits) as second:
+            BagWriter(path, config, overwrite=overwrite)
+        with BagWriter(path, config, overwrite=overwrite, next_free=True) as second:
             assert second.path.name.startswith("a-1")
             assert second.path != first.path
     assert numbers(first.path) == [7]
@@ -95,14 +96,16 @@ def test_two_recorders_do_not_share_a_file(
 def test_a_split_bag_is_not_mixed_with_another(tmp_path: Path) -> None:
     old = make_bag(tmp_path / "a_2.mcap")
     with pytest.raises(RecordingError, match=r"a_2\.mcap: File exists"):
-        BagWriter(tmp_path / "a.mcap", overwrite=False, max_size=1000)
-    with BagWriter(tmp_path / "a.mcap", next_free=True, max_size=1000) as writer:
+        BagWriter(tmp_path / "a.mcap", RecorderConfig(max_size=0.001), overwrite=False)
+    config = RecorderConfig(max_size=0.001)
+    with BagWriter(tmp_path / "a.mcap", config, next_free=True) as writer:
         assert writer.path == tmp_path / "a-1_0.mcap"
     assert (tmp_path / "a_2.mcap").read_bytes() == old
 
 
 def test_a_file_in_the_way_of_a_split_is_stepped_over(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "a.mcap", overwrite=False, chunk_size=500, max_size=1500) as writer:
+    config = RecorderConfig(max_size=0.0015)
+    with BagWriter(tmp_path / "a.mcap", config, chunk_size=500, overwrite=False) as writer:
         channel = writer.add_topic("/a", STRING)
         old = make_bag(tmp_path / "a_1.mcap")
         for n in range(60):
@@ -233,7 +236,8 @@ def record_until_killed(path: Path, step: int, share: float) -> None:
 
     # The process of a test of its own: nothing else opens a file in this module.
     mcap_file.open = lambda descriptor, mode, buffering: File(descriptor, mode)  # type: ignore[attr-defined]
-    with BagWriter(path, overwrite=False, compression="none", max_size=3_000) as writer:
+    config = RecorderConfig(compression="none", max_size=0.003)
+    with BagWriter(path, config, overwrite=False) as writer:
         writer.add_attachment("robot.urdf", b"<robot/>", "application/xml", 5)
         channel = writer.add_topic("/a", STRING)
         for n in range(40):

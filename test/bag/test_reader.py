@@ -31,6 +31,7 @@ from spacerobot_ros.bag import (
     message_definition,
     read_bag,
 )
+from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.mcap_reading import BagFile, blocks_in_time_order
 from spacerobot_ros.flight.reading import FlightBag
 
@@ -397,7 +398,7 @@ def test_a_bag_without_summary(tmp_path: Path) -> None:
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
 def test_a_chunk_that_is_damaged(tmp_path: Path, compression: str) -> None:
     path = tmp_path / "a.mcap"
-    with BagWriter(path, compression=compression) as writer:
+    with BagWriter(path, RecorderConfig(compression=compression)) as writer:
         channel = writer.add_topic("/a", STRING)
         for n in range(100):
             writer.write(channel, string("x" * 100), n, n)

@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 from support.full_disk import MakeDisk
 
 from spacerobot_ros.bag import BagWriter, Recording, RecordingError, read_bag
+from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.resources import robot_file
 
 STRING = "std_msgs/msg/String"
@@ -231,7 +232,7 @@ def test_a_disk_that_refuses_a_message_is_reported_once(
 ) -> None:
     make_disk(5_000)
     failures: list[RecordingError] = []
-    writer = BagWriter(tmp_path / "a.mcap", compression="none")
+    writer = BagWriter(tmp_path / "a.mcap", RecorderConfig(compression="none"), chunk_size=65536)
     recording = Recording(writer, 0.5, failures.append)
     channel = writer.add_topic("/a", STRING)
     recording.start()

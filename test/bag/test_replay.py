@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, Writer
 from support.hostile.records import string
 
 from spacerobot_ros.bag import LATCHED, Bag, BagWriter, RecordingError, read_bag
+from spacerobot_ros.bag.config import ReplayConfig
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, SubscriberWait, renamed_topics
 from spacerobot_ros.errors import ParameterError
 
@@ -66,7 +67,7 @@ def test_every_message_comes_at_its_time(path: Path) -> None:
 
 @pytest.mark.parametrize("rate", [0.5, 3.0, 1000.0])
 def test_the_rate_divides_the_spacing(path: Path, rate: float) -> None:
-    playback = Playback(read_bag(path), topics=["/b"], rate=rate)
+    playback = Playback(read_bag(path), ReplayConfig(topics="/b", rate=rate))
     playback.run(CLOCK)
     for k in range(5):
         due = playback.next_due_time()
@@ -79,13 +80,15 @@ def test_the_rate_divides_the_spacing(path: Path, rate: float) -> None:
 
 
 def test_start_and_duration_choose_a_part(path: Path) -> None:
-    found = played(Playback(read_bag(path), topics=["/a"], start=0.25, duration=0.5), 1.0)
+    found = played(
+        Playback(read_bag(path), ReplayConfig(topics="/a", start=0.25, duration=0.5)), 1.0
+    )
     times = [time for time, _ in found]
     assert times == pytest.approx([0.05, 0.15, 0.25, 0.35, 0.45])
 
 
 def test_what_was_latched_before_the_start_comes_first(path: Path) -> None:
-    found = played(Playback(read_bag(path), start=0.5), 1.0)
+    found = played(Playback(read_bag(path), ReplayConfig(start=0.5)), 1.0)
     assert found[0][0] == 0.0
     assert found[0][1].startswith("/latched")
     assert [text for _, text in found if text.startswith("/latched")] == [found[0][1]]
@@ -103,7 +106,7 @@ def test_a_late_clock_gets_everything_that_is_due_in_order(path: Path) -> None:
 
 
 def test_a_pause_shifts_what_follows(path: Path) -> None:
-    playback = Playback(read_bag(path), topics=["/a"])
+    playback = Playback(read_bag(path), ReplayConfig(topics="/a"))
     playback.run(CLOCK)
     assert len(list(playback.take_due(CLOCK + S // 4, 100))) == 3
     playback.pause(CLOCK + S // 4)
@@ -115,7 +118,7 @@ def test_a_pause_shifts_what_follows(path: Path) -> None:
 
 
 def test_steps_move_the_time_of_the_bag(path: Path) -> None:
-    playback = Playback(read_bag(path), topics=["/b"])
+    playback = Playback(read_bag(path), ReplayConfig(topics="/b"))
     for k in range(3):
         message = playback.step(CLOCK)
         assert message is not None
@@ -128,7 +131,7 @@ def test_steps_move_the_time_of_the_bag(path: Path) -> None:
 
 
 def test_a_loop_begins_again_at_the_time_of_the_last_message(path: Path) -> None:
-    found = played(Playback(read_bag(path), topics=["/b"], start=0.25, loop=True), 2.5)
+    found = played(Playback(read_bag(path), ReplayConfig(topics="/b", start=0.25, loop=True)), 2.5)
     times = [time for time, _ in found]
     turn = [0.0, 0.25, 0.5, 0.75]
     assert times[:12] == pytest.approx([0.75 * n + t for n in range(3) for t in turn])
@@ -166,7 +169,7 @@ def test_a_jump_brings_what_a_subscriber_would_have(path: Path) -> None:
 def test_a_jump_to_the_beginning_while_time_stands_still_shows_what_is_there(path: Path) -> None:
     everything = played(Playback(read_bag(path)), 1.0)
     for start in (0.0, 0.25):
-        playback = Playback(read_bag(path), start=start)
+        playback = Playback(read_bag(path), ReplayConfig(start=start))
         playback.seek(BEGAN + round(0.62 * S), CLOCK)
         shown = texts_of(playback.seek(BEGAN, CLOCK))
         there = {text.split()[0]: text for time, text in everything if time == start}
@@ -179,7 +182,7 @@ def test_a_jump_to_the_beginning_while_time_stands_still_shows_what_is_there(pat
 
 
 def test_a_jump_stays_in_the_part_that_is_played(path: Path) -> None:
-    playback = Playback(read_bag(path), start=0.2, duration=0.5)
+    playback = Playback(read_bag(path), ReplayConfig(start=0.2, duration=0.5))
     assert (playback.start_ns, playback.duration_s) == (BEGAN + S // 5, 0.5)
     playback.run(CLOCK)
     shown = playback.seek(BEGAN, CLOCK)
@@ -219,11 +222,11 @@ def test_a_bag_without_chunks(tmp_path: Path) -> None:
 def test_what_cannot_be_played_is_refused(path: Path, tmp_path: Path) -> None:
     bag = read_bag(path)
     with pytest.raises(RecordingError, match="has no topic /c: it has /a"):
-        Playback(bag, topics=["/c"])
+        Playback(bag, ReplayConfig(topics="/c"))
     with pytest.raises(RecordingError, match=r"no message to replay from 1.5 s: it lasts 1 s"):
-        Playback(bag, start=1.5)
+        Playback(bag, ReplayConfig(start=1.5))
     with pytest.raises(RecordingError, match=r"from 0.01 s for 0.05 s: it lasts 1 s"):
-        Playback(bag, topics=["/a"], start=0.01, duration=0.05)
+        Playback(bag, ReplayConfig(topics="/a", start=0.01, duration=0.05))
     with pytest.raises(RecordingError, match="has no messages"):
         Playback(read_bag(bag_of(tmp_path / "empty.mcap", [])))
 
@@ -232,7 +235,10 @@ def test_a_bag_of_too_many_topics_is_played_by_name(tmp_path: Path) -> None:
     bag = read_bag(bag_of(tmp_path / "a.mcap", [(f"/t{n}", 0.0) for n in range(1001)]))
     with pytest.raises(RecordingError, match="has 1001 topics, but only 1000 can be replayed"):
         Playback(bag)
-    assert [topic.name for topic in Playback(bag, topics=["/t7", "/t9"]).topics] == ["/t7", "/t9"]
+    assert [topic.name for topic in Playback(bag, ReplayConfig(topics="/t7 /t9")).topics] == [
+        "/t7",
+        "/t9",
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +258,7 @@ FAR = 3_000_000_000 * S
 def test_time_goes_on_by_the_rate_and_stands_in_pauses(
     far: Bag, rate: float, moves: list[tuple[bool, int]]
 ) -> None:
-    playback = Playback(far, rate=rate)
+    playback = Playback(far, ReplayConfig(rate=rate))
     assert playback.step(CLOCK) is not None
     running_ns = 0
     clock = CLOCK
@@ -308,7 +314,7 @@ def replayed(path: Path, start: float) -> Playback:
             if n in (0, 2, 3):
                 writer.write(latched, string(f"latched {n}"), 77 * S + n * S // 10, 0)
             writer.write(a, string(f"{n}"), 77 * S + n * S // 10, 0)
-    return Playback(read_bag(path), start=start)
+    return Playback(read_bag(path), ReplayConfig(start=start))
 
 
 @pytest.mark.parametrize(

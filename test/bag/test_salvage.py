@@ -184,8 +184,8 @@ def test_the_commands_offer_it_and_it_does(bag: Path, tmp_path: Path) -> None:
     assert run(main, ["salvage", str(bag)]).exit_code == 2
 
 
-def bag_of(path: Path, times: list[float], **options: Any) -> Path:
-    with BagWriter(path, chunk_size=1, **options) as writer:
+def bag_of(path: Path, times: list[float]) -> Path:
+    with BagWriter(path, chunk_size=1) as writer:
         writer.add_topic("/silent", STRING)
         channel = writer.add_topic("/a", STRING)
         for n, time in enumerate(times):

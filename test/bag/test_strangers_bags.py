@@ -36,6 +36,7 @@ from spacerobot_ros.bag import (
     message_definition,
     read_bag,
 )
+from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
 from spacerobot_ros.bag.mcap_reading import INFLATED_SIZE_VARIABLE
 from spacerobot_ros.bag.salvage import last_state, salvage_bag
 from spacerobot_ros.cli.main import main
@@ -116,7 +117,7 @@ def test_a_split_bag_is_one_bag(split_bag: Path, tmp_path: Path) -> None:
         assert table["time_ns"].tolist() == [time for _, time, _ in reader.messages()]
     bag = read_bag(split_bag)
     assert (bag.path, bag.message_count(), bag.start_time, bag.end_time) == (split_bag, 22, 0, 21)
-    playback = Playback(bag, start=1.5)
+    playback = Playback(bag, ReplayConfig(start=1.5))
     playback.run(0)
     replayed = [playback.step(0) for _ in range(20)]
     assert [each.log_time_ns for each in replayed if each] == [k * 10**9 for k in range(2, 22)]
@@ -188,7 +189,7 @@ def test_a_split_flight_is_verified_as_the_whole(tmp_path: Path) -> None:
 
 
 def test_the_name_of_a_split_recording_is_all_of_its_files(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "a.mcap", max_duration_ns=10**9, chunk_size=1) as writer:
+    with BagWriter(tmp_path / "a.mcap", RecorderConfig(max_duration=1.0), chunk_size=1) as writer:
         channel = writer.add_topic("/joint_states", JOINT_STATE)
         for k in range(5):
             writer.write(channel, joint_states(k, ("j1",)), k * 10**9, k * 10**9)

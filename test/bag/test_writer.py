@@ -23,6 +23,7 @@ from support.hostile.records import string
 
 import spacerobot_ros
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError, read_bag
+from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.salvage import salvage_bag
 
 STRING = "std_msgs/msg/String"
@@ -48,7 +49,7 @@ def all_additions(writer: BagWriter, channel: int) -> list[Callable[[], Any]]:
 def test_every_compression_is_read_back(tmp_path: Path, compression: str) -> None:
     path = tmp_path / "deep" / "folder" / "a.mcap"
     texts = [f"message {n} " + "x" * (n % 50) for n in range(3000)]
-    with BagWriter(path, compression=compression) as writer:
+    with BagWriter(path, RecorderConfig(compression=compression)) as writer:
         channel = writer.add_topic("/a", STRING)
         for n, text in enumerate(texts):
             writer.write(channel, string(text), n, n)
@@ -179,15 +180,11 @@ def test_where_no_bag_can_be_made(tmp_path: Path) -> None:
         BagWriter(tmp_path / "file" / "a.mcap")
 
 
-@pytest.mark.parametrize("limit", [{"max_size": 20_000}, {"max_duration_ns": 10**9}])
-def test_a_bag_is_split_into_complete_files(tmp_path: Path, limit: dict[str, int]) -> None:
+@pytest.mark.parametrize("limit", [{"max_size": 0.02}, {"max_duration": 1.0}])
+def test_a_bag_is_split_into_complete_files(tmp_path: Path, limit: dict[str, float]) -> None:
     count, step = 3000, 10**7
-    with BagWriter(
-        tmp_path / "a.mcap",
-        chunk_size=2000,
-        compression="none",
-        **limit,  # type: ignore[arg-type]
-    ) as writer:
+    config = RecorderConfig(compression="none", **limit)  # type: ignore[arg-type]
+    with BagWriter(tmp_path / "a.mcap", config, chunk_size=2000) as writer:
         writer.add_attachment("robot.urdf", b"<robot/>", "application/xml", 0)
         channel = writer.add_topic("/a", "std_msgs/msg/String")
         for n in range(count):
@@ -221,8 +218,9 @@ def test_a_bag_is_split_into_complete_files(tmp_path: Path, limit: dict[str, int
     assert found == list(range(count))
 
 
-def bag_of(path: Path, times: list[float], **options: Any) -> Path:
-    with BagWriter(path, chunk_size=1, **options) as writer:
+def bag_of(path: Path, times: list[float], max_duration: float = 0.0) -> Path:
+    config = RecorderConfig(max_duration=max_duration)
+    with BagWriter(path, config, chunk_size=1) as writer:
         writer.add_topic("/silent", STRING)
         channel = writer.add_topic("/a", STRING)
         for n, time in enumerate(times):
@@ -231,7 +229,7 @@ def bag_of(path: Path, times: list[float], **options: Any) -> Path:
 
 
 def test_a_file_is_full_when_it_lasts_exactly_as_long_as_it_may(tmp_path: Path) -> None:
-    bag_of(tmp_path / "a.mcap", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], max_duration_ns=S)
+    bag_of(tmp_path / "a.mcap", [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], max_duration=1.0)
     times = []
     for n in range(3):
         with (tmp_path / f"a_{n}.mcap").open("rb") as file:
@@ -321,7 +319,7 @@ def fill(writer: BagWriter, channel: int) -> int:
 
 def test_on_a_full_disk_what_fits_is_salvaged(tmp_path: Path, make_disk: MakeDisk) -> None:
     disk = make_disk(1_000_000)
-    writer = BagWriter(tmp_path / "a.mcap", compression="none")
+    writer = BagWriter(tmp_path / "a.mcap", RecorderConfig(compression="none"), chunk_size=65536)
     channel = writer.add_topic("/a", STRING)
     accepted = fill(writer, channel)
     kept = writer.messages_written
@@ -387,8 +385,9 @@ def test_the_limit_of_a_real_file(tmp_path: Path) -> None:
 import resource, sys
 import spacerobot_ros
 from spacerobot_ros.bag import BagWriter, RecordingError
+from spacerobot_ros.bag.config import RecorderConfig
 resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
-writer = BagWriter(sys.argv[1], compression="none")
+writer = BagWriter(sys.argv[1], RecorderConfig(compression="none"), chunk_size=65536)
 channel = writer.add_topic("/a", "std_msgs/msg/String")
 try:
     for n in range(1_000_000):
@@ -420,7 +419,7 @@ def test_a_kill_loses_nothing_before_a_flush(tmp_path: Path) -> None:
 import sys
 import spacerobot_ros
 from spacerobot_ros.bag import BagWriter
-writer = BagWriter(sys.argv[1])
+writer = BagWriter(sys.argv[1], chunk_size=65536)
 channel = writer.add_topic("/a", "std_msgs/msg/String")
 for n in range(777):
     writer.write(channel, n.to_bytes(8, "little"), n, n)
@@ -442,7 +441,7 @@ def test_a_kill_in_mid_write_loses_the_chunk_in_progress_only(tmp_path: Path) ->
 import sys
 import spacerobot_ros
 from spacerobot_ros.bag import BagWriter
-writer = BagWriter(sys.argv[1])
+writer = BagWriter(sys.argv[1], chunk_size=65536)
 channel = writer.add_topic("/a", "std_msgs/msg/String")
 n = 0
 while True:

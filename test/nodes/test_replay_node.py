@@ -27,6 +27,7 @@ from support.ros_harness import Harness, Probe, construction
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
+from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.meshes import TriangleMesh, mesh_file, read_mesh, stl_of
@@ -134,7 +135,7 @@ def test_depths_that_are_not_in_a_bag(harness: Harness, tmp_path: Path) -> None:
 
 def test_a_bag_that_turns_out_damaged_is_exit_2(harness: Harness, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    with BagWriter(path, chunk_size=100, compression="none") as writer:
+    with BagWriter(path, RecorderConfig(compression="none"), chunk_size=100) as writer:
         channel = writer.add_topic("/stream", STRING)
         for k in range(COUNT):
             writer.write(channel, string(f"{k:04d}"), BEGAN + k * SPACING, BEGAN)

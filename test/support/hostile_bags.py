@@ -47,8 +47,9 @@ def resume(path: Path) -> None:
 
 def play(path: Path) -> None:
     from spacerobot_ros.bag import Playback, read_bag
+    from spacerobot_ros.bag.config import ReplayConfig
 
-    playback = Playback(read_bag(path), rate=1e9)
+    playback = Playback(read_bag(path), ReplayConfig(rate=1e9))
     playback.run(0)
     while not playback.ended:
         playback.next_due_time()
