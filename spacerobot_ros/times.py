@@ -51,8 +51,3 @@ def first_time_ns(raw: bytes) -> int:
 def stamp_to_ns(stamp: Any) -> int:
     """Return a builtin_interfaces/Time or Duration object in nanoseconds."""
     return int(stamp.sec * SECOND + stamp.nanosec)
-
-
-def set_stamp(stamp: Any, time_ns: int) -> None:
-    """Set a builtin_interfaces/Time or Duration object to a time, at most ``LATEST_NS``."""
-    stamp.sec, stamp.nanosec = divmod(min(time_ns, LATEST_NS), SECOND)

@@ -430,34 +430,18 @@ TOPICS_NOT_RECORDED = ("/rosout", "/parameter_events", "/transition_event", "/he
 """Suffixes of topics that are recorded only on request."""
 
 
-def goal_topic(end_effector: str) -> str:
-    """Return the goal topic of an end-effector, with the link name converted to a valid topic
-    name.
+def link_topic(end_effector: str, kind: str) -> str:
+    """Return the topic ``goal_pose``, ``twist``, ``path`` or ``pose`` of an end-effector, with the
+    link name converted to a valid topic name.
     """
-    return _name_in_topics(end_effector) + "/goal_pose"
-
-
-def twist_topic(end_effector: str) -> str:
-    """Return the twist topic of an end-effector."""
-    return _name_in_topics(end_effector) + "/twist"
-
-
-def path_topic(end_effector: str) -> str:
-    """Return the path topic of an end-effector."""
-    return _name_in_topics(end_effector) + "/path"
+    return re.sub(r"\W", "_", end_effector, flags=re.ASCII) + f"/{kind}"
 
 
 def pose_topic(end_effector: str) -> Topic:
-    """Return the entry for the poses of an end-effector, with the link name converted to a valid
-    topic name.
-    """
-    name = _name_in_topics(end_effector)
-    state = StateField("pose", f"pose_of_{name}", _POSE_MEMBERS)
-    return replace(TOPICS["end_effector/pose"], name=f"{name}/pose", state=(state,))
-
-
-def _name_in_topics(link: str) -> str:
-    return re.sub(r"\W", "_", link, flags=re.ASCII)
+    """Return the entry for the poses of an end-effector; see :func:`link_topic`."""
+    name = link_topic(end_effector, "pose")
+    state = StateField("pose", f"pose_of_{name.removesuffix('/pose')}", _POSE_MEMBERS)
+    return replace(TOPICS["end_effector/pose"], name=name, state=(state,))
 
 
 def topic_named(name: str) -> Topic:

@@ -702,6 +702,6 @@ class Commander(ABC):
                 case output:
                     self._forward(output)
 
-    @abstractmethod
     def _forward(self, output: Any) -> None:
         """Publish a status, or another output that only this executive has."""
+        self._publish_status(output)

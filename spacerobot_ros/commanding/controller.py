@@ -180,14 +180,11 @@ class ControllerCommander(Commander):
         super().take_odom(stamp_ns, odom)
 
     def take_accepted_jump(self) -> str:
-        """Process a deferred state once its time is accepted, and check the waiting state."""
+        """Process a deferred state once its time is accepted, and continue without references that
+        have stopped time for their timeout of wall time."""
         warning = super().take_accepted_jump()
-        if self.active:
-            self._watch_waiting_state()
-        return warning
-
-    def _watch_waiting_state(self) -> None:
-        """Continue without references that have stopped time for their timeout of wall time."""
+        if not self.active:
+            return warning
         now, timeout = self._clock(), self.config.reference_timeout
         elapsed, self._looked = min(now - self._looked, _LONGEST_CHECK_PERIOD), now
         missing = () if self.executive is None else self.states.missing
@@ -200,6 +197,7 @@ class ControllerCommander(Commander):
                 self._do_without(topic)
         if missing:
             self.answer()
+        return warning
 
     def _do_without(self, topic: str) -> None:
         assert self.executive is not None
@@ -313,9 +311,6 @@ class ControllerCommander(Commander):
         controlled = getattr(self.executive.controller.law.outputs.selection, key)
         of_action = not goal.resumes
         return not (controlled or of_action) and self.host.has_publisher(JOINT_REFERENCE)
-
-    def _forward(self, output: Any) -> None:
-        self._publish_status(output)
 
     def _forward_plant_state(self) -> None:
         if self.executive is not None:

@@ -36,33 +36,29 @@ class FlyTo:
         Maximum errors; 0: the commander's parameter.
     time_limit
         Simulated time after which the goal is aborted, s; 0: never.
+
+    Raises
+    ------
+    PlanningError
+        A tolerance or the time limit is negative or not finite.
     """
 
     goal: Goal
     tolerance: Tolerance = NO_TOLERANCE
     time_limit: float = 0.0
 
-    @classmethod
-    def from_numbers(cls, goal: Goal, tolerance: Tolerance, time_limit: float) -> FlyTo:
-        """Return an action goal from received values.
-
-        Raises
-        ------
-        PlanningError
-            A tolerance or the time limit is negative or not finite.
-        """
+    def __post_init__(self) -> None:
         for name, value, unit in (
-            ("position tolerance", tolerance.position, "m"),
-            ("attitude tolerance", tolerance.attitude, "rad"),
-            ("joint tolerance", tolerance.shape, "m or rad"),
-            ("time limit", time_limit, "s"),
+            ("position tolerance", self.tolerance.position, "m"),
+            ("attitude tolerance", self.tolerance.attitude, "rad"),
+            ("joint tolerance", self.tolerance.shape, "m or rad"),
+            ("time limit", self.time_limit, "s"),
         ):
             if not 0 <= value < math.inf:
                 raise PlanningError(
                     f"The {name} of the goal is {value:g} {unit}: give a finite number above 0, or "
                     "0 for the parameter value."
                 )
-        return cls(goal, tolerance, time_limit)
 
     def tolerance_or(self, default: Tolerance) -> Tolerance:
         """Return the tolerances, with defaults for unset values."""
@@ -210,20 +206,18 @@ class FlyToGoals:
         self._errors, self._report_aborted = errors, report_aborted
         self._served: dict[str, _ActionGoal] = {}
         """Goals by id, in order of arrival."""
-        self._clients = 0
         self._accepted: list[str] = []
         """Ids of accepted goals that were not rejected later, from actions or topics, in order."""
 
     def __bool__(self) -> bool:
         """Whether a client is waiting."""
-        return self._clients > 0
+        return any(served.client is not None for served in self._served.values())
 
     def begin(
         self, goal_id: str, client: FlyToClient | None = None, request: FlyTo | None = None
     ) -> None:
         """Start tracking a goal; ``request`` is None if the client's goal is rejected."""
         self._served[goal_id] = _ActionGoal(client, request)
-        self._clients += client is not None
 
     def accepted(self, goal_id: str) -> None:
         """Record the latest accepted goal."""
@@ -305,7 +299,6 @@ class FlyToGoals:
         served = self._served.pop(goal_id, None)
         if served is None or served.client is None:
             return
-        self._clients -= 1
         errors = GoalErrors()
         if served.request is not None:
             errors = self._errors(served.request.goal).reported_by(status)

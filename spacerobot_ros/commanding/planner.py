@@ -37,7 +37,7 @@ from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.simulation.status import PlantStatus
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import twist_topic
+from spacerobot_ros.topics import link_topic
 
 
 class PlannerCommander(Commander):
@@ -171,7 +171,7 @@ class PlannerCommander(Commander):
             with self._on_long_work():
                 self.executive.propose_twist(twist)
         except PlanningError as refusal:
-            self._log_fault("twist", f"{twist_topic(link)}: {refusal}")
+            self._log_fault("twist", f"{link_topic(link, 'twist')}: {refusal}")
 
     def _submit_goal(self, key: str, goal: IdentifiedGoal) -> None:
         assert self.executive is not None

@@ -406,26 +406,17 @@ class PlantListener:
         if status.timeouts > before.timeouts or (
             status.reason == "timeout" and before.reason != "timeout"
         ):
-            rested = _timeout_rest(status)
-            if rested is not None:
-                changes.append(rested)
+            since, why = status.time_s, status.message
+            last = since if status.last_command_s is None else status.last_command_s
+            if status.reason != "timeout":
+                since, why = last, "The joints were brought to rest: no command arrived in time."
+            if math.isfinite(last) and math.isfinite(since):
+                changes.append(PlantStopped(why, round(last * SECOND), round(since * SECOND)))
         if status.resets > before.resets:
             changes.append(PlantChange.RESET)
         if was_blocked or status.rearms > before.rearms:
             changes.append(PlantChange.OBEYS)
         return changes
-
-
-def _timeout_rest(status: PlantStatus) -> PlantStopped | None:
-    """Return the stop of a plant after a timeout; None if its times are not finite."""
-    last, since = status.last_command_s, status.time_s
-    last = since if last is None else last
-    why = status.message
-    if status.reason != "timeout":
-        since, why = last, "The joints were brought to rest: no command arrived in time."
-    if not (math.isfinite(last) and math.isfinite(since)):
-        return None
-    return PlantStopped(why, round(last * SECOND), round(since * SECOND))
 
 
 # -- missing inputs ---------------------------------------------------------------------------

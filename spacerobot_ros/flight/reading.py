@@ -40,7 +40,7 @@ from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.scenario import COMMANDERS, CONFIGS, Published, Scenario
 from spacerobot_ros.simulation.capture import target_parameters
 from spacerobot_ros.times import SECOND
-from spacerobot_ros.topics import TOPICS, StateField, goal_topic, path_topic, topic_named
+from spacerobot_ros.topics import TOPICS, StateField, link_topic, topic_named
 
 _SAME_CLOCK_TOLERANCE = 1.0
 """If stamps differ from log times by less than this value (s), both come from the same clock."""
@@ -236,7 +236,10 @@ class FlightBag(RecordedRobot):
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals: list[SentGoal] = []
-        for topic in (goal_topic(link), path_topic(link)) if link else ("goal_pose", "goal_path"):
+        topics = ["goal_pose", "goal_path"]
+        if link:
+            topics = [link_topic(link, kind) for kind in ("goal_pose", "path")]
+        for topic in topics:
             ids, shapes = GoalIds(), self._goal_shapes() if topic == "goal_pose" else []
             for time_ns, message in self.messages(topic):
                 shape = next((each for since, each in reversed(shapes) if since <= time_ns), None)

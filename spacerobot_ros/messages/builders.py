@@ -32,7 +32,7 @@ from spacerobot_ros.model.description import (
 from spacerobot_ros.model.kinematics import ForwardKinematics, Frames, LinkPlacement
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.times import LATEST_NS, SECOND, stamp_bytes
-from spacerobot_ros.topics import Topic, goal_topic, path_topic
+from spacerobot_ros.topics import Topic, link_topic
 
 if TYPE_CHECKING:
     from spacerobot_ros.planning import BasePath, GaitSchedule, Goal
@@ -42,27 +42,13 @@ TRANSFORMS, STATIC_TRANSFORMS = "/tf", "/tf_static"
 """Transform topic names before remapping."""
 
 
-def transform_messages(frames: Frames, times_ns: NDArray[np.int64], poses: Array) -> list[bytes]:
-    """Return one serialised tf2_msgs/TFMessage per time.
-
-    Parameters
-    ----------
-    frames
-        Parent and child frame of each of the k transforms.
-    times_ns
-        (m,) stamps, ns.
-    poses
-        (m, k, 7) poses of the child frames in their parents, m.
-    """
-    return _transform_template(frames).copies(times_ns, _transform_columns(poses))
-
-
 def _transform_columns(poses: Array) -> dict[str, Array]:
     """Return poses (m, k, 7) by the path of their first number in a message."""
     return {f"transforms[{i}].transform.translation.x": poses[:, i] for i in range(poses.shape[1])}
 
 
-def _transform_template(frames: Frames) -> MessageTemplate:
+def transform_template(frames: Frames) -> MessageTemplate:
+    """Return a tf2_msgs/TFMessage template with the parent and child frame of each transform."""
     transforms = [
         {"header": {"frame_id": parent}, "child_frame_id": child} for parent, child in frames
     ]
@@ -93,7 +79,7 @@ class RobotTransforms:
         self._fixed = _prefix_frames(fixed, prefix)
         # Nodes send a message per tick; a fed template takes a fifth of the time of a copy.
         frames = (base, *_prefix_frames(moving, prefix))
-        self._template, self._poses = _transform_template(frames), np.zeros((1, len(frames), 7))
+        self._template, self._poses = transform_template(frames), np.zeros((1, len(frames), 7))
         for path, pose in _transform_columns(self._poses).items():
             self._template.feed(path, pose[0])
 
@@ -115,8 +101,8 @@ class RobotTransforms:
         """Return the message for links fixed to their parents; None without such links."""
         if self._links is None or not self._fixed:
             return None
-        poses = self._links.fixed_transforms[np.newaxis]
-        return transform_messages(self._fixed, np.array([time_ns]), poses)[0]
+        columns = _transform_columns(self._links.fixed_transforms[np.newaxis])
+        return transform_template(self._fixed).copies(np.array([time_ns]), columns)[0]
 
 
 def _prefix_frames(frames: Iterable[tuple[str, str]], prefix: str) -> Frames:
@@ -218,18 +204,6 @@ def _pose_fields(position: Array, quaternion: Array) -> dict[str, Any]:
     }
 
 
-def given_path_message(poses: Array, frame: str, stamp_ns: int) -> bytes:
-    """Return a path of poses (K, 7), or of positions (K, 3), as nav_msgs/Path.
-
-    For positions, all quaternions are zero, which means any attitude.
-    """
-    numbers = np.zeros((len(poses), 7))
-    numbers[:, : poses.shape[1]] = poses
-    header = {"header": {"stamp": min(stamp_ns, LATEST_NS), "frame_id": frame}}
-    columns = {"pose.position.x": numbers}
-    return encode_list("nav_msgs/msg/Path", header, "poses", header, columns)
-
-
 def goal_messages(
     goal: Goal, end_effector: Goal | None, frame: str, stamp_ns: int
 ) -> dict[str, bytes]:
@@ -237,14 +211,20 @@ def goal_messages(
     paths = {} if goal.waypoints is None else {"goal_path": goal.path_values}
     poses = {"goal_pose": goal} if goal.base and not paths else {}
     if end_effector is not None:
-        poses[goal_topic(DEFAULT_END_EFFECTOR)] = end_effector
+        poses[link_topic(DEFAULT_END_EFFECTOR, "goal_pose")] = end_effector
     for each in goal.end_effectors:
         link = each.link or DEFAULT_END_EFFECTOR
         if each.waypoints is None:
-            poses[goal_topic(link)] = each.as_goal()
+            poses[link_topic(link, "goal_pose")] = each.as_goal()
         else:
-            paths[path_topic(link)] = each.path_values
-    messages = {name: given_path_message(path, frame, stamp_ns) for name, path in paths.items()}
+            paths[link_topic(link, "path")] = each.path_values
+    messages = {}
+    header = {"header": {"stamp": min(stamp_ns, LATEST_NS), "frame_id": frame}}
+    for name, path in paths.items():
+        # Without attitudes, all quaternions are zero, which means any attitude.
+        columns = {"pose.position.x": np.zeros((len(path), 7))}
+        columns["pose.position.x"][:, : path.shape[1]] = path
+        messages[name] = encode_list("nav_msgs/msg/Path", header, "poses", header, columns)
     return messages | {name: goal_message(aim, frame, stamp_ns) for name, aim in poses.items()}
 
 

@@ -251,9 +251,25 @@ class MessageType:
     """
 
     def __init__(self, name: str, text: bytes) -> None:
+        # The parser is slow to import, and tools that read no messages do not need it.
+        from rosbags.typesys import get_types_from_msg
+
         self.name = name
+        if not _TYPE_NAME.fullmatch(name):
+            raise ValueError("a type name must have the form 'package/msg/Type'")
+        if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
+            raise ValueError(
+                f"its definition is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, "
+                "more than any message needs"
+            )
+        # The parser would rename service types, but leaves names in the form of messages unchanged.
+        parsed_name = name.replace("/srv/", "/msg/")
         with _as_value_errors():
-            self.fields: Fields = _parsed(name, text)
+            types = get_types_from_msg(text.decode(), parsed_name)
+            self.fields: Fields = {
+                name if each == parsed_name else each: of for each, of in types.items()
+            }
+            _count_fields(self.fields, name, {})
 
     def decode(self, data: bytes) -> Any:
         """Return a message from its serialised form; any defect raises an exception."""
@@ -304,25 +320,6 @@ def _as_value_errors() -> Iterator[None]:
     except Exception as error:
         words = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(words if len(words) <= 200 else f"{words[:200]} ...") from error
-
-
-def _parsed(type_name: str, text: bytes) -> Fields:
-    # The parser is slow to import, and tools that read no messages do not need it.
-    from rosbags.typesys import get_types_from_msg
-
-    if not _TYPE_NAME.fullmatch(type_name):
-        raise ValueError("a type name must have the form 'package/msg/Type'")
-    if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
-        raise ValueError(
-            f"its definition is longer than {_MAX_TEXT_BYTES} bytes or {_MAX_LINES} lines, more "
-            "than any message needs"
-        )
-    # The parser would rename service types, but leaves names in the form of messages unchanged.
-    parsed_name = type_name.replace("/srv/", "/msg/")
-    types = get_types_from_msg(text.decode(), parsed_name)
-    fields = {type_name if name == parsed_name else name: of for name, of in types.items()}
-    _count_fields(fields, type_name, {})
-    return fields
 
 
 def _count_fields(types: Fields, name: str, counts: dict[str, int], depth: int = 0) -> int:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -158,7 +157,18 @@ class TemplateReader:
         if same_size and all(raw[place] == text for place, text in self._fixed_spans):
             self.raw = raw
             return False
-        self._learn_layout(raw)
+        if len(raw) > self._max_size:
+            raise UnreadableError(f"it has {len(raw)} bytes; at most {self._max_size} are expected")
+        try:
+            if raw[:2] != LITTLE_ENDIAN:
+                raise IndexError("it is not in little-endian CDR")
+            layout = Layout(raw, self._kind, elements=True)
+        except IndexError as error:
+            short = self._kind.name.rpartition("/")[2]
+            raise UnreadableError(f"its bytes are not a {short}") from error
+        self.raw, self._layout = raw, layout
+        fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
+        self._fixed_spans = [(slice(a, b), raw[a:b]) for a, b in fixed]
         return True
 
     def floats(self, path: str, count: int | None = None) -> Array:
@@ -190,20 +200,6 @@ class TemplateReader:
         """Header stamp of the accepted message, ns."""
         seconds, nanoseconds = unpack_stamp(self.raw)
         return int(seconds * SECOND + nanoseconds)
-
-    def _learn_layout(self, raw: bytes) -> None:
-        if len(raw) > self._max_size:
-            raise UnreadableError(f"it has {len(raw)} bytes; at most {self._max_size} are expected")
-        try:
-            if raw[:2] != LITTLE_ENDIAN:
-                raise IndexError("it is not in little-endian CDR")
-            layout = Layout(raw, self._kind, elements=True)
-        except IndexError as error:
-            short = self._kind.name.rpartition("/")[2]
-            raise UnreadableError(f"its bytes are not a {short}") from error
-        self.raw, self._layout = raw, layout
-        fixed = [(0, len(LITTLE_ENDIAN)), *layout.fixed]
-        self._fixed_spans = [(slice(a, b), raw[a:b]) for a, b in fixed]
 
 
 class JointReader:
@@ -244,7 +240,10 @@ class JointReader:
         self._reader = TemplateReader(JOINT_STATE, max_size)
         self._problem: tuple[type[CommandError], str] | None = None
         """Error to raise for messages with this layout."""
-        self._order = _JointOrder(np.zeros(0, np.intp), np.zeros(0, np.intp))
+        self._of_message = self._of_model = np.zeros(0, np.intp)
+        """Indices of the joints that a message and a model have in common, in each of them."""
+        self._ignored: tuple[str, ...] = ()
+        """Descriptions of the other joints of a message."""
         self._seen = np.zeros(len(joint_names), dtype=np.bool_)
         """Joints received since the last complete state; their values are in ``values``."""
 
@@ -267,11 +266,10 @@ class JointReader:
         return stamp
 
     def _copy_values(self) -> None:
-        order = self._order
         for name, values in self.values.items():
             if self._reader.value_count(name):
-                values[order.of_model] = self._reader.floats(name)[order.of_message]
-        self.ignored.update(order.ignored)
+                values[self._of_model] = self._reader.floats(name)[self._of_message]
+        self.ignored.update(self._ignored)
         if self._measured and "velocity" in self.values:
             rates = self.values["velocity"]
             if not math.isfinite(sum(rates.tolist())):
@@ -296,7 +294,7 @@ class JointReader:
         else:
             return raw
         self._copy_values()
-        self._seen[self._order.of_model] = True
+        self._seen[self._of_model] = True
         if not self._seen.all():
             return None
         self._seen[:] = False
@@ -322,7 +320,11 @@ class JointReader:
             A measured state lacks a joint.
         """
         if self._reader.accept(raw):
-            self._check_names_and_lengths()
+            self._problem = None
+            try:
+                self._match_joints(self._reader.texts("name"))
+            except CommandError as error:
+                self._problem = type(error), str(error)
         if self._problem is not None:
             kind, clause = self._problem
             raise kind(clause)
@@ -332,32 +334,10 @@ class JointReader:
         """Stamp of the last message passed to :meth:`accept`, rejected or not, ns."""
         return self._reader.stamp_ns
 
-    def _check_names_and_lengths(self) -> None:
-        names = self._reader.texts("name")
-        self._problem = None
-        try:
-            self._order = self._order_of(names)
-            for i, quantity in enumerate(self._quantities):
-                count = self._reader.value_count(quantity)
-                if count != len(names) and (count or i == 0):
-                    raise CommandError(
-                        f"the message has {counted(len(names), 'joint name')} and "
-                        f"{counted(count, f'{quantity} value')}"
-                    )
-        except CommandError as error:
-            self._problem = CommandError, str(error)
-            return
-        for i, name in enumerate(self._joints):
-            if i not in self._order.of_model:
-                self._problem = MissingJointError, f"joint '{name}' is missing"
-                return
-        for values in self.values.values():
-            values[:] = 0.0
-
-    def _order_of(self, named: Sequence[str]) -> _JointOrder:
-        """Return the order of named joints; a measured state may lack joints and name others, if it
-        names at least one joint of the model.
-        """
+    def _match_joints(self, named: Sequence[str]) -> None:
+        """Find the joints of the model among the named joints of a message, or raise CommandError;
+        a measured state may lack joints and name others, if it names at least one joint of the
+        model."""
         joints = {name: i for i, name in enumerate(self._joints)}
         places = [i for i, name in enumerate(named) if name in joints]
         others = [name for name in named if name not in joints]
@@ -370,32 +350,31 @@ class JointReader:
         if whole and len(named) < len(joints):
             missing = next(name for name in joints if name not in named)
             raise CommandError(f"joint '{missing}' is missing: each message must name all joints")
-        return _JointOrder(
-            np.array(places, dtype=np.intp),
-            np.array([joints[named[i]] for i in places], dtype=np.intp),
-            tuple(
-                f"joint '{name}' {'mimics another' if name in self._followers else 'is unknown'}"
-                for name in others
-            ),
+        self._of_message = np.array(places, dtype=np.intp)
+        self._of_model = np.array([joints[named[i]] for i in places], dtype=np.intp)
+        self._ignored = tuple(
+            f"joint '{name}' {'mimics another' if name in self._followers else 'is unknown'}"
+            for name in others
         )
+        for i, quantity in enumerate(self._quantities):
+            count = self._reader.value_count(quantity)
+            if count != len(named) and (count or i == 0):
+                raise CommandError(
+                    f"the message has {counted(len(named), 'joint name')} and "
+                    f"{counted(count, f'{quantity} value')}"
+                )
+        absent = [name for i, name in enumerate(self._joints) if i not in self._of_model]
+        if absent:
+            raise MissingJointError(f"joint '{absent[0]}' is missing")
+        for values in self.values.values():
+            values[:] = 0.0
 
 
 class MissingJointError(CommandError):
     """A measured state lacks a joint; another message may contain it."""
 
 
-@dataclass(frozen=True)
-class _JointOrder:
-    """Indices of the joints that a message and a model have in common, in each of them, and
-    descriptions of the other joints of the message.
-    """
-
-    of_message: npt.NDArray[np.intp]
-    of_model: npt.NDArray[np.intp]
-    ignored: tuple[str, ...] = ()
-
-
-class MessageDecoder:
+class MessageDecoder(JointReader):
     """Reads measured states and references for one robot from serialised messages.
 
     The nodes use this class as their :class:`~spacerobot_ros.commanding.host.StateDecoder`.
@@ -410,18 +389,11 @@ class MessageDecoder:
 
     def __init__(self, joint_names: Sequence[str], followers: Collection[str] = ()) -> None:
         quantities: list[Quantity] = ["position", "velocity"]
-        self._joints = JointReader(joint_names, quantities, measured=True, followers=followers)
-        self.ignored, self.joined = self._joints.ignored, self._joints.joined
-        """Ignored parts of joint states, and a function that merges joint states."""
-        self._references = JointReader(joint_names, ["position", "velocity"])
+        super().__init__(joint_names, quantities, measured=True, followers=followers)
+        self._references = JointReader(joint_names, quantities)
         self._odom, self._target = TemplateReader(ODOMETRY), TemplateReader(ODOMETRY)
-        self.q, self.qdot = self._joints.values["position"], self._joints.values["velocity"]
-        self.check_robot, self.decode_joints = self._joints.require, self._joints.accept
-
-    @property
-    def incomplete(self) -> str:
-        """Clause describing the joints that are still missing from joint states."""
-        return self._joints.incomplete
+        self.q, self.qdot = self.values["position"], self.values["velocity"]
+        self.check_robot, self.decode_joints = self.require, self.accept
 
     def decode_base(self, odom: bytes) -> tuple[Array, Array]:
         """Return the pose (7,) and twist (6,) in an Odometry message."""

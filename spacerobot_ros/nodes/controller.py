@@ -115,8 +115,8 @@ class CoordinatedControlNode(CommanderNode):
 
     def use(self, robot: SpaceRobot) -> None:
         """Set the robot to control."""
+        super().use(robot)
         commander = self.commander
-        commander.use_robot(robot, self.decoder_of(robot))
         commander.rehearse()
         self._joint_message = joint_template(robot.joint_names)
         if robot.n:

@@ -21,20 +21,13 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.planner import (
-    PlannerCommander,
-    TrajectoryOutput,
-)
+from spacerobot_ros.commanding.planner import PlannerCommander, TrajectoryOutput
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.messages.builders import goal_markers, path_message, trajectory_message
 from spacerobot_ros.messages.readers import joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.commander import CommanderNode
-from spacerobot_ros.nodes.common.fly_to import action_class
-from spacerobot_ros.nodes.common.messages import (
-    path_poses,
-    shape_of,
-)
+from spacerobot_ros.nodes.common.messages import interface_class, path_poses, shape_of
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, described_robot
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.planning.core.cancellation import MAX_THREAD_END_TIME
@@ -48,7 +41,7 @@ from spacerobot_ros.planning.execution.status import (
 )
 from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.times import stamp_bytes
-from spacerobot_ros.topics import goal_topic, path_topic, twist_topic
+from spacerobot_ros.topics import link_topic
 
 
 class PlannerNode(CommanderNode):
@@ -97,10 +90,10 @@ class PlannerNode(CommanderNode):
             )
         self.subscribe_to_goals("goal_pose")
         for name in self.config.goal_links:
-            self.subscribe_to_goals(goal_topic(name), name)
+            self.subscribe_to_goals(link_topic(name, "goal_pose"), name)
             for kind, topic, take in (
-                (TwistStamped, twist_topic(name), self._on_twist),
-                (Path, path_topic(name), self._on_path),
+                (TwistStamped, link_topic(name, "twist"), self._on_twist),
+                (Path, link_topic(name, "path"), self._on_path),
             ):
                 self.create_subscription(kind, topic, partial(take, name), STREAM)
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
@@ -134,7 +127,7 @@ class PlannerNode(CommanderNode):
     def use(self, robot: SpaceRobot) -> None:
         """Set the robot for planning."""
         self.goal_shape = None
-        self.commander.use_robot(robot, self.decoder_of(robot))
+        super().use(robot)
         self._message = joint_template(robot.joint_names)
         self._setpoint: Setpoint | None = None
         """The setpoint whose arrays provide the values of the message."""
@@ -147,12 +140,12 @@ class PlannerNode(CommanderNode):
         self.commander.receive_twist(link, frame, linear, angular)
 
     def _on_path(self, link: str, message: Path) -> None:
-        self.receive(link, message, lambda: self._read_path(link, message))
+        def read() -> Goal:
+            what, frame = f"The path of the end-effector '{link}'", self.config.world_frame
+            poses = path_poses(message, frame, what, self.pose_of)
+            return self.goal_of_link(EndEffectorGoal.along(link, poses))
 
-    def _read_path(self, link: str, message: Path) -> Goal:
-        what, frame = f"The path of the end-effector '{link}'", self.config.world_frame
-        poses = path_poses(message, frame, what, self.pose_of)
-        return self.goal_of_link(EndEffectorGoal.along(link, poses))
+        self.receive(link, message, read)
 
     def _on_goal_shape(self, message: JointState) -> None:
         """Keep the joint positions in which later goals must end, for methods that support them."""
@@ -210,12 +203,11 @@ class _TrajectoryClients:
     """
 
     def __init__(self, node: Any) -> None:
-        kind = action_class("control_msgs", "FollowJointTrajectory")
+        kind = interface_class("control_msgs.action", "FollowJointTrajectory")
         if kind is None:
             raise ParameterError(
                 "Parameter 'output' is 'trajectory', which requires the package control_msgs: "
-                "install "
-                "it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
+                "install it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
             )
         self._kind, self._node = kind, node
         self._clients: dict[str, ActionClient] = {}
@@ -250,7 +242,12 @@ class _Connection:
         return bool(self._client.server_is_ready())
 
     def send(self, number: int, start: ScheduleStart) -> None:
-        goal = self._kind.Goal(trajectory=joint_trajectory(start.schedule))
+        schedule = deserialize_message(trajectory_message(start.schedule, 0, ""), JointTrajectory)
+        # With positions alone, controllers interpolate linearly. This reproduces the schedule,
+        # whose velocities are constant over a tick. It starts when it is received.
+        for point in schedule.points:
+            point.velocities = []
+        goal = self._kind.Goal(trajectory=schedule)
         answer = self._client.send_goal_async(goal)
         answer.add_done_callback(lambda future: self._on_answer(number, future.result()))
 
@@ -279,18 +276,6 @@ class _Connection:
         self._handles.pop(number, None)
         result = response.result
         self.output.ended(number, response.status, result.error_code, result.error_string)
-
-
-def joint_trajectory(schedule: GaitSchedule) -> JointTrajectory:
-    """Return a schedule as a trajectory that starts when it is received.
-
-    The points have only positions, so that controllers interpolate linearly. This reproduces the
-    schedule, whose velocities are constant over a tick.
-    """
-    message = deserialize_message(trajectory_message(schedule, 0, ""), JointTrajectory)
-    for point in message.points:
-        point.velocities = []
-    return message
 
 
 main = partial(run_node, PlannerNode)

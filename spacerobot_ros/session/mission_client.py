@@ -14,7 +14,6 @@ from rclpy.duration import Duration
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 
@@ -25,7 +24,7 @@ from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.builders import goal_messages
 from spacerobot_ros.messages.statuses import read_status
 from spacerobot_ros.nodes.common.messages import shape_message
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, UNKNOWN_NODE
+from spacerobot_ros.nodes.common.node import LATCHED_QUEUE, STREAM, UNKNOWN_NODE
 from spacerobot_ros.nodes.common.process import spin_until
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
@@ -33,11 +32,6 @@ from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import LATEST_NS, SECOND
 
 _STATUS_CHECK_PERIOD = 0.2  # wall s
-
-_STATUSES = QoSProfile(
-    depth=STREAM.depth, reliability=LATCHED.reliability, durability=LATCHED.durability
-)
-"""QoS of statuses: the end of a goal and the status of the next goal arrive at the same time."""
 
 _LONGEST_DELIVERY = 5.0  # wall s
 
@@ -112,8 +106,9 @@ class MissionClient:
         """Messages from failed nodes, by the last part of their names."""
         self.node.create_subscription(DiagnosticStatus, "events", self._on_event, STREAM)
         topic, self._read = STATUS_TOPICS[decider]
+        # The end of a goal and the status of the next goal arrive at the same time.
         self._status_topic = self.node.create_subscription(
-            DiagnosticStatus, topic, self._on_status, _STATUSES
+            DiagnosticStatus, topic, self._on_status, LATCHED_QUEUE
         )
 
     @property
@@ -263,17 +258,13 @@ class MissionClient:
 
     def _take(self, status: Status) -> None:
         self.status = status
-        if self.outcome is None and not self._is_about_another_goal(self.status):
-            self.message = self.status.message
+        # Others, such as the verdict on an earlier goal, say nothing about this one.
+        concerns = self.goal_id is None or self._follower.is_about_goal(status)
+        if self.outcome is None and (concerns or not (status.goal_id or status.state.decided)):
+            self.message = status.message
             self.on_message(self.message)
-        if self._follower.update(self.status):
-            self._end(Outcome(self.status.state.value))
-
-    def _is_about_another_goal(self, status: Status) -> bool:
-        """Whether a status, such as the verdict on an earlier goal, says nothing about this one."""
-        if self.goal_id is None or self._follower.is_about_goal(status):
-            return False
-        return bool(status.goal_id) or status.state.decided
+        if self._follower.update(status):
+            self._end(Outcome(status.state.value))
 
 
 def _names_of(endpoints: Sequence[TopicEndpointInfo]) -> set[tuple[str, str]]:

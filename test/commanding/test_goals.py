@@ -78,17 +78,17 @@ def status(state: str, goal_id: str, message: str = "So it is.", **about: Any) -
 )
 def test_tolerances_are_finite_numbers(change: dict[str, float], words: str) -> None:
     tolerance = Tolerance(0.0, 0.2, 0.3)
-    assert FlyTo.from_numbers(POSE, tolerance, 7.5) == FlyTo(POSE, tolerance, 7.5)
+    assert FlyTo(POSE, tolerance, 7.5).tolerance == tolerance
     with pytest.raises(PlanningError) as refused:
-        FlyTo.from_numbers(POSE, replace(tolerance, **change), 7.5)
+        FlyTo(POSE, replace(tolerance, **change), 7.5)
     assert_one_sentence(str(refused.value), words, "finite number above 0")
 
 
 def test_a_time_limit_is_a_finite_number() -> None:
-    assert FlyTo.from_numbers(POSE, Tolerance(0.0, 0.0, 0.0), 0.0).time_limit == 0.0
+    assert FlyTo(POSE, Tolerance(0.0, 0.0, 0.0), 0.0).time_limit == 0.0
     for limit in (-1.0, math.inf):
         with pytest.raises(PlanningError, match="time limit of the goal is"):
-            FlyTo.from_numbers(POSE, Tolerance(0.0, 0.0, 0.0), limit)
+            FlyTo(POSE, Tolerance(0.0, 0.0, 0.0), limit)
 
 
 def test_tolerances_that_a_goal_leaves_open_are_the_parameters() -> None:

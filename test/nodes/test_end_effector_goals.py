@@ -29,7 +29,7 @@ from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes.common.messages import path_poses
 from spacerobot_ros.report import write_report
-from spacerobot_ros.topics import goal_topic
+from spacerobot_ros.topics import link_topic
 
 URDF = Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf"
 NAMES = ("shoulder_yaw", "shoulder_pitch", "elbow_pitch")
@@ -95,7 +95,8 @@ def test_positions_on_the_topics_of_links_are_reached_one_after_the_other(harnes
         "link_3": reachable("link_3", [0.5, -1.2, 0.6]),
     }
     topics = {
-        link: flight.probe.create_publisher(PoseStamped, goal_topic(link), 10) for link in aims
+        link: flight.probe.create_publisher(PoseStamped, link_topic(link, "goal_pose"), 10)
+        for link in aims
     }
     harness.connect()
     flight.start()

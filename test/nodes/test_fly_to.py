@@ -27,7 +27,7 @@ from support.ros_harness import Harness
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode, RecorderNode, ReplayNode
-from spacerobot_ros.nodes.common.fly_to import action_class
+from spacerobot_ros.nodes.common.messages import interface_class
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
@@ -118,8 +118,8 @@ def base_at(pose: PoseStamped) -> dict[str, Any]:
     return {"base_pose": [pose]}
 
 
-FLY_TO = action_class("spacerobot_msgs", "FlyTo")
-NAVIGATE = action_class("nav2_msgs", "NavigateToPose")
+FLY_TO = interface_class("spacerobot_msgs.action", "FlyTo")
+NAVIGATE = interface_class("nav2_msgs.action", "NavigateToPose")
 
 pytestmark = [
     pytest.mark.study,

@@ -41,8 +41,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlannerNode
-from spacerobot_ros.nodes.common.fly_to import action_class
-from spacerobot_ros.nodes.common.messages import goal_of
+from spacerobot_ros.nodes.common.messages import goal_of, interface_class
 from spacerobot_ros.planning import METHODS, GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
@@ -412,7 +411,7 @@ def test_a_planner_that_is_configured_again_finds_its_robot_again(harness: Harne
 
 
 def test_without_the_package_of_the_action_the_planner_says_so(harness: Harness) -> None:
-    if action_class("control_msgs", "FollowJointTrajectory") is not None:
+    if interface_class("control_msgs.action", "FollowJointTrajectory") is not None:
         pytest.skip("control_msgs is installed")
     with pytest.raises(SpaceRobotError, match="requires the package control_msgs: install it"):
         harness.make(PlannerNode, {"robot": "sliding_masses", "output": "trajectory"})

@@ -14,9 +14,9 @@ from support.planner_flight import NEAR, TURNED, Flight, values_of
 from support.ros_harness import Harness
 from support.trajectory_server import TrajectoryServer
 
-from spacerobot_ros.nodes.common.fly_to import action_class
+from spacerobot_ros.nodes.common.messages import interface_class
 
-FOLLOW = action_class("control_msgs", "FollowJointTrajectory")
+FOLLOW = interface_class("control_msgs.action", "FollowJointTrajectory")
 
 pytestmark = [
     pytest.mark.study,

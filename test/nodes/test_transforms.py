@@ -25,7 +25,7 @@ from spacerobot_ros.messages.builders import (
     TRANSFORM_TYPE,
     TRANSFORMS,
     RobotTransforms,
-    transform_messages,
+    transform_template,
 )
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
@@ -34,6 +34,7 @@ from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import KnownFrames, pose_array
 from spacerobot_ros.nodes.plant import publisher
 from spacerobot_ros.resources import resource_names, robot_file
+from spacerobot_ros.times import stamp_bytes
 
 TOLERANCE = 1e-12
 
@@ -189,7 +190,7 @@ class Frames:
         self, harness: Harness, monkeypatch: pytest.MonkeyPatch, robot: str, **given: Any
     ) -> None:
         # Bytes pass as they are, whatever the type of their topic is called.
-        monkeypatch.setattr(publisher, "transform_class", lambda: Odometry)
+        monkeypatch.setattr(publisher, "interface_class", lambda *_: Odometry)
         self.sent: list[bytes] = []
         probe = harness.probe({"odom": Odometry, "joint_states": JointState})
         probe.create_subscription(Odometry, TRANSFORMS, self.sent.append, 100, raw=True)
@@ -256,7 +257,10 @@ def test_serialised_frames_are_what_ros_makes_of_each(robot: str) -> None:
     links = [joint.child for joint in load_robot(robot_file(robot)).joints]
     frames = tuple((f"p{'x' * i}", name) for i, name in enumerate(links))
     poses = np.random.default_rng(3).normal(size=(len(frames), 7))
-    (raw,) = transform_messages(frames, np.array([5_000_000_007]), poses[np.newaxis])
+    template = transform_template(frames)
+    for i, pose in enumerate(poses):
+        template.feed(f"transforms[{i}].transform.translation.x", pose)
+    raw = template.serialised(stamp_bytes(5_000_000_007))
     place = 8
     for (parent, child), pose in zip(frames, poses, strict=True):
         one = TransformStamped(child_frame_id=child)

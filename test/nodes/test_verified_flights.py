@@ -28,7 +28,7 @@ from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.scenario_files import read_sections
+from spacerobot_ros.scenario_files import read_scenario
 
 SLIDERS = ["slider_1", "slider_2", "slider_3"]
 VELOCITY = {
@@ -263,7 +263,7 @@ def test_bags_and_dumps_with_the_parameters_of_ros_are_read(recorded: Recorded) 
     assert scenario.plant.tick_rate == 20.0
     assert (scenario.planner.method, scenario.planner.tick_rate) == ("lie_bracket", 20.0)
 
-    sections = read_sections(recorded.dump)
+    sections, _ = read_scenario(recorded.dump)
     assert set(sections) == {"plant", "planner", "recorder"}
     assert sections["planner"]["use_sim_time"] is True
     assert sections["planner"][QOS_OVERRIDE] == "volatile"

@@ -15,7 +15,6 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -40,7 +39,13 @@ from spacerobot_ros.nodes.common.messages import (
     goal_description,
     goal_of,
 )
-from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, STREAM, FlightNode
+from spacerobot_ros.nodes.common.node import (
+    BEST_EFFORT,
+    LATCHED,
+    LATCHED_QUEUE,
+    STREAM,
+    FlightNode,
+)
 from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
@@ -55,13 +60,6 @@ _STATUS_LOG_PERIOD = 5.0  # wall s, for ignored statuses
 
 _LONGEST_DIAGNOSTICS_PERIOD = 1.0
 """Maximum wall time, s, between diagnostics in runs that need not be repeatable."""
-
-_STATUS_QOS = QoSProfile(
-    depth=20, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-"""QoS of plant/status; no status may be lost, so the queue is deeper than that of latched
-topics.
-"""
 
 
 class CommanderNode(FlightNode):
@@ -112,7 +110,7 @@ class CommanderNode(FlightNode):
         self._diagnosed_ns, self._diagnosed = 0, time.monotonic()
         self._known_frames = KnownFrames(self)
         self._statuses = LatchedSubscription(
-            self, DiagnosticStatus, "plant/status", self._on_plant_status, _STATUS_QOS
+            self, DiagnosticStatus, "plant/status", self._on_plant_status, LATCHED_QUEUE
         )
         self._best_effort = config.state_reliability == "best_effort"
         self._unheard = ""
@@ -136,9 +134,11 @@ class CommanderNode(FlightNode):
 
     def subscribe_to_goals(self, topic: str, key: str = BASE_GOAL_KEY) -> None:
         """Subscribe to goal poses for the base or another link."""
-        self.create_subscription(
-            PoseStamped, topic, lambda message: self._on_goal(key, message), STREAM
-        )
+
+        def take(message: PoseStamped) -> None:
+            self.receive(key, message, lambda: self._read_goal(key, message))
+
+        self.create_subscription(PoseStamped, topic, take, STREAM)
 
     def listen_to_obstacles(self) -> None:
         """Subscribe to the obstacles that plans avoid."""
@@ -149,18 +149,12 @@ class CommanderNode(FlightNode):
             LATCHED,
         )
 
-    @abstractmethod
     def use(self, robot: SpaceRobot) -> None:
-        """Set the robot."""
-
-    def decoder_of(self, robot: SpaceRobot) -> MessageDecoder:
-        """Return a decoder for a robot; the decoder also merges partial joint states of the
-        robot.
-        """
+        """Set the robot, and the decoder that also merges its partial joint states."""
         joints = robot.description.moving_joints
         followers = [joint.name for joint in joints if joint.mimic is not None]
         self._decoder = MessageDecoder(robot.joint_names, followers)
-        return self._decoder
+        self.commander.use_robot(robot, self._decoder)
 
     def activate(self) -> None:
         """Start sending a command for each state."""
@@ -258,9 +252,6 @@ class CommanderNode(FlightNode):
             return
         self.commander.answer_latest()
 
-    def _on_goal(self, key: str, message: PoseStamped) -> None:
-        self.receive(key, message, lambda: self._read_goal(key, message))
-
     def receive(self, key: str, message: PoseStamped | Path, read: Callable[[], Goal]) -> None:
         """Pass the goal returned by ``read`` to the commander; log the goal if it is accepted."""
         stamp, part = message.header.stamp, key.replace("_", "-")
@@ -328,9 +319,6 @@ class CommanderNode(FlightNode):
         statuses, odoms = map(self.count_publishers, topics)
         return bool(statuses > odoms > 0)
 
-    def _on_odom(self, raw: bytes) -> None:
-        self.commander.receive_odom(first_time_ns(raw), raw)
-
     def _joined(self, raw: bytes) -> bytes | None:
         """Return joint states of all joints; None: some have not arrived yet."""
         if self._decoder is None:
@@ -356,7 +344,7 @@ class CommanderNode(FlightNode):
         """Subscribe to the state; with automatic reliability, detect publishers of another QoS."""
         auto = self.config.state_reliability == "auto" and not self._best_effort
         for kind, topic, callback in (
-            (Odometry, "odom", self._on_odom),
+            (Odometry, "odom", lambda raw: self.commander.receive_odom(first_time_ns(raw), raw)),
             (JointState, "joint_states", self._on_joints),
         ):
 
@@ -374,16 +362,6 @@ class CommanderNode(FlightNode):
                 ),
             )
 
-    def _resubscribe_best_effort(self) -> None:
-        self.get_logger().info(
-            f"A publisher of '{self._unheard}' uses best effort; the subscription is changed to "
-            f"match."
-        )
-        self._unheard, self._best_effort = "", True
-        for topic in ("odom", "joint_states"):
-            self.destroy_subscription(self.inputs[topic])
-        self._subscribe_states()
-
     def _process_waiting_messages(self) -> None:
         """Process waiting statuses, and a deferred state once its time is accepted."""
         commander, handle = self.commander, self._statuses.subscription.handle
@@ -396,7 +374,14 @@ class CommanderNode(FlightNode):
         if self._descriptions is not None:
             self._descriptions.renew()
         if self._unheard:
-            self._resubscribe_best_effort()
+            self.get_logger().info(
+                f"A publisher of '{self._unheard}' uses best effort; the subscription is changed "
+                f"to match."
+            )
+            self._unheard, self._best_effort = "", True
+            for topic in ("odom", "joint_states"):
+                self.destroy_subscription(self.inputs[topic])
+            self._subscribe_states()
         ignored = commander.take_accepted_jump()
         if ignored or (
             self.config.diagnostics_period

@@ -7,7 +7,6 @@ and ``nav2_msgs/action/NavigateToPose``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -52,7 +51,7 @@ class FlyToAction:
     kind: Any
     """Class of the action."""
 
-    package: ClassVar = "spacerobot_msgs"
+    module: ClassVar = "spacerobot_msgs.action"
     type_name: ClassVar = "FlyTo"
     name: ClassVar = "~/fly_to"
 
@@ -101,7 +100,7 @@ class FlyToAction:
             request.position_tolerance, request.attitude_tolerance, request.joint_tolerance
         )
         limit = request.time_limit
-        return FlyTo.from_numbers(goal, tolerance, limit.sec + limit.nanosec / SECOND)
+        return FlyTo(goal, tolerance, limit.sec + limit.nanosec / SECOND)
 
     def feedback(self, progress: Progress, world_frame: str) -> Any:
         """Return a goal's progress as a message."""
@@ -124,7 +123,7 @@ class NavigateToPoseAction:
     kind: Any
     """Class of the action."""
 
-    package: ClassVar = "nav2_msgs"
+    module: ClassVar = "nav2_msgs.action"
     type_name: ClassVar = "NavigateToPose"
     name: ClassVar = "~/navigate_to_pose"
 
@@ -214,7 +213,7 @@ class GoalActions:
         self._node = node
         self._servers: list[_Server] = []
         for kind in (FlyToAction, NavigateToPoseAction):
-            found = action_class(kind.package, kind.type_name)
+            found = interface_class(kind.module, kind.type_name)
             if found is not None:
                 self._servers.append(self._create_server(kind(found)))
         if not self._servers:
@@ -239,7 +238,11 @@ class GoalActions:
 
         def on_cancel(handle: ServerGoalHandle) -> CancelResponse:
             # The goal state changes after this callback, before the result may arrive.
-            self._run_in_executor(lambda: node.commander.cancel_fly_to(_goal_id(handle)))
+            def cancel() -> None:
+                node.destroy_timer(timer)
+                node.commander.cancel_fly_to(_goal_id(handle))
+
+            timer = node.create_timer(0.0, cancel, clock=Clock(clock_type=ClockType.STEADY_TIME))
             return CancelResponse.ACCEPT
 
         server = _Server(
@@ -254,14 +257,6 @@ class GoalActions:
         )
         return server
 
-    def _run_in_executor(self, act: Callable[[], None]) -> None:
-
-        def once() -> None:
-            self._node.destroy_timer(timer)
-            act()
-
-        timer = self._node.create_timer(0.0, once, clock=Clock(clock_type=ClockType.STEADY_TIME))
-
     def destroy(self) -> None:
         """Destroy the servers when the node is destroyed."""
         servers, self._servers = self._servers, []
@@ -272,11 +267,6 @@ class GoalActions:
 def _goal_id(handle: ServerGoalHandle) -> str:
     """Return the id of a goal in statuses, as `ros2 action` prints it."""
     return bytes(handle.goal_id.uuid).hex()
-
-
-def action_class(package: str, name: str) -> Any | None:
-    """Return the class of an action; None if its package is not fully installed."""
-    return interface_class(f"{package}.action", name)
 
 
 def set_duration(message: Any, seconds: float) -> None:

@@ -9,16 +9,16 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rclpy.type_support import check_for_type_support
 from sensor_msgs.msg import JointState
 
 from spacerobot_ros.errors import PlanningError, RecordingError, SpaceRobotError, counted, printable
-from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORM_TYPE, TRANSFORMS
+from spacerobot_ros.messages.builders import STATIC_TRANSFORMS, TRANSFORMS
 from spacerobot_ros.messages.definitions import message_module
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import (
@@ -26,7 +26,7 @@ from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_multiply,
 )
-from spacerobot_ros.nodes.common.node import LATCHED
+from spacerobot_ros.nodes.common.node import LATCHED, LATCHED_QUEUE, STREAM
 from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
@@ -37,6 +37,9 @@ _MAX_KEPT_TRANSFORMS, _MAX_KEPT_STATIC_TRANSFORMS = 200, 100
 """Numbers of stored /tf and /tf_static messages, enough for a few seconds from several
 publishers.
 """
+
+TRANSFORM_CLASS = "tf2_msgs.msg", "TFMessage"
+"""Module and name of a class that few machines without ROS have; see :func:`interface_class`."""
 
 _MAX_CHAINED_FRAMES = 1000
 """Maximum number of frames between a frame and the world; needed because received frames may form
@@ -246,14 +249,6 @@ def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
     return np.array([values[name] for name in joint_names])
 
 
-def transform_class() -> Any | None:
-    """Return the class of tf2_msgs/TFMessage; None if its package is not installed."""
-    try:
-        return message_class(TRANSFORM_TYPE)
-    except SpaceRobotError:
-        return None
-
-
 class LatchedSubscription:
     """A subscription to a latched topic, renewed if a publisher has left while others remain: they
     then send their last messages again.
@@ -295,18 +290,12 @@ class KnownFrames:
     def __init__(self, node: Any) -> None:
         self._recent: deque[bytes] = deque(maxlen=_MAX_KEPT_TRANSFORMS)
         self._static: deque[bytes] = deque(maxlen=_MAX_KEPT_STATIC_TRANSFORMS)
-        self._kind = transform_class()
+        self._kind = interface_class(*TRANSFORM_CLASS)
         if self._kind is None:
             return
-        latched = QoSProfile(
-            depth=_MAX_KEPT_STATIC_TRANSFORMS,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
-        stream = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
         for topic, kept, qos in (
-            (TRANSFORMS, self._recent, stream),
-            (STATIC_TRANSFORMS, self._static, latched),
+            (TRANSFORMS, self._recent, STREAM),
+            (STATIC_TRANSFORMS, self._static, LATCHED_QUEUE),
         ):
             node.create_subscription(self._kind, topic, kept.append, qos, raw=True)
 
@@ -316,7 +305,17 @@ class KnownFrames:
         ``own`` maps each frame to its parent and its pose in the parent frame, and overrides /tf.
         None if the frames are not connected.
         """
-        parents = {**self._received_parents(), **own}
+        parents: dict[str, tuple[str, Array]] = {}
+        for raw in (*self._static, *self._recent):
+            try:
+                transforms = deserialize_message(raw, self._kind).transforms
+            except RuntimeError:
+                continue  # The bytes are not a TFMessage.
+            for each in transforms:
+                step = pose_array(each.transform.translation, each.transform.rotation)
+                if step is not None:
+                    parents[each.child_frame_id] = each.header.frame_id, step
+        parents |= own
         pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
         for _ in range(_MAX_CHAINED_FRAMES):
             if frame == world:
@@ -326,18 +325,3 @@ class KnownFrames:
             frame, step = parents[frame]
             pose = compose_poses(step, pose)
         return None
-
-    def _received_parents(self) -> dict[str, tuple[str, Array]]:
-        received: dict[str, tuple[str, Array]] = {}
-        for raw in (*self._static, *self._recent):
-            try:
-                transforms: Sequence[TransformStamped] = deserialize_message(
-                    raw, self._kind
-                ).transforms
-            except RuntimeError:
-                continue  # The bytes are not a TFMessage.
-            for each in transforms:
-                pose = pose_array(each.transform.translation, each.transform.rotation)
-                if pose is not None:
-                    received[each.child_frame_id] = each.header.frame_id, pose
-        return received

@@ -22,7 +22,6 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.service import Service
 from rclpy.subscription import Subscription
@@ -57,6 +56,13 @@ LATCHED = QoSProfile(
 )
 """QoS with which a late subscriber receives the last message: reliable, transient local, depth
 1."""
+
+LATCHED_QUEUE = QoSProfile(
+    depth=STREAM.depth, reliability=LATCHED.reliability, durability=LATCHED.durability
+)
+"""QoS of subscriptions to latched topics of which no message may be lost, or with several
+publishers.
+"""
 
 AUTOSTART = Parameter(
     "autostart",
@@ -145,7 +151,7 @@ class FlightNode(LifecycleNode):
         self.on_end: Callable[[int], None] = lambda code: None
         """Function that a finished node calls with its exit code."""
         self._failure, self._destroyed = "", False
-        self._liveness = Liveness(self, self.role, self.depends_on, self.on_silence)
+        self._liveness = Liveness(self)
         self._event_stream = self.create_publisher(DiagnosticStatus, "events", STREAM)
         self._raising = False
         self._guard_transitions()
@@ -158,7 +164,10 @@ class FlightNode(LifecycleNode):
             # A supervisor starts time once all nodes have met.
             self.offer("~/connections", lambda: json.dumps(endpoints_of(self)))
             self.prepare()
-            self._permanent = set(self._entities())
+            self._permanent: set[Any] = {
+                *(*self.timers, *self.subscriptions),
+                *(*self.services, *self.publishers),
+            }
             if values[AUTOSTART.name] if autostart is None else autostart:
                 self.start()
         except SpaceRobotError:
@@ -321,18 +330,17 @@ class FlightNode(LifecycleNode):
         unchanged value is always accepted, because loading a dump sets every parameter.
         """
         try:
-            given = typed(self._parameters_declared, parameter_list)
-            changes = [each for each in given if not self._has_value(each)]
+            changes = []
+            for given in typed(self._parameters_declared, parameter_list):
+                present = self.get_parameter_or(given.name)
+                if (present.type_, present.value) != (given.type_, given.value):
+                    changes.append(given)
             self._require_changeable(changes)
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         if not changes:
             return SetParametersResult(successful=True)
         return super().set_parameters_atomically(changes)
-
-    def _has_value(self, given: RosParameter) -> bool:
-        present = self.get_parameter_or(given.name)
-        return bool(present.type_ == given.type_ and present.value == given.value)
 
     @property
     def is_active(self) -> bool:
@@ -520,21 +528,18 @@ class FlightNode(LifecycleNode):
 
         service.callback = answer
 
-    def _entities(self) -> list[Any]:
-        return [*self.timers, *self.subscriptions, *self.services, *self.publishers]
-
     def _destroy_configured(self) -> None:
         """Destroy the entities created by configure; the services of every ROS node are kept."""
         self._set_parameters_read_only(fixed=False)
-        destroy = {
-            Timer: self.destroy_timer,
-            Subscription: self.destroy_subscription,
-            Service: self.destroy_service,
-            Publisher: self.destroy_publisher,
-        }
-        for entity in self._entities():
-            if entity not in self._permanent:
-                next(act for kind, act in destroy.items() if isinstance(entity, kind))(entity)
+        for entities, destroy in (
+            (self.timers, self.destroy_timer),
+            (self.subscriptions, self.destroy_subscription),
+            (self.services, self.destroy_service),
+            (self.publishers, self.destroy_publisher),
+        ):
+            for entity in (*entities,):
+                if entity not in self._permanent:
+                    destroy(entity)
 
     def _set_parameters_read_only(self, *, fixed: bool) -> None:
         """Make the parameters that :meth:`configure` reads constant, or writable again."""

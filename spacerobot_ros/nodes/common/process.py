@@ -54,14 +54,10 @@ _REQUIRED_SHARED_MEMORY = 2 * 2**20
 
 
 def use_loopback_discovery() -> None:
-    """Limit discovery to this machine unless the user chose otherwise; select a transport."""
+    """Limit discovery to this machine unless the user chose otherwise; send messages through
+    sockets where shared memory is missing or full, and say why."""
     if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    _use_sockets_without_shared_memory()
-
-
-def _use_sockets_without_shared_memory() -> None:
-    """Send messages through sockets where shared memory is missing or full, and say why."""
     if any(os.environ.get(name) for name in _TRANSPORT_CHOICES):
         return
     try:
@@ -123,7 +119,18 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
         A signal arrived before the node existed, and the caller has its own signal guard.
     """
     if isinstance(factory, type) and {"-h", "--help"} & set(sys.argv[1:]):
-        print(_help(factory, Path(sys.argv[0]).stem))
+        node: type[FlightNode] = factory
+        text = click.HelpFormatter(max_width=100)
+        usage = f"ros2 run spacerobot_ros {Path(sys.argv[0]).stem}"
+        text.write_usage(usage, "--ros-args -p NAME:=VALUE ...")
+        text.write_paragraph()
+        text.write_text((node.__doc__ or "").partition("\n\n")[0])
+        with text.section("Parameters"):
+            text.write_dl(
+                (each.name, f"{each.description} [{each.default!r}{each.unit and ' ' + each.unit}]")
+                for each in declared(node.Config)
+            )
+        print(text.getvalue().rstrip())
         return 0
     use_loopback_discovery()
     with guarded() as alone:
@@ -133,20 +140,6 @@ def run_node(factory: Callable[[], FlightNode], arguments: list[str] | None = No
             if not alone:
                 raise
             return 0
-
-
-def _help(node: type[FlightNode], executable: str) -> str:
-    """Return what a node does, and its parameters."""
-    text = click.HelpFormatter(max_width=100)
-    text.write_usage(f"ros2 run spacerobot_ros {executable}", "--ros-args -p NAME:=VALUE ...")
-    text.write_paragraph()
-    text.write_text((node.__doc__ or "").partition("\n\n")[0])
-    with text.section("Parameters"):
-        text.write_dl(
-            (each.name, f"{each.description} [{each.default!r}{each.unit and ' ' + each.unit}]")
-            for each in declared(node.Config)
-        )
-    return text.getvalue().rstrip()
 
 
 def start_ros(arguments: list[str] | None) -> None:
@@ -205,7 +198,12 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             spin_until(executor, stop)
             node.drain(executor)
             node.finalize()
-            _await_delivery(node)
+            # Messages that readers have not received yet would end with the process.
+            end = time.monotonic() + _LONGEST_DELIVERY
+            for publisher in node.publishers:
+                left = end - time.monotonic()
+                if left > 0 and publisher.get_subscription_count():
+                    publisher.wait_for_all_acked(Duration(seconds=left))
         return stop.result() or node.exit_code
     finally:
         logging.getLogger("spacerobot_ros").removeHandler(warnings)
@@ -213,15 +211,6 @@ def _run_node(factory: Callable[[], FlightNode], arguments: list[str] | None) ->
             node.destroy_node()
         rclpy.try_shutdown()
         faulthandler.cancel_dump_traceback_later()
-
-
-def _await_delivery(node: FlightNode) -> None:
-    """Wait until readers have received all messages, since unsent ones end with the process."""
-    end = time.monotonic() + _LONGEST_DELIVERY
-    for publisher in node.publishers:
-        left = end - time.monotonic()
-        if left > 0 and publisher.get_subscription_count():
-            publisher.wait_for_all_acked(Duration(seconds=left))
 
 
 def spin_until(executor: EventsExecutor, done: rclpy.task.Future) -> None:

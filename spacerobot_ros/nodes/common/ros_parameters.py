@@ -61,7 +61,7 @@ class RemoteParameters:
         got = yield from self._call(GetParameters, "get_parameters", these)
         if got is not None and len(got.values) == len(names):
             values = zip(names, map(parameter_value_to_python, got.values), strict=True)
-            self.values = {name: json.dumps(_json_value(value)) for name, value in values}
+            self.values = {name: json.dumps(value, default=list) for name, value in values}
 
     def _call(self, kind: Any, service: str, request: Any) -> Generator[bool, None, Any]:
         client: Client = self._node.create_client(kind, f"{self.name}/{service}")
@@ -78,10 +78,6 @@ class RemoteParameters:
             return None
         finally:
             self._node.destroy_client(client)
-
-
-def _json_value(value: Any) -> Any:
-    return value if value is None or isinstance(value, (bool, int, float, str)) else list(value)
 
 
 _QOS_OVERRIDES = "qos_overrides."

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
 from spacerobot_ros.messages.diagnostics import diagnostic_name, encode_diagnostics
 from spacerobot_ros.messages.statuses import StatusRecord, read_status
 from spacerobot_ros.model.compilation import compilation_contexts
+
+if TYPE_CHECKING:
+    from spacerobot_ros.nodes.common.node import FlightNode
 
 TOPIC = "heartbeat"
 
@@ -83,12 +86,8 @@ class Watchdog:
     A node is monitored from its first heartbeat until it reports that it is inactive. While a
     node is busy, no heartbeat is expected. If this node itself was suspended, all timeouts restart.
 
-    Parameters
-    ----------
-    timeout
-        Wall time, s, without a heartbeat after which a node is considered silent.
-    clock
-        Function that returns the wall time, s.
+    A node is silent after ``timeout``, a wall time in s, without a heartbeat; ``clock`` returns the
+    wall time, s.
     """
 
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -130,23 +129,15 @@ class Watchdog:
 
 class Liveness:
     """Sends the heartbeats of a node, and monitors the heartbeats of the roles on which this node
-    depends.
-
-    ``on_silence`` is called when a monitored node has become silent, or has returned.
+    depends: the node is told when a monitored node has become silent, or has returned.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        role: Role | None,
-        depends_on: Iterable[Role],
-        on_silence: Callable[[SilenceReport], None],
-    ) -> None:
-        self._node, self._on_silence = node, on_silence
-        self._role = "" if role is None else role.value
+    def __init__(self, node: FlightNode) -> None:
+        self._node = node
+        self._role = "" if node.role is None else node.role.value
         self._publisher = node.create_publisher(DiagnosticStatus, TOPIC, HEARTBEAT_QOS)
         self._timers: list[Timer] = []
-        self._watched = {each.value for each in depends_on}
+        self._watched = {each.value for each in node.depends_on}
         self._watchdog: Watchdog | None = None
         self._timeout = 0.0
         self._busy = 0
@@ -235,7 +226,7 @@ class Liveness:
 
     def _report(self, news: list[SilenceReport]) -> None:
         for silence in news:
-            self._on_silence(silence)
+            self._node.on_silence(silence)
         if self._watchdog is None:
             return  # The node has reacted by stopping.
         self._next_report = time.monotonic() + _REPORT_PERIOD

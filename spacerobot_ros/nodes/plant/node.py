@@ -166,8 +166,8 @@ class PlantNode(FlightNode):
         self._monitor = PlantMonitor(
             self.commands, self.plant, config if self._undecided else decided
         )
-        self._publisher = StatePublisher(self, robot, self.reported, config)
-        self._transforms = TransformPublisher(self, robot, config)
+        self._publisher = StatePublisher(self)
+        self._transforms = TransformPublisher(self)
         self._markers = RobotMarkers(robot.description, self.reported.target, config.world_frame)
         self._marker_stream = self.create_publisher(MarkerArray, "markers", STREAM)
         self._report = PlantReport(self, self._real_time)
@@ -184,7 +184,7 @@ class PlantNode(FlightNode):
         )
         self._clearance = None
         if self._clearance_ticks:
-            self._clearance = ClearancePublisher(self, has_contact_forces=config.engine == "mujoco")
+            self._clearance = ClearancePublisher(self)
         self._obstacles: str | None = None
         """The last URDF on the topic obstacles; None if the robot's own obstacles are used."""
         self.create_subscription(String, "obstacles", self._on_obstacles, LATCHED)
@@ -234,12 +234,22 @@ class PlantNode(FlightNode):
         assert self._monitor is not None
         self._undecided, config = False, self.config.decided(actuation)
         if actuation == "effort":
-            commands, robot = self.commands, self.plant.robot
-            before = self.plant
-            self._use_plant(self._plant_now(robot, config), config)
+            commands, before, after = self.commands, self.plant, self._under_efforts
+            capturing = before.capturing
+            # Without a motion so far, the prepared plant is in the current state.
+            if capturing is not None or np.any(before.momentum[:6]) or self.config.resume_bag:
+                motion = before.pose, before.q, before.qdot, before.momentum
+                target = payload = None
+                if capturing is not None:
+                    target = BodyMotion.of(capturing.target_pose, capturing.target_twist)
+                    payload = capturing.payload
+                initial = InitialState.of_motion(*motion)
+                after = _resumed_plant(before.robot, config, initial, target, payload)
+            assert after is not None
+            self._use_plant(after, config)
             self.plant.succeed(before)
             self.commands.succeed(commands)
-            self._publisher.observe(self.reported)
+            self._publisher.rebuild()
             self._report.observe_plant()
             self._count_commanders()
         self._under_efforts = None
@@ -251,19 +261,6 @@ class PlantNode(FlightNode):
             f"Commands carry {_CARRIED[actuation]}: the plant uses this actuation."
         )
         self._publish_changed_status()
-
-    def _plant_now(self, robot: SpaceRobot, config: PlantConfig) -> PlantWithFaults:
-        """Return a plant with another actuation in the current state, with the joints at rest."""
-        plant, capturing = self.plant, self.plant.capturing
-        prepared = self._under_efforts
-        if capturing is None and not np.any(plant.momentum[:6]) and not self.config.resume_bag:
-            assert prepared is not None
-            return prepared  # It is still at its start.
-        initial = InitialState.of_motion(plant.pose, plant.q, plant.qdot, plant.momentum)
-        if capturing is None:
-            return _resumed_plant(robot, config, initial)
-        target = BodyMotion.of(capturing.target_pose, capturing.target_twist)
-        return _resumed_plant(robot, config, initial, target, capturing.payload)
 
     def activate(self) -> None:
         """Publish the robot and its current state, and start stepping."""
@@ -411,7 +408,13 @@ class PlantNode(FlightNode):
             self._publisher.rebuild()
         self._publisher.publish(now, all_topics=self.tick % self._pose_ticks == 0)
         if self._clearance is not None:
-            self._look_at_contacts(self._clearance, now)
+            publishes = self.tick % self._clearance_ticks == 0
+            looks = publishes or self.tick % self.config.contact_ticks == 0
+            contacts = self._clearance.look(now, publishes=publishes) if looks else None
+            if contacts is not None:
+                assert self._monitor is not None
+                self._monitor.contacts = contacts
+                self._publish_changed_status()
         if self._tf_ticks and self.tick % self._tf_ticks == 0:
             self._transforms.publish(now)
         draws = self._markers.draws_anything and self._marker_ticks
@@ -423,16 +426,6 @@ class PlantNode(FlightNode):
             )
         if self._report_ticks and self.tick % self._report_ticks == 0:
             self._publish_report()
-
-    def _look_at_contacts(self, clearance: ClearancePublisher, now: int) -> None:
-        publishes = self.tick % self._clearance_ticks == 0
-        if not (publishes or self.tick % self.config.contact_ticks == 0):
-            return
-        contacts = clearance.look(now, publishes=publishes)
-        if contacts is not None:
-            assert self._monitor is not None
-            self._monitor.contacts = contacts
-            self._publish_changed_status()
 
     def _publish_report(self) -> None:
         self._reported_ns = self._steady.now().nanoseconds

@@ -20,18 +20,15 @@ from spacerobot_ros.messages.builders import (
 from spacerobot_ros.messages.diagnostics import PlantDiagnostics, encode_diagnostics
 from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
-from spacerobot_ros.nodes.common.messages import message_class, transform_class
-from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode
+from spacerobot_ros.nodes.common.messages import TRANSFORM_CLASS, interface_class, message_class
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.simulation.commands import (
     NO_STAMP,
     CommandSource,
     Reason,
     Refusal,
 )
-from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import latched_text
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import SECOND, stamp_bytes
@@ -121,56 +118,52 @@ _LONGEST_WAIT = 0.5  # wall s, for readers
 class StatePublisher:
     """Publishes the state topics that the topic table lists for a plant."""
 
-    def __init__(
-        self, node: FlightNode, robot: SpaceRobot, state: ReportedState, config: PlantConfig
-    ) -> None:
-        self._node, self._robot, self._state, self._config = node, robot, state, config
-        self._world = config.world_frame
-        self._base = config.prefix_for(robot.description) + robot.base_link
+    def __init__(self, node: PlantNode) -> None:
+        self._node, robot = node, node.plant.robot
+        self._base = node.config.prefix_for(robot.description) + robot.base_link
         self._outputs: dict[str, Publisher] = {}
         self._readers: frozenset[bytes] = frozenset()
         self._matched = 0
         self._description = node.create_publisher(String, "robot_description", LATCHED)
         self._target_description: Any = None
-        if state.target is not None:
+        if node.reported.target is not None:
             self._target_description = node.create_publisher(
                 String, "target/robot_description", LATCHED
             )
         self.rebuild()
 
-    def observe(self, state: ReportedState) -> None:
-        """Set the published state."""
-        self._state = state
-        self.rebuild()
-
     def rebuild(self) -> None:
-        """Create the messages for the quantities that the state now contains."""
-        clock = TOPICS["/clock"]
-        streams = [
-            (topic, self._output(topic), self._template(topic))
-            for topic in (clock, *self._state.topics)
-        ]
+        """Create the messages for the quantities that the state of the plant now contains."""
+        topics = TOPICS["/clock"], *self._node.reported.topics
+        for topic in topics:
+            if topic.name not in self._outputs:
+                self._outputs[topic.name] = self._node.create_publisher(
+                    message_class(topic.type), topic.name, STREAM
+                )
+        streams = [(each, self._outputs[each.name], self._template(each)) for each in topics]
         self._all = [(output, template) for _, output, template in streams]
         self._every_tick = [
             (output, template) for topic, output, template in streams if topic.every_tick
         ]
-        poses = {"odom", *(pose_topic(name).name for name in self._config.end_effectors)}
+        links = self._node.config.end_effectors
+        poses = {"odom", *(pose_topic(name).name for name in links)}
         self._of_measured_pose = [template for topic, _, template in streams if topic.name in poses]
         self._of_target = [template for topic, _, template in streams if topic.name == _TARGET]
 
     def publish_description(self) -> None:
         """Publish the robot and target URDFs."""
-        self._description.publish(String(data=self._robot.description.urdf))
-        if self._state.target is not None:
-            self._target_description.publish(String(data=self._state.target.urdf))
+        self._description.publish(String(data=self._node.plant.robot.description.urdf))
+        if (target := self._node.reported.target) is not None:
+            self._target_description.publish(String(data=target.urdf))
 
     def publish(self, time_ns: int, *, all_topics: bool) -> None:
         """Publish the state, stamped ``time_ns``.
 
         ``all_topics`` includes the topics that are not published in every tick.
         """
-        lost = self._of_measured_pose if self._state.sensors.dropout else []
-        if self._state.misses_target:
+        state = self._node.reported
+        lost = self._of_measured_pose if state.sensors.dropout else []
+        if state.misses_target:
             lost = [*lost, *self._of_target]
         stamp = stamp_bytes(time_ns)
         for output, template in self._all if all_topics else self._every_tick:
@@ -204,25 +197,16 @@ class StatePublisher:
             if not output.wait_for_all_acked(Duration(seconds=left)):
                 return
 
-    def _output(self, topic: Topic) -> Publisher:
-        if topic.name not in self._outputs:
-            self._outputs[topic.name] = self._node.create_publisher(
-                message_class(topic.type), topic.name, STREAM
-            )
-        return self._outputs[topic.name]
-
     def _template(self, topic: Topic) -> MessageTemplate:
-        names = self._state.names(topic)
-        target = self._state.target
-        prototype = state_message(
-            topic, names, self._world, self._base, "" if target is None else target.base_link
-        )
+        state, world = self._node.reported, self._node.config.world_frame
+        target = "" if state.target is None else state.target.base_link
+        prototype = state_message(topic, state.names(topic), world, self._base, target)
         template = MessageTemplate(topic.type, prototype)
-        if topic.name == "odom" and self._state.sensors.used:
-            template.feed("pose.covariance", self._state.sensors.pose_covariance)
-            template.feed("twist.covariance", self._state.sensors.twist_covariance)
+        if topic.name == "odom" and state.sensors.used:
+            template.feed("pose.covariance", state.sensors.pose_covariance)
+            template.feed("twist.covariance", state.sensors.twist_covariance)
         for field in topic.state:
-            values = self._state.quantities[field.quantity]
+            values = state.quantities[field.quantity]
             if values.size:
                 template.feed(field.columns[0], values)
         return template
@@ -235,17 +219,14 @@ class TransformPublisher:
     the transforms.
     """
 
-    def __init__(self, node: PlantNode, robot: SpaceRobot, config: PlantConfig) -> None:
-        self._node, self._kind = node, transform_class()
-        if self._kind is None or not config.tf_period:
-            self.publishes = False
+    def __init__(self, node: PlantNode) -> None:
+        self._node, self._kind = node, interface_class(*TRANSFORM_CLASS)
+        robot, config = node.plant.robot.description, node.config
+        self.publishes = self._kind is not None and config.tf_period > 0
+        if not self.publishes:
             return
-        self.publishes = True
         self._frames = RobotTransforms(
-            robot.description,
-            config.world_frame,
-            config.prefix_for(robot.description),
-            links=config.tf_links,
+            robot, config.world_frame, config.prefix_for(robot), links=config.tf_links
         )
         self._stream = node.create_publisher(self._kind, TRANSFORMS, STREAM)
         self._static: Publisher | None = None
@@ -267,21 +248,19 @@ class TransformPublisher:
 
 
 class ClearancePublisher:
-    """Publishes the smallest distance between links, and reports their contacts.
+    """Publishes the smallest distance between links, and reports their contacts."""
 
-    For ``has_contact_forces``, see :class:`.ClearanceMonitor`.
-    """
-
-    def __init__(self, node: PlantNode, *, has_contact_forces: bool) -> None:
+    def __init__(self, node: PlantNode) -> None:
         self._node = node
         self._monitor: ClearanceMonitor | None = None
         self._stream: Publisher | None = None
         """Created once links could touch."""
-        self.use(node.plant.robot.description, has_contact_forces=has_contact_forces)
+        has_forces = node.config.engine == "mujoco"
+        self.use(node.plant.robot.description, has_contact_forces=has_forces)
 
     def use(self, described: RobotDescription, *, has_contact_forces: bool = False) -> bool:
         """Measure distances between links and to obstacles from now on; return whether links could
-        touch."""
+        touch. For ``has_contact_forces``, see :class:`.ClearanceMonitor`."""
         # Not every plant measures distances.
         from spacerobot_ros.simulation.clearance import ClearanceMonitor
 

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -159,7 +160,7 @@ class Listener:
             ("controller/status", "controller", ControllerStatus.from_values),
             ("replay/status", "replay", lambda values, _: ReplayStatus.from_values(values)),
         ):
-            take = self._status_callback(key, read)
+            take = partial(self._on_status_message, key, read)
             self._status_topics.append(LatchedSubscription(node, DiagnosticStatus, topic, take))
         node.create_subscription(Path, "planned_path", self._on_path, LATCHED)
         node.create_subscription(JointTrajectory, "gait_schedule", self._on_schedule, LATCHED)
@@ -223,10 +224,7 @@ class Listener:
             momenta=self._momenta,
             firing=self._firing,
             clearance=self._clearance,
-            plant=statuses.get("plant"),
-            planner=statuses.get("planner"),
-            controller=statuses.get("controller"),
-            replay=statuses.get("replay"),
+            **statuses,
             planned_path=None if planner_hidden else self._planned,
             planned_motion=None if planner_hidden else self._motion,
             goals=dict(self._goals),
@@ -329,25 +327,22 @@ class Listener:
 
     # -- statuses, goals, heartbeats ------------------------------------------------------------
 
-    def _status_callback(
-        self, key: str, read: Callable[[dict[str, str], str], Any]
-    ) -> Callable[[DiagnosticStatus], None]:
-        def take(received: DiagnosticStatus) -> None:
-            message = read_status(received)
-            try:
-                status = read(dict(message.values), message.message)
-            except SpaceRobotError:
-                return  # The status is from another kind of node.
-            status = self._after_refusal(key, status)
-            self._statuses[key] = status
-            self._reporters[key] = message.name
-            self._hidden.pop(message.name, None)
-            if isinstance(status, PlannerStatus) and status.state is not PlannerState.REFUSED:
-                with suppress(SpaceRobotError):  # An unreadable goal, from another package.
-                    self._take_planned_goal(status)
-            self._on_status(key, message.name)
-
-        return take
+    def _on_status_message(
+        self, key: str, read: Callable[[dict[str, str], str], Any], received: DiagnosticStatus
+    ) -> None:
+        message = read_status(received)
+        try:
+            status = read(dict(message.values), message.message)
+        except SpaceRobotError:
+            return  # The status is from another kind of node.
+        status = self._after_refusal(key, status)
+        self._statuses[key] = status
+        self._reporters[key] = message.name
+        self._hidden.pop(message.name, None)
+        if isinstance(status, PlannerStatus) and status.state is not PlannerState.REFUSED:
+            with suppress(SpaceRobotError):  # An unreadable goal, from another package.
+                self._take_planned_goal(status)
+        self._on_status(key, message.name)
 
     def _after_refusal(self, key: str, status: Any) -> Any:
         """Return the status to show: if a goal is refused while another is pursued, the status of

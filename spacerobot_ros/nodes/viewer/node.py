@@ -41,7 +41,7 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FaultTargets
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.times import LATEST_NS, SECOND
-from spacerobot_ros.topics import SERVICE_BY_REQUEST, Request, goal_topic
+from spacerobot_ros.topics import SERVICE_BY_REQUEST, Request, link_topic
 from spacerobot_ros.viewer import content
 from spacerobot_ros.viewer.page import Page
 from spacerobot_ros.viewer.reachability import (
@@ -198,7 +198,7 @@ class ViewerNode(FlightNode):
     def _add_goal_topics(self, parts: Iterable[Part]) -> None:
         for part in parts:
             if part not in self._goal_topics:
-                topic = "goal_pose" if part == BASE_GOAL_KEY else goal_topic(part)
+                topic = "goal_pose" if part == BASE_GOAL_KEY else link_topic(part, "goal_pose")
                 self._goal_topics[part] = self.create_publisher(PoseStamped, topic, STREAM)
 
     # -- drawing --------------------------------------------------------------------------------
