@@ -77,18 +77,6 @@ class InitialStates:
             np.array(is_center_of_mass, dtype=np.bool_),
         )
 
-    @classmethod
-    def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
-        """Return ``count`` identical rows; the caller may overwrite columns.
-
-        Raises
-        ------
-        ParameterError
-            The plant would reject the initial state.
-        """
-        one = cls.of(robot, [initial])
-        return cls(*(np.repeat(getattr(one, each.name), count, axis=0) for each in fields(cls)))
-
     def __len__(self) -> int:
         return len(self.position)
 
@@ -274,7 +262,25 @@ class Flights:
             raise ParameterError(f"A flight of {self.ticks} ticks is too short: use at least 1.")
         if not self.report_ticks:
             object.__setattr__(self, "report_ticks", (self.ticks,))
-        self._require_program()
+        match self.program:
+            case FollowedSchedule(positions=positions):
+                if self.actuation != "velocity":
+                    raise ParameterError("A schedule requires velocity actuation.")
+                _require_rows("positions", positions, count, robot.n)
+            case HeldCommands(table=table):
+                _require_rows("commands", table, count, self.command_size)
+            case ControlledGoals(config=config, gains=gains):
+                if robot.description.wheel_names:
+                    raise ParameterError(
+                        f"Robot '{robot.description.name}' has reaction wheels, which lanes do "
+                        "not support: use engine 'flights'."
+                    )
+                if self.actuation != "effort":
+                    raise ParameterError("A controller requires effort actuation.")
+                if round(config.control_period * SECOND) != round(self.control_period * SECOND):
+                    raise ParameterError("The controller and the plant have different rates.")
+                if gains and len(gains) != count:
+                    raise ParameterError(f"There are gains for {len(gains)} flights, not {count}.")
         limits = (-1, *self.report_ticks, self.ticks + 1)
         if list(limits) != sorted(set(limits)):
             raise ParameterError(
@@ -293,28 +299,6 @@ class Flights:
             raise ParameterError(f"There are sensors for {len(self.sensors)} flights, not {count}.")
         if self.actuation == "velocity" and self.initial_states.qdot.any():
             raise ParameterError("Joints under velocity commands must start at rest.")
-
-    def _require_program(self) -> None:
-        count = len(self)
-        match self.program:
-            case FollowedSchedule(positions=positions):
-                if self.actuation != "velocity":
-                    raise ParameterError("A schedule requires velocity actuation.")
-                _require_rows("positions", positions, count, self.robot.n)
-            case HeldCommands(table=table):
-                _require_rows("commands", table, count, self.command_size)
-            case ControlledGoals(config=config, gains=gains):
-                if self.robot.description.wheel_names:
-                    raise ParameterError(
-                        f"Robot '{self.robot.description.name}' has reaction wheels, which "
-                        "lanes do not support: use engine 'flights'."
-                    )
-                if self.actuation != "effort":
-                    raise ParameterError("A controller requires effort actuation.")
-                if round(config.control_period * SECOND) != round(self.control_period * SECOND):
-                    raise ParameterError("The controller and the plant have different rates.")
-                if gains and len(gains) != count:
-                    raise ParameterError(f"There are gains for {len(gains)} flights, not {count}.")
 
     def __len__(self) -> int:
         return len(self.initial_states)
@@ -410,15 +394,16 @@ class BatchResult:
     """(N, I, 2 n + 20) all of the following arrays up to ``momentum``, in the order of
     :func:`state_parts`."""
     pose: Array
-    """(N, I, 7) position ``r_WB`` (m) and quaternion ``R_WB`` of the base."""
+    """(N, I, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base."""
     twist: Array
     """(N, I, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s)."""
     q: Array
-    """(N, I, n) joint positions."""
+    """(N, I, n) joint positions, m or rad."""
     qdot: Array
-    """(N, I, n) joint rates."""
+    """(N, I, n) joint rates, m/s or rad/s."""
     momentum: Array
-    """(N, I, 7) linear and angular momentum in W, kinetic energy."""
+    """(N, I, 7) linear (kg m/s) and angular momentum about the centre of mass (kg m^2/s), both in
+    W, and kinetic energy (J)."""
     measured_pose: Array
     """(N, I, 7) ``pose`` as measured by the sensors."""
     measured_q: Array

@@ -78,7 +78,13 @@ def fly_lanes(
         except SpaceRobotError as error:
             result.failures[row] = str(error)
     rows = np.flatnonzero(fit)
-    size = _block_size(flights, tick)
+    each = 8 * (2 * tick.memory_layout.total_rows + 100 * len(flights.report_ticks))
+    if (table := flights.table).ndim == 3:
+        each += 2 * table[0].nbytes
+    size, lanes = target.block_bytes // each, target.lanes
+    if not target.threads:
+        size = min(_MAX_BLOCK_GROUPS, size // lanes) * lanes
+    size = max(lanes, size)
     for first in range(0, len(rows), size):
         LaneBlock(flights, tick, model, p, rows[first : first + size], result).fly(stopped)
     return result
@@ -102,18 +108,6 @@ def starts_accepted_by_plant(flights: Flights) -> Flags:
     with np.errstate(invalid="ignore"):
         size = np.linalg.norm(starts.quaternion, axis=1)
         return np.asarray(fit & np.isfinite(size) & (size > 1e-6))
-
-
-def _block_size(flights: Flights, tick: CompiledTick) -> int:
-    each = 8 * (2 * tick.memory_layout.total_rows + 100 * len(flights.report_ticks))
-    table = flights.table
-    if table.ndim == 3:
-        each += 2 * table[0].nbytes
-    fitting = tick.target.block_bytes // each
-    if tick.target.threads:
-        return max(1, int(fitting))
-    lanes = tick.target.lanes
-    return max(1, min(_MAX_BLOCK_GROUPS, int(fitting) // lanes)) * lanes
 
 
 class LaneBlock:
@@ -149,7 +143,18 @@ class LaneBlock:
         self._profiles: dict[int, ReferenceProfile] = {}
         """Reference profiles of controlled flights, by lane in the block."""
         self._write_starts(p[rows])
-        self._write_errors_and_gains()
+        errors, controller = flights.sensors, self._controller
+        if errors is not None:
+            self._write_rows("joint_bias", errors.joint_bias[rows])
+            self._write_rows("joint_noise", errors.noise[rows, 4:5])
+        if controller is not None:
+            self._write_rows("monitor", astuple(GoalMonitor())[1:])
+            self._write_rows("decided", -1.0)
+            self._write_rows("gains", controller.gains_argument(rows.tolist()))
+            if errors is not None:
+                bias = np.hstack([errors.pose_bias[rows], errors.joint_bias[rows]])
+                self._write_rows("bias", bias)
+                self._write_rows("sigma", errors.noise[rows])
         self._loops = len(rows) if self._target.threads else self._groups
         """Number of flights or groups whose ticks are counted separately."""
         arrays = self._target.arrays
@@ -204,23 +209,15 @@ class LaneBlock:
             parts += [starts.qdot, starts.momenta, r_cm]
         self._write_rows("state", np.concatenate(parts, axis=1), lanes)
 
-    def _write_errors_and_gains(self) -> None:
-        at, errors, controller = self._flown, self._flights.sensors, self._controller
-        if errors is not None:
-            self._write_rows("joint_bias", errors.joint_bias[at])
-            self._write_rows("joint_noise", errors.noise[at, 4:5])
-        if controller is not None:
-            self._write_rows("monitor", astuple(GoalMonitor())[1:])
-            self._write_rows("decided", -1.0)
-            self._write_rows("gains", controller.gains_argument(at.tolist()))
-            if errors is not None:
-                self._write_rows("bias", np.hstack([errors.pose_bias[at], errors.joint_bias[at]]))
-                self._write_rows("sigma", errors.noise[at])
-
     def _prepare_job(self) -> tuple[Job, list[Any]]:
         """Return the driver's job, and the arrays that it points to."""
-        flights, program = self._flights, self._flights.program
-        table = self._target.arrays.asarray(self._table_of_lanes())
+        flights, program, errors = self._flights, self._flights.program, self._flights.sensors
+        commands, noisy = flights.table, False
+        if commands.ndim == 3:  # (groups, ticks, width, lanes), as they differ.
+            of_lanes = commands[self._rows_of_lanes]
+            grouped = of_lanes.reshape(self._groups, self._lanes, *commands.shape[1:])
+            commands = np.moveaxis(grouped, 1, 3)
+        table = self._target.arrays.asarray(np.ascontiguousarray(commands))
         self._instants = self._target.arrays.asarray(np.array(flights.report_ticks, dtype=np.int64))
         each_table = table.ndim == 4
         arrays = {
@@ -231,8 +228,11 @@ class LaneBlock:
             "instants": self._instants,
             "reports": self._reports,
         }
-        if flights.sensors is not None:
-            seeds = flights.sensors.seeds[self._rows_of_lanes].astype(np.uint64)
+        if errors is not None:
+            # Commands along schedules depend only on the errors of joints.
+            of_joints = errors.noise[self._flown, 4].any() or errors.joint_bias[self._flown].any()
+            noisy = isinstance(program, ControlledGoals) or bool(of_joints)
+            seeds = errors.seeds[self._rows_of_lanes].astype(np.uint64)
             arrays |= {"seeds": self._target.arrays.asarray(seeds), "normals": self._normals}
         job = Job(
             groups=self._loops,
@@ -241,7 +241,7 @@ class LaneBlock:
             program=_PROGRAMS[type(program)],
             table_ticks=table.shape[1] if each_table else table.shape[0],
             each_table=each_table,
-            noisy=self._feeds_back_errors(),
+            noisy=noisy,
             instant_count=len(flights.report_ticks),
             ends=isinstance(program, ControlledGoals) and program.ends_when_decided,
             **{name: self._target.address(array) for name, array in arrays.items()},
@@ -250,24 +250,6 @@ class LaneBlock:
             job.gain = min(program.shape_gain, 1.0 / flights.control_period)
             job.deadband = program.deadband
         return job, list(arrays.values())
-
-    def _feeds_back_errors(self) -> bool:
-        """Return whether commands depend on sensor errors; those along schedules depend only on
-        joint errors."""
-        errors, rows = self._flights.sensors, self._flown
-        if errors is None:
-            return False
-        joints = errors.noise[rows, 4].any() or errors.joint_bias[rows].any()
-        return isinstance(self._flights.program, ControlledGoals) or bool(joints)
-
-    def _table_of_lanes(self) -> Array:
-        """Return commands (ticks, width), or (groups, ticks, width, lanes) if they differ."""
-        table = self._flights.table
-        if table.ndim == 3:
-            of_lanes = table[self._rows_of_lanes]
-            grouped = of_lanes.reshape(self._groups, self._lanes, *table.shape[1:])
-            table = np.moveaxis(grouped, 1, 3)
-        return np.ascontiguousarray(table)
 
     def fly(self, stopped: Callable[[], bool]) -> None:
         """Fly the flights and write the results, unless stopped."""
@@ -293,7 +275,11 @@ class LaneBlock:
         while self._controller is not None and self._pending.any():
             self._command_outside_lanes()
             self._tick.library.fly_until(self._job, tick)
-        self._note_failures()
+        if self._memory[:, self._rows["failure"]].any():
+            reasons, ticks = self._read_rows("failure")[:, 0], self._read_rows("failed_at")[:, 0]
+            for lane in np.flatnonzero(reasons).tolist():
+                self._end_flight(lane, int(ticks[lane]), FAILURES[int(reasons[lane]) - 1])
+            self._memory[:, self._rows["failure"]] = 0.0
 
     def _end_flight(self, lane: int, tick: int, message: str) -> None:
         self._write_rows("alive", 0.0, np.array([lane]))
@@ -318,14 +304,6 @@ class LaneBlock:
             numbers[lane] = controller.profile_argument(profile)
         self._write_rows("profile", numbers)
         self._write_rows("bounds", most)
-
-    def _note_failures(self) -> None:
-        if not self._memory[:, self._rows["failure"]].any():
-            return
-        reasons, ticks = self._read_rows("failure")[:, 0], self._read_rows("failed_at")[:, 0]
-        for lane in np.flatnonzero(reasons).tolist():
-            self._end_flight(lane, int(ticks[lane]), FAILURES[int(reasons[lane]) - 1])
-        self._memory[:, self._rows["failure"]] = 0.0
 
     def _command_outside_lanes(self) -> None:
         controller, each = self._controller, 1 if self._target.threads else self._lanes
@@ -366,12 +344,7 @@ class LaneBlock:
         result.limited_ticks["stroke"][rows] = limits[:, n:]
         if self._controller is not None:
             self._write_decisions(self._controller)
-        self._measure()
-
-    def _measure(self) -> None:
-        """Write the measurements of the reported states."""
-        result, rows, errors = self._result, self._flown, self._flights.sensors
-        measured = result.pose[rows], result.q[rows]
+        measured, errors = (result.pose[rows], result.q[rows]), self._flights.sensors
         if errors is not None:
             at, names = np.repeat(rows, result.pose.shape[1]), ("pose", "twist", "q", "qdot")
             states = [np.concatenate(getattr(result, name)[rows]) for name in names]

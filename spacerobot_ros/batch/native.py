@@ -9,7 +9,7 @@ enumerations, and :class:`Job`.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -99,11 +99,6 @@ class RowLayout:
         rows = self.slices[name]
         return int(rows.stop - rows.start)
 
-    def copy_range(self, source: str, target: str) -> tuple[int, int, int]:
-        """Return the first row of ``source``, the first row of ``target``, and their number of
-        rows, which is the same."""
-        return self.first_row(source), self.first_row(target), self.row_count(source)
-
 
 @dataclass(frozen=True)
 class CompiledTick:
@@ -154,26 +149,27 @@ class CompiledTick:
         cls, flights: Flights, model: ModelFunctions, target: Target, link: str
     ) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
-        names, n = _TICK_VARIABLES[flights.actuation], robot.n
+        inputs, n = _TICK_INPUTS[flights.actuation], robot.n
+        results = _TICK_OUTPUTS[flights.actuation]
         # Reports need all results except the poses of links.
-        reported = [name for name in names.outputs if not name.startswith("link")]
-        ticks: dict[str, Sequence[str]] = {
-            "FLIGHT": names.results_of_every_tick,
+        reported = [name for name in results if not name.startswith("link")]
+        ticks = {
+            "FLIGHT": [name for name in results if name not in _ONLY_REPORTED],
             "REPORT": reported + ["place"] * bool(link),
         }
         functions: dict[str, ca.Function] = {}
-        for kind, results in ticks.items():
+        for kind, needed in ticks.items():
             tick = PLANTS[flights.actuation].tick_function(
                 robot, Composition(model, ca.MX), flights.substeps
             )
-            inputs = tick.mx_in()
-            outputs = dict(zip(names.outputs, tick.call(inputs, True, False), strict=True))
+            arguments = tick.mx_in()
+            outputs = dict(zip(results, tick.call(arguments, True, False), strict=True))
             if link:
                 of_links = ca.reshape(outputs["link_r"], 3, -1)
                 outputs["place"] = ca.densify(of_links[:, robot.link_names.index(link)])
-            chosen = [outputs[each] for each in results]
+            chosen = [outputs[each] for each in needed]
             name = f"{flights.actuation}_{kind.lower()}"
-            functions[kind] = ca.Function(name, inputs, chosen, [*names.inputs, "p"], [*results])
+            functions[kind] = ca.Function(name, arguments, chosen, [*inputs, "p"], needed)
         controller = None
         if isinstance(flights.program, ControlledGoals):
             in_lanes = BatchController.of(flights)
@@ -201,9 +197,6 @@ class CompiledTick:
         if has_stops:
             for name in ("holding_step", "shape_equations"):
                 functions[name.upper()] = model.function(name, compile=False)
-        copies = dict(names.results_fed_back)
-        if controller is not None:
-            copies["next_monitor"] = "monitor"
         state, limited = rows.first_row("next_state"), rows.first_row("limited", 1)
         rates = state + n + 4 if effort else rows.first_row("qdot")
         efforts = rows.first_row("realised" if effort else "effort")
@@ -216,7 +209,11 @@ class CompiledTick:
             report.append((rows.first_row(name), width, rows.row_count(name)))
             width += rows.row_count(name)
         spans = {
-            "COPIES": [rows.copy_range(*each) for each in copies.items()],
+            "COPIES": [
+                (rows.first_row(source), rows.first_row(target), rows.row_count(source))
+                for source, target in _FED_BACK.items()
+                if source in sizes
+            ],
             "SUMS": [(limited, rows.first_row("limits"), n if effort else 2 * n)],
             "PEAKS": peaks,
             "REPORTED": report,
@@ -241,45 +238,30 @@ class CompiledTick:
         return cls(library, target, rows, width, controller)
 
 
-@dataclass(frozen=True)
-class _TickVariables:
-    """Names of a tick function's arguments and results.
-
-    ``results_of_every_tick`` are those that every tick needs, ``results_fed_back`` those that
-    become arguments of the next tick.
-    """
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    results_of_every_tick: tuple[str, ...]
-    results_fed_back: Mapping[str, str]
-
-
-_TICK_VARIABLES = {
-    "velocity": _TickVariables(
-        ("state", "command", "before", "momenta", "r_cm", "h"),
-        (
-            "next_state",
-            "pose",
-            "twist",
-            "qdot",
-            "effort",
-            "momentum",
-            "link_R",
-            "link_r",
-            "limited",
-            "next_r_cm",
-        ),
-        ("next_state", "qdot", "effort", "limited", "next_r_cm"),
-        {"next_state": "state", "qdot": "before", "next_r_cm": "r_cm"},
+_TICK_INPUTS = {
+    "velocity": ("state", "command", "before", "momenta", "r_cm", "h"),
+    "effort": ("state", "command", "h"),
+}
+_TICK_OUTPUTS = {
+    "velocity": (
+        *("next_state", "pose", "twist", "qdot", "effort"),
+        *("momentum", "link_R", "link_r", "limited", "next_r_cm"),
     ),
-    "effort": _TickVariables(
-        ("state", "command", "h"),
-        ("next_state", "pose", "twist", "realised", "momentum", "link_R", "link_r", "limited"),
-        ("next_state", "realised", "limited"),
-        {"next_state": "state"},
+    "effort": (
+        *("next_state", "pose", "twist", "realised"),
+        *("momentum", "link_R", "link_r", "limited"),
     ),
 }
+"""Names of the arguments and results of a tick function, by actuation."""
+
+_ONLY_REPORTED = ("pose", "twist", "momentum", "link_R", "link_r")
+"""Results that only some ticks need."""
+
+_FED_BACK = {
+    **{"next_state": "state", "qdot": "before", "next_r_cm": "r_cm"},
+    "next_monitor": "monitor",
+}
+"""Arguments of the next tick, by the results that become these arguments."""
 
 
 def _shared_declarations(
@@ -303,7 +285,7 @@ def _shared_declarations(
         for name, each in spans.items()
     ]
     lines += [
-        f"static const double {name}[] = {{{', '.join(map(_cpp_number, each.tolist()))}}};"
+        f"static const double {name}[] = {_cpp_list(each.tolist()).replace('inf', 'INFINITY')};"
         for name, each in numbers.items()
     ]
     lines += [
@@ -314,9 +296,5 @@ def _shared_declarations(
     return "\n".join(lines)
 
 
-def _cpp_list(numbers: Iterable[int]) -> str:
-    return "{" + ", ".join(map(str, numbers)) + "}"
-
-
-def _cpp_number(value: float) -> str:
-    return repr(value).replace("inf", "INFINITY")
+def _cpp_list(numbers: Iterable[float]) -> str:
+    return "{" + ", ".join(map(repr, numbers)) + "}"

@@ -45,8 +45,9 @@ from spacerobot_ros.simulation.plant import Plant
 class SteppedFlights:
     """N flights of one robot, advanced together tick by tick under given commands.
 
-    An ended flight keeps the state of its last tick. On a device, the arrays are those of the
-    device.
+    An ended flight keeps the state of its last tick. ``pose``, ``twist``, ``q``, ``qdot`` and
+    ``momentum`` (N, ...) are as in :class:`.BatchResult`, at one instant. On a device, the arrays
+    are those of the device.
 
     Parameters
     ----------
@@ -73,16 +74,10 @@ class SteppedFlights:
     """
 
     pose: Array
-    """(N, 7) position ``r_WB`` (m) and quaternion ``R_WB`` (x, y, z, w) of the base."""
     twist: Array
-    """(N, 6) ``v_WB_B`` (m/s) and ``omega_WB_B`` (rad/s)."""
     q: Array
-    """(N, n) joint positions, m or rad."""
     qdot: Array
-    """(N, n) joint velocities, m/s or rad/s."""
     momentum: Array
-    """(N, 7) linear (kg m/s) and angular momentum about the centre of mass (kg m^2/s), both in W,
-    and kinetic energy (J)."""
     link_r: Array
     """(N, 3) position of the link ``link`` in B, m; (N, 0) without one."""
 
@@ -120,7 +115,15 @@ class SteppedFlights:
         self.command_size = self._flights.command_size
         """See :attr:`.Flights.command_size`."""
         self.require_startable(starts, None)
-        self._engine = self._choose_engine(link, plants, in_lanes, target)
+        engine: _SteppedLanes | _SteppedPlants | None = None
+        if in_lanes and not plants:
+            try:
+                engine = _SteppedLanes(self._flights, link, target or vector_unit())
+            except NoLibraryError as reason:
+                if target is not None:
+                    raise SpaceRobotError(f"'{target.name}' has no program: {reason}.") from reason
+                warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
+        self._engine = engine or _SteppedPlants(self._flights, link, plants)
         self.arrays = self._engine.arrays
         """Array module: NumPy, or that of the device."""
         self.ticks = self.arrays.zeros(count, dtype=np.int64)
@@ -260,18 +263,6 @@ class SteppedFlights:
             for row in rows.tolist():
                 self.failures.pop(row, None)
 
-    def _choose_engine(
-        self, link: str, plants: Sequence[PlantConfig], in_lanes: bool, target: Target | None
-    ) -> _SteppedLanes | _SteppedPlants:
-        if in_lanes and not plants:
-            try:
-                return _SteppedLanes(self._flights, link, target or vector_unit())
-            except NoLibraryError as reason:
-                if target is not None:
-                    raise SpaceRobotError(f"'{target.name}' has no program: {reason}.") from reason
-                warn_once(f"Flights are flown one by one, not in lanes: {reason}.")
-        return _SteppedPlants(self._flights, link, plants)
-
 
 class _SteppedLanes(LaneBlock):
     """All flights in one block; NoLibraryError if no tick can be compiled here."""
@@ -310,13 +301,11 @@ class _SteppedLanes(LaneBlock):
         return self._report_starts(self.arrays.asarray(rows))
 
     def remember_starts(self) -> None:
-        """See :meth:`SteppedFlights.remember_starts`."""
         names = ("p", "state", "momenta", "r_cm")
         parts = [self._rows[name] for name in names if name in self._rows.slices]
         self._starts = [(part, self._memory[0, part].copy()) for part in parts]
 
     def restart(self, rows: Any, starts: Any) -> Any:
-        """Begin flights on a device; see :meth:`SteppedFlights.restart`."""
         for part, first in self._starts:
             self._memory[0, part][:, rows] = first[:, starts]
         return self._report_starts(rows)
@@ -356,21 +345,19 @@ class _SteppedPlants:
         self.failures: dict[int, str] = {}
 
     def start(self, rows: Counts) -> Array:
-        for row in rows.tolist():
-            self._start_plant(row)
-        return np.array([self._report(self._plants[row]) for row in rows.tolist()])
-
-    def _start_plant(self, row: int) -> None:
-        flights = self._flights
+        flights, plants = self._flights, self._plants
         assert flights.inertial is not None
-        start, masses = flights.initial_states.initial_state(row), flights.inertial[row].vector
-        if self._configs:
-            self._plants[row] = build_plant(flights.robot_of(row), self._configs[row], start)
-        elif row in self._plants and self._masses[row] == masses.tobytes():
-            self._plants[row].initial = start
-            self._plants[row].reset()
-        else:
-            self._plants[row], self._masses[row] = plant_of(flights, row), masses.tobytes()
+        for row in rows.tolist():
+            start = flights.initial_states.initial_state(row)
+            masses = flights.inertial[row].vector.tobytes()
+            if self._configs:
+                plants[row] = build_plant(flights.robot_of(row), self._configs[row], start)
+            elif row in plants and self._masses[row] == masses:
+                plants[row].initial = start
+                plants[row].reset()
+            else:
+                plants[row], self._masses[row] = plant_of(flights, row), masses
+        return np.array([self._report(plants[row]) for row in rows.tolist()])
 
     def step(self, commands: Array, ticks: int, under_way: Flags) -> Array:
         for row in np.flatnonzero(under_way).tolist():

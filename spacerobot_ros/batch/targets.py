@@ -141,10 +141,15 @@ class Target:
     ) -> str:
         """Return the program, as C++ code that CUDA also compiles; see :meth:`compile`."""
         given = list(functions.values())
+        # In this code, every number has the type ``V``.
+        options = {"with_header": False, "cpp": True, "casadi_real": "V"}
+        generator = ca.CodeGenerator(given[0].name(), options)
+        for function in given:
+            generator.add(function)
         parts = [
             self._definitions(given, libmvec),
             _read_source("lanes.hpp"),
-            _CASADI_SELECTION.sub(r"where(\1,\2)", _vector_source(given)),
+            _CASADI_SELECTION.sub(r"where(\1,\2)", str(generator.dump())),
             *(f"#define {name} {function.name()}" for name, function in functions.items()),
             declarations,
             _read_source("driver.hpp").replace('#include "stops.hpp"\n', _read_source("stops.hpp")),
@@ -330,15 +335,6 @@ def device_named(name: str) -> Target:
     if name.startswith("host"):
         return replace(THREADS_OF_HOST, single=single)
     return CudaDevice.of(int(found[1] or 0), single=single)
-
-
-def _vector_source(functions: Sequence[ca.Function]) -> str:
-    """Return C++ code of functions in which every number has the type ``V``."""
-    options = {"with_header": False, "cpp": True, "casadi_real": "V"}
-    generator = ca.CodeGenerator(functions[0].name(), options)
-    for function in functions:
-        generator.add(function)
-    return str(generator.dump())
 
 
 def _read_source(name: str) -> str:

@@ -280,7 +280,14 @@ class Episodes:
         self._on_device = bool(config.device)
         if self._on_device:
             self._require_device_support(config, in_lanes)
-        self._link = self._reaching_link(config.link, scenario) if config.kind.has_link else ""
+        self._link = ""
+        if config.kind.has_link:
+            described = self.robot.description
+            self._link = described.end_effector(config.link or plant.end_effector_frame)
+            if not self._link:
+                raise ParameterError(
+                    f"Robot '{described.name}' has no end-effector: set argument 'link'."
+                )
         self._plants = [plant] * count if self._source.needs_plants else []
         self.flights = SteppedFlights(
             self.robot,
@@ -382,14 +389,6 @@ class Episodes:
             known = *_CHANGEABLE, "attributes of the task"
             require_names("An environment has no changeable attribute", [name], known)
 
-    def _reaching_link(self, link: str, scenario: Scenario) -> str:
-        link = self.robot.description.end_effector(link or scenario.plant.end_effector_frame)
-        if not link:
-            raise ParameterError(
-                f"Robot '{self.robot.description.name}' has no end-effector: set argument 'link'."
-            )
-        return link
-
     def _action_scale(self, config: EpisodeConfig, scenario: Scenario) -> tuple[Array, Counts]:
         """Return the command for an action of ones, and the command entries set by actions."""
         size, force, torque = self.flights.command_size, config.max_force, config.max_torque
@@ -487,11 +486,16 @@ class Episodes:
             )
         sizes = {part.name: 3 for part in fields(InitialState)}
         sizes |= {"quaternion": 4, "joint_positions": n, "joint_velocities": n}
-        for one in each:
+        checked: list[dict[str, Array]] = [{} for _ in each]
+        for one, values in zip(each, checked, strict=True):
             require_names("A start has no", one, sizes)
-        return [
-            {name: _checked_start(name, one[name], sizes[name]) for name in one} for one in each
-        ]
+            for name, given in one.items():
+                values[name] = as_numbers(given, f"The start's {name}")
+                if values[name].shape != (sizes[name],) or not np.isfinite(values[name]).all():
+                    raise ParameterError(
+                        f"The start's {name} is {given!r}; it must be {sizes[name]} finite numbers."
+                    )
+        return checked
 
     def _checked_goals(self, goal: Any) -> Array:
         values, (count, size) = as_numbers(goal, "The goal"), self.goals.shape
@@ -574,10 +578,3 @@ class Episodes:
         places = self.robot.function("link_poses")(measured[2].T)[1].full()
         link = self.robot.link_names.index(self._link)
         return RobotStates(*measured, places.reshape(3, len(rows), -1)[:, :, link].T)
-
-
-def _checked_start(name: str, given: Any, size: int) -> Array:
-    values = as_numbers(given, f"The start's {name}")
-    if values.shape != (size,) or not np.isfinite(values).all():
-        raise ParameterError(f"The start's {name} is {given!r}; it must be {size} finite numbers.")
-    return values

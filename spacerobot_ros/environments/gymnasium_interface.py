@@ -242,7 +242,11 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         self._ended = ended.copy()
         if mode is AutoresetMode.SAME_STEP and ended.any():
             rows = self._arrays.flatnonzero(ended)
-            last = self._last_observations(rows)
+            last = episodes.observations.copy()
+            if not self._on_device:
+                seen, last = last, np.full(self.num_envs, None, dtype=object)
+                for row in rows.tolist():
+                    last[row] = seen[row]
             infos = {"final_info": infos | self._info(ended), "_final_info": ended.copy()}
             infos |= {"final_obs": last, "_final_obs": ended.copy()}
             self._begin(rows)
@@ -270,15 +274,6 @@ class SpaceRobotVectorEnv(VectorEnv, EzPickle):
         (checked,) = _seeds_of(seed if seed is None else [seed], 1)
         self._seeds = [np_random(checked)[1]]
         self._generators = self._arrays.random.default_rng(self._seeds[0])
-
-    def _last_observations(self, rows: Any) -> Any:
-        seen = self.episodes.observations
-        if self._on_device:
-            return seen.copy()
-        last = np.full(self.num_envs, None, dtype=object)
-        for row in rows.tolist():
-            last[row] = seen[row].copy()
-        return last
 
     def _begin(self, rows: Any, **options: Any) -> None:
         self.episodes.begin(rows, self._generators, **options)
