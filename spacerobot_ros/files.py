@@ -1,10 +1,5 @@
-"""Atomic file replacement, files that no other user can have modified, and the cache.
-
-Files are replaced completely or not at all, because disks may fill up and processes may be killed.
-Files that are executed or resumed are read only if no other user on the machine can have written
-them. A :class:`Cache` stores files that can be recreated, in a private folder of this user; it
-treats a damaged file as missing, and warns once.
-"""
+"""Atomic file replacement, untrusted YAML, files that no other user can have modified, and the
+cache."""
 
 from __future__ import annotations
 
@@ -76,12 +71,11 @@ def write_whole(path: Path, content: bytes, *, mode: int = 0o600) -> None:
         raise
 
 
-def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
+def write_output(path: Path, content: bytes | str) -> None:
     """Write a report, picture or result, completely or not at all; create its folders.
 
-    ``mode`` specifies the permissions of a new file; an existing file keeps its permissions. A bag
-    is not replaced, because it may be the only record of a flight. Devices and pipes are supported.
-    Text is written as UTF-8.
+    An existing file keeps its permissions. A bag is not replaced, because it may be the only record
+    of a flight. Devices and pipes are supported. Text is written as UTF-8.
 
     Raises
     ------
@@ -91,29 +85,26 @@ def write_output(path: Path, content: bytes | str, mode: int = 0o666) -> None:
     data = content.encode() if isinstance(content, str) else content
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _write_output(Path(os.path.realpath(path)), data, mode)
+        target = Path(os.path.realpath(path))
+        before = target.stat() if target.exists() else None
+        mode, is_device = 0o666, before is not None and not stat.S_ISREG(before.st_mode)
+        if before is not None and not is_device:
+            mode = stat.S_IMODE(before.st_mode)
+            with target.open("rb") as file:
+                if file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC:
+                    raise SpaceRobotError(
+                        f"The file {target} is a bag, which is not overwritten: choose another "
+                        "file."
+                    )
+        if is_device or not os.access(target.parent, os.W_OK):
+            target.write_bytes(data)
+        else:
+            write_whole(target, data, mode=mode)
     except OSError as error:
         reason = error.strerror
         if isinstance(error, FileExistsError | NotADirectoryError):
             reason = f"{path.parent} is not a folder"
         raise SpaceRobotError(f"The file {path} cannot be written: {reason}.") from error
-
-
-def _write_output(path: Path, data: bytes, mode: int) -> None:
-    before = path.stat() if path.exists() else None
-    is_device = before is not None and not stat.S_ISREG(before.st_mode)
-    if before is not None and not is_device:
-        with path.open("rb") as file:
-            if file.read(len(_MCAP_MAGIC)) == _MCAP_MAGIC:
-                raise SpaceRobotError(
-                    f"The file {path} is a bag, which is not overwritten: choose another file."
-                )
-    if is_device or not os.access(path.parent, os.W_OK):
-        path.write_bytes(data)
-        return
-    if before is not None:
-        mode = stat.S_IMODE(before.st_mode)
-    write_whole(path, data, mode=mode)
 
 
 # -- YAML -------------------------------------------------------------------------------------
@@ -251,7 +242,11 @@ class Cache:
             return None
         try:
             _require_own(self.folder)
-            return path, _content_of_entry(path.read_bytes(), key)
+            whole = path.read_bytes()
+            content = whole[: whole.rfind(b"\n" + _CACHE_MAGIC + b" ")]
+            if not whole.endswith(_trailer(content, key)):
+                raise ValueError("it is damaged, or stored under another key")
+            return path, content
         except UntrustedFileError as error:
             self._warn_of_untrusted_cache(error)
         except FileNotFoundError:
@@ -311,11 +306,3 @@ def warn_first_time(logger: logging.Logger, folder: Path, name: str, message: st
 def _trailer(content: bytes, key: str) -> bytes:
     digest = hashlib.sha256(content).hexdigest()
     return b"\n%s %s %d %s\n" % (_CACHE_MAGIC, key.encode(), len(content), digest.encode())
-
-
-def _content_of_entry(whole: bytes, key: str) -> bytes:
-    """Return a cached file without its last line; ValueError if the line does not match."""
-    content = whole[: whole.rfind(b"\n" + _CACHE_MAGIC + b" ")]
-    if not whole.endswith(_trailer(content, key)):
-        raise ValueError("it is damaged, or stored under another key")
-    return content

@@ -130,7 +130,12 @@ class Parameter:
             if self.excludes(value):
                 raise self._refusal(value, f"one of {', '.join(self.choices)}")
             return value
-        return self._check_lines(value) if self.texts else self._check_numbers(value)
+        if not self.texts:
+            return self._check_numbers(value)
+        lines = value.replace("\n", ";").split(";") if isinstance(value, str) else value
+        if not isinstance(lines, Sequence) or not all(isinstance(line, str) for line in lines):
+            raise self._refusal(lines, "a list of texts")
+        return tuple(line.strip() for line in lines if line.strip())
 
     def excludes(self, text: str) -> bool:
         """Whether there are choices and the string is not one of them."""
@@ -170,13 +175,6 @@ class Parameter:
         if not all(map(_is_moderate, numbers)):
             raise self._refusal(value, _MODERATE)
         return numbers
-
-    def _check_lines(self, value: Any) -> tuple[str, ...]:
-        if isinstance(value, str):
-            value = value.replace("\n", ";").split(";")
-        if not isinstance(value, Sequence) or not all(isinstance(line, str) for line in value):
-            raise self._refusal(value, "a list of texts")
-        return tuple(line.strip() for line in value if line.strip())
 
     def _range_text(self) -> str:
         if math.isinf(self.maximum):
@@ -256,20 +254,18 @@ def declared(config: type[Any] | Any) -> tuple[Parameter, ...]:
     ``config`` is the class, or an instance whose values are the defaults.
     """
     if isinstance(config, type):
-        return _declared_in_class(config, _registered_options(config()))
+        # Users may extend the registries of a configuration.
+        defaults = config()
+        registered_options = tuple(
+            (entry, type(options))
+            for each in fields(defaults)
+            if _REGISTERED in each.metadata
+            for entry, options in getattr(defaults, each.name).items()
+        )
+        return _declared_in_class(config, registered_options)
     return tuple(
         replace(declaration, name=name, default=value)
         for name, declaration, value in _parameters_with_values(config)
-    )
-
-
-def _registered_options(config: Any) -> tuple[tuple[str, type[Any]], ...]:
-    """Return names and option classes of a configuration's registries, which users may extend."""
-    return tuple(
-        (entry, type(options))
-        for each in fields(config)
-        if _REGISTERED in each.metadata
-        for entry, options in getattr(config, each.name).items()
     )
 
 

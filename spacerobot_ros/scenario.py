@@ -107,12 +107,22 @@ class Scenario:
             the parameter.
         """
         if node not in self._configs:
-            self._configs[node] = self._make_config(node)
-        return self._following_plant(node, self._configs[node])
-
-    def _following_plant(self, node: str, config: Any) -> Any:
-        """Return a configuration with automatic values replaced by what nodes learn from others."""
-        changes: dict[str, Any] = {}
+            known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
+            values = self._parameters_as_written(node)
+            for name, value in values.items():
+                if name not in known and not is_of_every_node(name):
+                    raise ParameterError(
+                        f"Node '{node}' has no parameter '{name}'.{suggestion(name, known)}"
+                    )
+                if isinstance(value, str) and name in known:
+                    is_number = isinstance(known[name].default, (int, float))
+                    values[name] = number_in(value) if is_number else value
+            try:
+                self._configs[node] = configured(CONFIGS[node], values)
+            except ParameterError as error:
+                raise ParameterError(f"Node '{node}': {error}") from error
+        # Automatic values are replaced by what nodes learn from others.
+        config, changes = self._configs[node], dict[str, Any]()
         if node == "plant" and config.actuation == "auto":
             efforts = "coordinated_control" in self.commanders
             return config.decided("effort" if efforts else "")
@@ -123,22 +133,6 @@ class Scenario:
         if node in COMMANDERS and not config.position_tolerance:
             changes["position_tolerance"] = self._automatic_tolerance(config)
         return replace(config, **changes) if changes else config
-
-    def _make_config(self, node: str) -> Any:
-        known = {parameter.name: parameter for parameter in declared(CONFIGS[node])}
-        values = self._parameters_as_written(node)
-        for name, value in values.items():
-            if name not in known and not is_of_every_node(name):
-                raise ParameterError(
-                    f"Node '{node}' has no parameter '{name}'.{suggestion(name, known)}"
-                )
-            if isinstance(value, str) and name in known:
-                is_number = isinstance(known[name].default, (int, float))
-                values[name] = number_in(value) if is_number else value
-        try:
-            return configured(CONFIGS[node], values)
-        except ParameterError as error:
-            raise ParameterError(f"Node '{node}': {error}") from error
 
     def _automatic_tolerance(self, config: Any) -> float:
         """Return the automatic position tolerance for a commander's robot, m."""

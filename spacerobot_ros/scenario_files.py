@@ -92,8 +92,9 @@ KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
 # -- parameters by node and settings ------------------------------------------------------------
 
 
-def read_sections(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters in a parameter file, by node and full name.
+def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any] | None]:
+    """Return the parameters in a scenario file, by node and full name, and the values in its
+    section ``scenario``; None: there is no such section, but the plant has a robot.
 
     A section applies to a node in any namespace (``/**/plant``), in one namespace
     (``/robot_1/plant``), in no namespace (``plant``), or to all nodes (``/**``). If two sections
@@ -103,25 +104,28 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     Raises
     ------
     ParameterError
-        The file cannot be read, or a section has no ``ros__parameters`` that contains parameters.
+        The file cannot be read; a section has no ``ros__parameters`` that contains parameters; or
+        the section ``scenario`` is missing or has an unknown key.
     """
-    return _sections(_read_content(path), path)
-
-
-def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any] | None]:
-    """Return the parameters in a scenario file, as in :func:`read_sections`, and the values in its
-    section ``scenario``; None: there is no such section, but the plant has a robot.
-
-    Raises
-    ------
-    ParameterError
-        See :func:`read_sections`; or the section is missing or has an unknown key.
-    """
-    content = _read_content(path)
-    in_file, values = _sections(content, path), _scenario_values(content)
-    plant = in_file.get("plant", {})
+    try:
+        content = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ParameterError(
+            f"The scenario file {path} cannot be read: {reason(error)}."
+        ) from error
+    content = content if isinstance(content, dict) else {}
+    in_file = _parameters_by_node(content, path)
+    # Files next to the scenario file get their full paths.
+    for parameters in in_file.values():
+        for name in ("robot", "world", "target.robot", "srdf", "thrusters"):
+            file = parameters.get(name, "")
+            named = isinstance(file, str) and (is_path(file) or name in ("srdf", "thrusters"))
+            if named and (path.parent / file).is_file():
+                parameters[name] = str((path.parent / file).resolve())
+    plant, section = in_file.get("plant", {}), content.get("scenario")
     if "scenario" not in content and (plant.get("robot") or plant.get("robot_description")):
         return in_file, None
+    values = section.get("ros__parameters") if isinstance(section, dict) else None
     if not isinstance(values, dict):
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
@@ -132,33 +136,16 @@ def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any]
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
             f"the keys are {', '.join(_SCENARIO_KEYS)}."
         )
+    if (world := values.get("world")) is not None:
+        file = (path.parent / str(world)).resolve()
+        try:
+            load_world(file)
+        except RobotDescriptionError as error:
+            message = f"The world in the scenario file {path} is invalid: {error}"
+            raise ParameterError(message) from None
+        for node in in_file.keys() & {"plant", "planner"}:
+            in_file[node] = {"world": str(file), **in_file[node]}
     return in_file, values
-
-
-def _sections(content: Mapping[Any, Any], path: Path) -> dict[str, dict[str, Any]]:
-    in_file = {
-        node: _with_files_beside(path, parameters)
-        for node, parameters in _parameters_by_node(content, path).items()
-    }
-    values = _scenario_values(content)
-    world = values.get("world") if isinstance(values, dict) else None
-    return in_file if world is None else _with_world(in_file, str(world), path)
-
-
-def _scenario_values(content: Mapping[Any, Any]) -> Any:
-    section = content.get("scenario")
-    return section.get("ros__parameters") if isinstance(section, dict) else None
-
-
-def _read_content(path: Path) -> dict[Any, Any]:
-    """Return the content of a parameter file; empty if the file is not a mapping."""
-    try:
-        content = load_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ParameterError(
-            f"The scenario file {path} cannot be read: {reason(error)}."
-        ) from error
-    return content if isinstance(content, dict) else {}
 
 
 def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
@@ -220,34 +207,6 @@ def _flatten_section(section: Mapping[str, Any], prefix: str = "") -> dict[str, 
         else:
             flat[f"{prefix}{key}"] = value
     return flat
-
-
-def _with_files_beside(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a scenario file, with full paths for files next to it."""
-    beside = {
-        name: str((path.parent / file).resolve())
-        for name in ("robot", "world", "target.robot", "srdf", "thrusters")
-        if isinstance(file := values.get(name), str)
-        and (is_path(file) or name in ("srdf", "thrusters"))
-        and (path.parent / file).is_file()
-    }
-    return {**values, **beside}
-
-
-def _with_world(
-    in_file: dict[str, dict[str, Any]], world: str, path: Path
-) -> dict[str, dict[str, Any]]:
-    """Return a scenario file's parameters, with its obstacles for the plant and the planner."""
-    try:
-        file = (path.parent / world).resolve()
-        load_world(file)
-    except RobotDescriptionError as error:
-        raise ParameterError(f"The world in the scenario file {path} is invalid: {error}") from None
-    return in_file | {
-        node: {"world": str(file), **in_file[node]}
-        for node in ("plant", "planner")
-        if node in in_file
-    }
 
 
 # -- goals, published figures and kills ---------------------------------------------------------
@@ -320,17 +279,16 @@ def parse_kills(lines: object, where: str) -> tuple[Kill, ...]:
         raise ParameterError(
             f"'kills' in {where} is {lines!r}, not a list of lines NODE at SECONDS."
         )
-    return tuple(sorted((_parse_kill(line, where) for line in lines), key=lambda k: k.at))
-
-
-def _parse_kill(line: object, where: str) -> Kill:
-    refusal = line_refusal(str(line), f"kill in {where}")
-    node, *words = str(line).split() or [""]
-    if node not in ("plant", *COMMANDERS):
-        raise refusal(f"its node is one of {', '.join(('plant', *COMMANDERS))}")
-    if words[:1] != ["at"]:
-        raise refusal("it must be NODE at SECONDS [until SECONDS]")
-    return Kill(node, *parse_times(words, node, 0.0, refusal))
+    kills = []
+    for line in map(str, lines):
+        refusal = line_refusal(line, f"kill in {where}")
+        node, *words = line.split() or [""]
+        if node not in ("plant", *COMMANDERS):
+            raise refusal(f"its node is one of {', '.join(('plant', *COMMANDERS))}")
+        if words[:1] != ["at"]:
+            raise refusal("it must be NODE at SECONDS [until SECONDS]")
+        kills.append(Kill(node, *parse_times(words, node, 0.0, refusal)))
+    return tuple(sorted(kills, key=lambda kill: kill.at))
 
 
 def parse_published(rows: Any, path: Path) -> tuple[Published, ...]:

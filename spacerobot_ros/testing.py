@@ -21,7 +21,7 @@ from spacerobot_ros.nodes.common.node import endpoints_of, topics_without_all_ma
 from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.resources import suggestion
-from spacerobot_ros.scenario import COMMANDERS, NO_GOAL, Scenario, scenario_or_robot
+from spacerobot_ros.scenario import COMMANDERS, NO_GOAL, scenario_or_robot
 from spacerobot_ros.scenario_files import changed_goal
 from spacerobot_ros.session.mission_client import MissionClient
 
@@ -93,7 +93,18 @@ class Stack:
             self.executor = EventsExecutor(context=self.context)
             closing.callback(self.executor.shutdown)
             for each in nodes:
-                node = self._packaged(each, scenario) if isinstance(each, str) else self._own(each)
+                if not isinstance(each, str):
+                    node = self._own(each)
+                elif each in NODE_TYPES:
+                    given = scenario.parameters(each).items()
+                    overrides = [Parameter(key, value=value) for key, value in given]
+                    options = {"parameter_overrides": overrides, "context": self.context}
+                    node = NODE_TYPES[each](each, autostart=False, **options)
+                else:
+                    raise SpaceRobotError(
+                        f"This package has no node '{each}'.{suggestion(each, NODE_TYPES)} "
+                        f"Its nodes are {', '.join(NODE_TYPES)}."
+                    )
                 closing.callback(node.destroy_node)
                 if node.get_name() in self.nodes:
                     raise SpaceRobotError(
@@ -104,17 +115,6 @@ class Stack:
             for node in self._flight_nodes:
                 node.require_transition(node.trigger_configure)
             self.close = closing.pop_all().close
-
-    def _packaged(self, name: str, scenario: Scenario) -> Node:
-        if name not in NODE_TYPES:
-            raise SpaceRobotError(
-                f"This package has no node '{name}'.{suggestion(name, NODE_TYPES)} "
-                f"Its nodes are {', '.join(NODE_TYPES)}."
-            )
-        own = scenario.parameters(name)
-        given = [Parameter(key, value=value) for key, value in own.items()]
-        options = {"parameter_overrides": given, "context": self.context}
-        return NODE_TYPES[name](name, autostart=False, **options)
 
     def _own(self, make: Callable[[rclpy.Context], Node]) -> Node:
         node = make(self.context)
@@ -168,6 +168,17 @@ class Stack:
         )
         self.executor.add_node(client.node)
         everyone = [*self.nodes.values(), client.node]
+
+        def launch() -> None:
+            """Send the goal, once; nodes that are not active are activated, the plant after it."""
+            asleep = [node for node in self._flight_nodes if not node.is_active]
+            for node in sorted(asleep, key=lambda node: node.get_name() == "plant"):
+                if node.get_name() == "plant":
+                    client.send(goal)
+                node.require_transition(node.trigger_activate)
+            if client.goal_id is None:
+                client.send(goal)
+
         try:
             self.spin_until(
                 lambda: (
@@ -178,10 +189,10 @@ class Stack:
             )
             # Messages published by one callback are delivered in order: the goal comes first.
             clock = Clock(clock_type=ClockType.STEADY_TIME)
-            timer = client.node.create_timer(1e-3, lambda: self._launch(client, goal), clock=clock)
+            timer = client.node.create_timer(1e-3, launch, clock=clock)
             self.spin_until(lambda: client.goal_id is not None)
             client.node.destroy_timer(timer)
-            self._spin_until(
+            self.spin_until(
                 lambda: client.outcome is not None,
                 lambda: (
                     "The goal has no outcome: "
@@ -193,22 +204,13 @@ class Stack:
             self.executor.remove_node(client.node)
             client.node.destroy_node()
 
-    def _launch(self, client: MissionClient, goal: Goal) -> None:
-        """Send a goal, once; nodes that are not active are activated, the plant after the goal."""
-        asleep = [node for node in self._flight_nodes if not node.is_active]
-        for node in sorted(asleep, key=lambda node: node.get_name() == "plant"):
-            if node.get_name() == "plant":
-                client.send(goal)
-            node.require_transition(node.trigger_activate)
-        if client.goal_id is None:
-            client.send(goal)
+    def spin_until(
+        self, condition: Callable[[], bool], pending: Callable[[], str] = lambda: ""
+    ) -> None:
+        """Spin until a condition is true; raises SpaceRobotError on failure or timeout.
 
-    def spin_until(self, condition: Callable[[], bool]) -> None:
-        """Spin until a condition is true; raises SpaceRobotError on failure or timeout."""
-        self._spin_until(condition, lambda: "")
-
-    def _spin_until(self, condition: Callable[[], bool], pending: Callable[[], str]) -> None:
-        """Spin; ``pending`` returns the first sentence of the error after a timeout."""
+        ``pending`` returns the first sentence of the error after a timeout.
+        """
         end = time.monotonic() + self._timeout
         while not condition():
             for node in self._flight_nodes:

@@ -99,9 +99,7 @@ def test_a_whole_file_is_of_this_user_alone(tmp_path: Path) -> None:
         write_whole(tmp_path / "none" / "a", b"")
 
 
-def test_a_new_file_has_a_mode_and_a_bag_is_not_replaced(tmp_path: Path) -> None:
-    write_output(tmp_path / "b", b"b", mode=0o600)
-    assert stat.S_IMODE((tmp_path / "b").stat().st_mode) == 0o600
+def test_a_bag_is_not_replaced(tmp_path: Path) -> None:
     bag = tmp_path / "c.mcap"
     bag.write_bytes(b"\x89MCAP and more")
     with pytest.raises(SpaceRobotError) as refused:

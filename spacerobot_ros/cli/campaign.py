@@ -126,7 +126,24 @@ def fly(
     if (file is None) == (compare is None):
         raise ParameterError("Give one campaign FILE, or two after --compare, not both.")
     if compare is not None:
-        _compare(compare, flights, out, report, how)
+        from spacerobot_ros.campaign.config import load_campaign
+        from spacerobot_ros.campaign.report import require_same_draws, write_comparison
+
+        require_same_draws(*(load_campaign(each, flights) for each in compare))
+        names = [each.stem for each in compare]
+        if names[0] == names[1]:  # The default folders of two campaigns must differ.
+            names = [f"{name}_{letter}" for name, letter in zip(names, "AB", strict=True)]
+        base = out or Path("out") / "_".join(names)
+        flown = []
+        for each, name in zip(compare, names, strict=True):
+            flown.append(_fly_campaign(each, flights, base / name, how, name))
+            exit_if_terminated()
+        path = report or base / "report.html"
+        (first, first_end), (second, second_end) = flown
+        for line in write_comparison((first, second), path):
+            say(line)
+        say(f"report      {path}")
+        _require_flights(first_end, second_end)
         return
     assert file is not None
     folder, progress = _fly_campaign(file, flights, out, how)
@@ -219,30 +236,3 @@ def _write_report(folder: Path, report: Path | None) -> None:
     for line in write_campaign_report(folder, path):
         say(line)
     say(f"report      {path}")
-
-
-def _compare(
-    files: tuple[Path, Path],
-    flights: int | None,
-    out: Path | None,
-    report: Path | None,
-    how: dict[str, Any],
-) -> None:
-    from spacerobot_ros.campaign.config import load_campaign
-    from spacerobot_ros.campaign.report import require_same_draws, write_comparison
-
-    require_same_draws(*(load_campaign(file, flights) for file in files))
-    names = [file.stem for file in files]
-    if names[0] == names[1]:  # The default folders of two campaigns must differ.
-        names = [f"{name}_{letter}" for name, letter in zip(names, "AB", strict=True)]
-    base = out or Path("out") / "_".join(names)
-    flown = []
-    for file, name in zip(files, names, strict=True):
-        flown.append(_fly_campaign(file, flights, base / name, how, name))
-        exit_if_terminated()
-    path = report or base / "report.html"
-    (first, first_end), (second, second_end) = flown
-    for line in write_comparison((first, second), path):
-        say(line)
-    say(f"report      {path}")
-    _require_flights(first_end, second_end)

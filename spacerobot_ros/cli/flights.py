@@ -99,7 +99,15 @@ def run_command(
     the flight early: the bag and the summary cover the flight up to that time, and the exit code is
     128 plus the signal number (130 after Ctrl-C).
     """
-    chosen = _changed_scenario(scenario, goal, method, settings, realtime)
+    from spacerobot_ros.scenario import scenario_or_robot
+
+    chosen = goal(scenario_or_robot(scenario))
+    if method is not None:
+        chosen = chosen.with_method(method)
+    if realtime is not None:
+        chosen = chosen.in_real_time(realtime)
+    chosen = chosen.with_settings(settings)
+    chosen.require_goal()
     from spacerobot_ros.bag import free_name
     from spacerobot_ros.session.run import run_scenario
 
@@ -149,25 +157,6 @@ def _write_report(bag: Path, html: Path) -> None:
     say(f"report      {html}")
 
 
-def _changed_scenario(
-    name: str,
-    goal: GoalOptions,
-    method: str | None,
-    settings: tuple[str, ...],
-    realtime: float | None,
-) -> Scenario:
-    from spacerobot_ros.scenario import scenario_or_robot
-
-    scenario = goal(scenario_or_robot(name))
-    if method is not None:
-        scenario = scenario.with_method(method)
-    if realtime is not None:
-        scenario = scenario.in_real_time(realtime)
-    scenario = scenario.with_settings(settings)
-    scenario.require_goal()
-    return scenario
-
-
 def _summary_lines(summary: dict[str, Any]) -> list[str]:
     position, attitude = summary["position_error_m"], summary["attitude_error_rad"]
     beside = turned = ""
@@ -177,6 +166,11 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
             f", {quantity(attitude, 'rad')} = {math.degrees(attitude):.3f} deg from the goal"
             f"{_judged(summary, 'attitude', 'rad')}"
         )
+    used, expected = summary.get("propellant_kg"), summary.get("planned_propellant_kg")
+    of_plan = "" if expected is None else f" (planned {max(0.0, 1e3 * expected):.1f} g)"
+    # The angles of wheels are meaningless.
+    joints = zip(summary["joint_names"], summary["final_joint_positions"], strict=True)
+    shape = [position for name, position in joints if name not in summary["wheel_names"]]
     drift = "not explained by thrusters:" if summary["has_thrust"] else "changed by"
     took, factor = summary["plan_time_s"], summary["real_time_factor"]
     # A controller in a separate process does not report its planning time.
@@ -187,14 +181,14 @@ def _summary_lines(summary: dict[str, Any]) -> list[str]:
         f"position    ({numbers(summary['final_position_m'])}) m{beside}",
         f"attitude    ({numbers(summary['final_attitude_rotvec_rad'])}) rad{turned}",
         *_end_effector_line(summary),
-        *([f"shape       ({numbers(shape)})"] if (shape := _shape(summary)) else []),
+        *([f"shape       ({numbers(shape)})"] if shape else []),
         f"manoeuvre   {summary['manoeuvre_time_s']:.6g} s, "
         f"{counted(summary['corrections'], 'correction')}{planned}",
         f"flight      {summary['ticks']} ticks in {summary['wall_time_s']:.2f} s: "
         f"{summary['ticks_per_s']:.0f} ticks/s, {pace} times real time",
         f"momentum    {drift} {quantity(summary['linear_momentum_drift'], 'kg m/s')} and "
         f"{quantity(summary['angular_momentum_drift'], 'kg m^2/s')}",
-        *_propellant_line(summary),
+        *([] if used is None else [f"propellant  {1e3 * used:.1f} g{of_plan}"]),
         *_capture_line(summary),
         *_clearance_line(summary),
         f"bag         {summary['bag']} ({summary['messages_recorded']} messages)",
@@ -211,12 +205,6 @@ def _fault_lines(scenario: Scenario, summary: dict[str, Any]) -> list[str]:
         line = f"detected    by {found['node']} at {found['time_s']:.6g} s: {found['message']}"
         lines.append(line)
     return [*lines, *(f"disturbance {with_seconds(each)}" for each in plant.disturbances)]
-
-
-def _shape(summary: dict[str, Any]) -> list[float]:
-    """Return the final joint positions, except those of wheels, whose angles are meaningless."""
-    joints = zip(summary["joint_names"], summary["final_joint_positions"], strict=True)
-    return [position for name, position in joints if name not in summary["wheel_names"]]
 
 
 def _judged(summary: dict[str, Any], part: str, unit: str) -> str:
@@ -250,12 +238,6 @@ def _end_effector_errors(summary: dict[str, Any], distance: float, angle: float 
         error += f" and {quantity(angle, 'rad')}"
         limits += f", {quantity(summary['attitude_tolerance_rad'], 'rad')}" if limits else ""
     return f"{error} from its goal" + (limits and f" (tolerance {limits})")
-
-
-def _propellant_line(summary: dict[str, Any]) -> list[str]:
-    used, planned = summary.get("propellant_kg"), summary.get("planned_propellant_kg")
-    beside = "" if planned is None else f" (planned {max(0.0, 1e3 * planned):.1f} g)"
-    return [] if used is None else [f"propellant  {1e3 * used:.1f} g{beside}"]
 
 
 def _capture_line(summary: dict[str, Any]) -> list[str]:
@@ -422,7 +404,7 @@ def goal_command(
         # NaN: the base keeps its position or attitude.
         position, quaternion = pose[:3] or [math.nan] * 3, pose[3:] or [math.nan] * 4
         if rotvec:
-            warn_of_large_angles(rotvec, "--goal-rpy-deg")
+            warn_of_large_angles(rotvec)
             quaternion = Goal.from_rotvec([0, 0, 0], rotvec).quaternion.tolist()
         if rpy_deg:
             quaternion = Goal.from_rpy([0, 0, 0], rpy_deg).quaternion.tolist()

@@ -226,31 +226,6 @@ GoalOptions = Callable[["Scenario"], "Scenario"]
 """Changes the goal of a scenario to that of the :func:`goal_options`."""
 
 
-def with_goal(
-    scenario: Scenario,
-    pose: Sequence[float] | None,
-    rotvec: Sequence[float] | None,
-    rpy_deg: Sequence[float] | None,
-    end_effectors: Sequence[EndEffectorGoal] = (),
-) -> Scenario:
-    """Return a scenario with a goal from options; warn about a rotation that looks like degrees.
-
-    Parameters
-    ----------
-    scenario
-        The scenario whose goal is replaced.
-    pose
-        (7,) position (m) and quaternion, or (3,) position, if given.
-    rotvec, rpy_deg
-        (3,) attitude in radians or in degrees, if given.
-    end_effectors
-        Goals of end-effectors.
-    """
-    if rotvec is not None:
-        warn_of_large_angles(rotvec, "--goal-rpy-deg")
-    return scenario.with_goal(pose, rotvec, rpy_deg, end_effectors=end_effectors)
-
-
 def end_effector_goals(
     poses: Sequence[tuple[float, ...]] = (),
     positions: Sequence[tuple[float, ...]] = (),
@@ -308,12 +283,17 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
     def with_options(*words: Any, goal: Any, position: Any, **options: Any) -> None:
         if goal is not None and position is not None:
             raise click.UsageError("The goal is given twice, as a pose and as a position.")
-        rotvec, rpy_deg, *hands = (
+        rotvec, rpy_deg, *given = (
             options.pop(name)
             for name in ("rotvec", "rpy_deg", "poses", "positions", "links", "paths")
         )
-        goals = goal or position, rotvec, rpy_deg, end_effector_goals(*hands)
-        command(*words, goal=lambda scenario: with_goal(scenario, *goals), **options)
+        hands = end_effector_goals(*given)
+
+        def changed(scenario: Scenario) -> Scenario:
+            warn_of_large_angles(rotvec or ())
+            return scenario.with_goal(goal or position, rotvec, rpy_deg, end_effectors=hands)
+
+        command(*words, goal=changed, **options)
 
     with_poses = _position_option(_pose_option(_attitude_options("goal-")(with_options)))
     return end_effector_options(cast("Callable[..., None]", with_poses))
@@ -363,25 +343,19 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def warn_of_large_angles(rotvec: Sequence[float], option_in_degrees: str) -> None:
+def warn_of_large_angles(rotvec: Sequence[float]) -> None:
     """Warn about a rotation of more than one revolution, which may be in degrees."""
     angle = math.hypot(*rotvec)
     if 2 * math.pi < angle < math.inf:
         say(
             f"The goal rotates by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} "
-            f"revolutions: only the final attitude matters. For degrees, use {option_in_degrees}.",
+            "revolutions: only the final attitude matters. For degrees, use --goal-rpy-deg.",
             err=True,
         )
 
 
 class RegisteredName(_Choice):
-    """A choice of names from registries, which are imported on demand.
-
-    Parameters
-    ----------
-    registries
-        Mappings as ``module:attribute``.
-    """
+    """A choice of names from registries (``module:attribute``), which are imported on demand."""
 
     def __init__(self, *registries: str) -> None:
         super().__init__(())
@@ -426,10 +400,10 @@ def viewer_if_requested(
 
     Otherwise ``settings``, from ``--set``, must not contain viewer parameters.
     """
-    for text in () if view else settings:
-        if text.startswith("viewer."):
-            raise click.UsageError(f"'{text}' is a web page setting: add --view.")
     if not view:
+        for text in settings:
+            if text.startswith("viewer."):
+                raise click.UsageError(f"'{text}' is a web page setting: add --view.")
         yield None
         return
     from spacerobot_ros.session.viewing import viewing

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,6 @@ from spacerobot_ros.files import write_output
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
-    from spacerobot_ros.planning import Goal
 
 
 @click.command("plan", cls=GoalCommand)
@@ -171,7 +170,16 @@ def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]
     """Return the content for the ``--json`` file."""
     from spacerobot_ros.model.rotations import rotvec_from_quaternion
 
-    goal, path = problem.goal, trial.path
+    goal, path, hands = problem.goal, trial.path, {}
+    if goal.end_effectors:
+        hands["end_effectors"] = {
+            each.link: {
+                "goal": list(each.values),
+                "position_error_m": error.distance,
+                "attitude_error_rad": error.angle,
+            }
+            for each, error in zip(goal.end_effectors, trial.error.end_effectors, strict=True)
+        }
     return {
         "scenario": problem.name,
         "method": trial.method,
@@ -184,7 +192,7 @@ def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]
         "final_joint_positions": trial.positions[-1].tolist(),
         "position_error_m": trial.error.distance if "position" in goal.base else None,
         "attitude_error_rad": trial.error.angle if "attitude" in goal.base else None,
-        **_end_effectors_of(problem.goal, trial),
+        **hands,
         "notes": trial.pieces[-1].notes,
         "schedule": {
             "tick_period_s": problem.control_period,
@@ -196,21 +204,6 @@ def plan_json(problem: PlanningProblem, trial: PlanEvaluation) -> dict[str, Any]
             "position_m": path.position.tolist(),
             "quaternion": path.quaternion.tolist(),
         },
-    }
-
-
-def _end_effectors_of(goal: Goal, trial: PlanEvaluation) -> dict[str, Any]:
-    if not goal.end_effectors:
-        return {}
-    return {
-        "end_effectors": {
-            each.link: {
-                "goal": list(each.values),
-                "position_error_m": error.distance,
-                "attitude_error_rad": error.angle,
-            }
-            for each, error in zip(goal.end_effectors, trial.error.end_effectors, strict=True)
-        }
     }
 
 
@@ -235,6 +228,8 @@ def comparison_lines(plans: Mapping[str, PlanEvaluation | SpaceRobotError]) -> I
 def _plan_random_goals(
     problem: PlanningProblem, methods: list[str], count: int, within: tuple[float, float]
 ) -> None:
+    import numpy as np
+
     from spacerobot_ros.flight.trials import PlanEvaluation, random_goals, try_goals
 
     goals = random_goals(problem, count, within[0], math.radians(within[1]))
@@ -249,22 +244,16 @@ def _plan_random_goals(
         f"{'median':>10}{'longest':>10}{'planned in':>11}{'at most':>9}"
     )
     for name, trials in flown.items():
-        say(_row_of_method(name, len(results[name]), trials))
+        reached, goals_tried = sum(each.reached for each in trials), len(results[name])
+        missed, refused = len(trials) - reached, goals_tried - len(trials)
+        row = f"{name:<14}{goals_tried:>7}{reached:>7}{missed:>8}{refused:>9}"
+        if trials:
+            low, middle, high = np.quantile([each.duration for each in trials], [0.0, 0.5, 1.0])
+            planned, longest = np.quantile([each.plan_time for each in trials], [0.5, 1.0])
+            row += f"{low:>10.4g}{middle:>10.4g}{high:>10.4g}{planned:>11.3g}{longest:>9.3g}"
+        say(row)
     for name, found in results.items():
         for reason in dict.fromkeys(str(each) for each in found if isinstance(each, Exception)):
             say(f"{name} refused: {reason}")
     if not all(each.reached for each in flown[methods[0]]):
         fail()
-
-
-def _row_of_method(name: str, goals: int, trials: Sequence[PlanEvaluation]) -> str:
-    import numpy as np
-
-    reached = sum(each.reached for each in trials)
-    missed, refused = len(trials) - reached, goals - len(trials)
-    counts = f"{name:<14}{goals:>7}{reached:>7}{missed:>8}{refused:>9}"
-    if not trials:
-        return counts
-    low, middle, high = np.quantile([each.duration for each in trials], [0.0, 0.5, 1.0])
-    planned, longest = np.quantile([each.plan_time for each in trials], [0.5, 1.0])
-    return f"{counts}{low:>10.4g}{middle:>10.4g}{high:>10.4g}{planned:>11.3g}{longest:>9.3g}"

@@ -74,7 +74,12 @@ def analyze_command(
     from spacerobot_ros.resources import robot_file
 
     model = SpaceRobot.from_file(robot_file(robot))
-    found = analyze(model, None if shape is None else _parse_shape(shape), end_effector)
+    try:
+        numbers = None if shape is None else [float(x) for x in shape.replace(",", " ").split()]
+    except ValueError:
+        message = f"--shape is '{shape}'; it must have one number per joint."
+        raise ParameterError(message) from None
+    found = analyze(model, numbers, end_effector)
     for line in (*analysis_lines(found), *_notes(model), "", *workspace_lines(found)):
         say(line)
     if json_file is not None:
@@ -98,15 +103,9 @@ def analyze_command(
         say(f"{'':<13}{of_workspaces}")
 
 
-def _parse_shape(text: str) -> list[float]:
-    try:
-        return [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        raise ParameterError(f"--shape is '{text}'; it must have one number per joint.") from None
-
-
 def analysis_lines(found: Analysis) -> list[str]:
     """Return the findings as lines that fit the screen."""
+    from spacerobot_ros.planning.core.controllability import sliders_of
     from spacerobot_ros.planning.methods.registry import METHODS
 
     robot = found.robot
@@ -117,7 +116,11 @@ def analysis_lines(found: Analysis) -> list[str]:
         "base"
     ]
     lines += [*_joint_rows(robot), "", *_rotation_lines(found)]
-    lines += [f"{'position':<13}{_position_text(found)}", ""]
+    position = "follows from attitude and shape: the centre of mass is at rest"
+    if found.sliding.controllable:
+        count = len(sliders_of(robot))
+        position = f"{count} sliders with independent slots control the base position (paper 1)"
+    lines += [f"{'position':<13}{position}", ""]
     for method, objection in found.objections.items():
         suits = "yes" if METHODS[method].plans_for_base else "yes, for end-effectors"
         lines.append(f"{method:<15}{'no: ' + objection if objection else suits}")
@@ -276,15 +279,6 @@ def _rotation_lines(found: Analysis) -> list[str]:
             f"condition {min(finite):.3g} at best, {median(finite):.3g} in the median"
         )
     return lines
-
-
-def _position_text(found: Analysis) -> str:
-    from spacerobot_ros.planning.core.controllability import sliders_of
-
-    count = len(sliders_of(found.robot))
-    if found.sliding.controllable:
-        return f"{count} sliders with independent slots control the base position (paper 1)"
-    return "follows from attitude and shape: the centre of mass is at rest"
 
 
 def _finding_json(found: Controllability) -> dict[str, Any]:

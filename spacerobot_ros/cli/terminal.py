@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from enum import IntEnum
 from typing import TYPE_CHECKING, NoReturn
 
 import click
@@ -23,26 +22,14 @@ if TYPE_CHECKING:
     from spacerobot_ros.planning.core.progress import SearchProgress
 
 
-class ExitCode(IntEnum):
-    """Exit codes of the command line."""
+_NOT_REACHED = 1
+"""Exit code: the goal was not reached or is unreachable, or the bag differs from its
+re-simulation. It is 0 on success, and 128 plus the number of a signal that ended the command."""
 
-    DONE = 0
-    """Success: the goal was reached within tolerance, or the bag is verified."""
-
-    NOT_REACHED = 1
-    """The goal was not reached or is unreachable, or the bag differs from its re-simulation."""
-
-    BAD_INPUT = 2
-    """The input is invalid, or a required program or package is missing."""
-
-    INTERRUPTED = 130
-    """The command was ended by SIGINT (Ctrl-C); for other signals, the exit code is 128 plus the
-    signal number.
-    """
-
+_BAD_INPUT = 2
+"""Exit code: the input is invalid, or a required program or package is missing."""
 
 _ROS_MODULES = ("rclpy", "rosidl_parser", "ament_index_python")
-
 
 _LABEL = re.compile(r"\S+(?: \S+)* {2,}")
 """Words in front of a column."""
@@ -78,7 +65,7 @@ def fail(message: str = "") -> NoReturn:
     """End a failed command with a message."""
     if message:
         say(message, err=True)
-    sys.exit(ExitCode.NOT_REACHED)
+    sys.exit(_NOT_REACHED)
 
 
 def end(ending: Terminated) -> NoReturn:
@@ -116,12 +103,12 @@ def sentences() -> Iterator[None]:
     except SpaceRobotError as error:
         out_of_reach = isinstance(error, PlanningError) and not isinstance(error, GoalError)
         say(str(error), err=True)
-        sys.exit(ExitCode.NOT_REACHED if out_of_reach else ExitCode.BAD_INPUT)
+        sys.exit(_NOT_REACHED if out_of_reach else _BAD_INPUT)
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise
         say("Standard output cannot be written: no space is left on its device.", err=True)
-        sys.exit(ExitCode.BAD_INPUT)
+        sys.exit(_BAD_INPUT)
     except ImportError as error:
         if not error.name or error.name.split(".")[0] not in _ROS_MODULES:
             raise
@@ -130,7 +117,7 @@ def sentences() -> Iterator[None]:
             "with its extra [jazzy].",
             err=True,
         )
-        sys.exit(ExitCode.BAD_INPUT)
+        sys.exit(_BAD_INPUT)
 
 
 _PERIOD, _PERIOD_WITHOUT_TERMINAL = 1.0, 10.0

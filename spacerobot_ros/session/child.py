@@ -23,7 +23,6 @@ from spacerobot_ros.termination import Terminated, guarded, start_child
 from spacerobot_ros.topics import GLOBAL_TOPICS
 
 _RESTART_PERIOD = 60.0  # wall s, over which restarts are counted
-_CHILD_MODULE = "spacerobot_ros.session.child"
 
 _NO_ERROR_TEXT = (
     "it wrote no error. If another stack is running in this ROS domain, the nodes of that stack "
@@ -105,7 +104,7 @@ class NodeProcess:
         if self._namespace:
             moved = [word for topic in GLOBAL_TOPICS for word in ("-r", f"{topic}:={topic[1:]}")]
             ros += ["-r", f"__ns:={self._namespace}", *moved]
-        words = ["-m", _CHILD_MODULE, self._module, *ros]
+        words = ["-m", __name__, self._module, *ros]
         words += ["--params-file", str(self._parameter_file), *arguments]
         with self._log_file.open("wb") as log:
             self.child = start_child(words, environment, stdout=stdout or log, stderr=log)

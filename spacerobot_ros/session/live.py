@@ -81,28 +81,22 @@ def fly_by_nodes(
         stack.spin(look)
         wall_time = time.perf_counter() - began
         stack.finish()
-        return _summary(stack, wall_time)
-
-
-def _summary(stack: MultiProcessStack, wall_time: float) -> dict[str, Any]:
-    scenario, client = stack.scenario, stack.client
-    assert stack.bag is not None
-    bag = open_flight_bag(stack.bag)
-    flight = read_flown(bag, scenario)
-    outcome, message = client.outcome or Outcome.INTERRUPTED, client.message
-    if outcome is Outcome.INTERRUPTED:
-        message = f"Interrupted after {flight.duration:.6g} s of simulated time."
-    flight = replace(
-        flight,
-        outcome=outcome,
-        message=message,
-        status=client.status,
-        gait=client.gait,
-        plan_time=stack.statistics.plan_time_s,
-        wall_time=wall_time,
-    )
-    recorded = {"messages_recorded": bag.message_count, "bag": str(bag.path)}
-    return {**flight.summary(), **recorded}
+        client, opened = stack.client, open_flight_bag(stack.bag or bag)
+        flight = read_flown(opened, scenario)
+        outcome, message = client.outcome or Outcome.INTERRUPTED, client.message
+        if outcome is Outcome.INTERRUPTED:
+            message = f"Interrupted after {flight.duration:.6g} s of simulated time."
+        flight = replace(
+            flight,
+            outcome=outcome,
+            message=message,
+            status=client.status,
+            gait=client.gait,
+            plan_time=stack.statistics.plan_time_s,
+            wall_time=wall_time,
+        )
+        recorded = {"messages_recorded": opened.message_count, "bag": str(opened.path)}
+        return {**flight.summary(), **recorded}
 
 
 _LONGEST_DISCOVERY = 10.0  # wall s
@@ -117,7 +111,6 @@ _LONGEST_RECORDER_WAIT = 1.0
 """Wall time, s, to wait until recorders have subscribed to the goal topics."""
 
 _CHECK_PERIOD = 0.1
-
 
 _NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)( or [mµ]?rad)?\b")
 """A continually changing quantity in a status message."""

@@ -73,7 +73,8 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
         for kind, remark in _joint_remarks(joint, is_wheel=joint.name in robot.wheel_names):
             found.setdefault(kind, []).append(remark)
     for _, remarks in sorted(found.items()):
-        yield remarks[0] + _other_joints_clause(len(remarks) - 1)
+        others = counted(len(remarks) - 1, "other joint")
+        yield remarks[0] + (f" The same applies to {others}." if remarks[1:] else "")
     for link in robot.links:
         # A body with such an inertia is refused; a welded link is not.
         if flaw := describe_inertia_flaw(link.inertia.about_com):
@@ -81,13 +82,26 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
                 f"The inertia of link '{link.name}' {flaw} The links welded to it compensate for "
                 "this."
             )
-    yield from _visual_remarks(robot)
-
-
-def _other_joints_clause(count: int) -> str:
-    if not count:
-        return ""
-    return f" The same applies to {counted(count, 'other joint')}."
+    meshes = {
+        shape.resource: None
+        for link in robot.links
+        for shape in link.shapes
+        if shape.kind == "mesh"
+    }
+    missing = [each for each in meshes if mesh_file(each) is None]
+    if missing:
+        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+        yield (
+            f"The mesh '{missing[0]}' was not found{more}: give a path relative to the URDF, or "
+            "source the workspace of its package. Only pictures need it."
+        )
+    if not any(link.shapes for link in robot.links):
+        yield "No link has a <visual>: the robot is drawn as lines between its joints."
+    if not robot.end_effector():
+        yield (
+            "No link is named 'end_effector': for coordinated control, set the parameter "
+            "end_effector_frame."
+        )
 
 
 def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]:
@@ -122,29 +136,6 @@ def _joint_remarks(joint: Joint, *, is_wheel: bool) -> Iterator[tuple[int, str]]
             4,
             f"The joint '{joint.name}' has an effort limit of 0: it moves under velocity commands, "
             'but not under effort commands. Give <limit effort="..."/> in N or N m.',
-        )
-
-
-def _visual_remarks(robot: RobotDescription) -> Iterator[str]:
-    meshes = {
-        shape.resource: None
-        for link in robot.links
-        for shape in link.shapes
-        if shape.kind == "mesh"
-    }
-    missing = [each for each in meshes if mesh_file(each) is None]
-    if missing:
-        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
-        yield (
-            f"The mesh '{missing[0]}' was not found{more}: give a path relative to the URDF, or "
-            "source the workspace of its package. Only pictures need it."
-        )
-    if not any(link.shapes for link in robot.links):
-        yield "No link has a <visual>: the robot is drawn as lines between its joints."
-    if not robot.end_effector():
-        yield (
-            "No link is named 'end_effector': for coordinated control, set the parameter "
-            "end_effector_frame."
         )
 
 

@@ -78,7 +78,6 @@ With the default of 3 s, a lockstep plant would wait, and other nodes would lose
 _LONGEST_RECORDING_DELAY = 1.0
 """Wall time, s, in which the recorder receives the last messages from the plant."""
 
-
 _LONGEST_ANSWER_AFTER_INTERRUPT = 0.5  # wall s
 _CONNECTION_CHECK_PERIOD = 0.05  # wall s
 
@@ -139,7 +138,17 @@ class MultiProcessStack:
         show: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.namespace = checked_namespace(namespace)
-        _require_flyable(scenario)
+        goal = scenario.goal
+        if scenario.kills and scenario.lockstep:
+            raise ParameterError(
+                f"The scenario '{scenario.name}' kills nodes during the flight: fly it with "
+                "--nodes and --realtime."
+            )
+        if goal.end_effectors and goal.base not in (frozenset(), POSE):
+            raise ParameterError(
+                "End-effector goals need the whole base pose or none: give --goal, or omit the "
+                "base attitude."
+            )
         self.scenario = scenario
         self.when_exists = scenario.parameters("recorder").get("when_exists", "refuse")
         """Reaction to an existing bag with this name; the default is an error."""
@@ -157,7 +166,7 @@ class MultiProcessStack:
         self._folder = tempfile.TemporaryDirectory(prefix="spacerobot_")
         self._processes: dict[str, NodeProcess] = {}
         names: Sequence[str] | None = None
-        if scenario.goal.joint_positions is not None:
+        if goal.joint_positions is not None:
             robot = robot_of(scenario.plant)
             names = robot.joint_names if robot is not None else ()
             if robot is not None:
@@ -168,7 +177,7 @@ class MultiProcessStack:
             decider,
             scenario.config(decider).world_frame,
             lambda: self.time_ns,
-            scenario.goal,
+            goal,
             scenario.end_effector_goal,
             joint_names=names,
             namespace=self.namespace,
@@ -294,7 +303,11 @@ class MultiProcessStack:
             self._change_states(Transition.TRANSITION_DEACTIVATE, ["plant"])
         self._spin_for(0.0 if interrupted else _LONGEST_RECORDING_DELAY)
         if "planner" in present:
-            self._ask_statistics(_LONGEST_ANSWER_AFTER_INTERRUPT if interrupted else _LONGEST_START)
+            services = {"planner": self._get_statistics}
+            patience = _LONGEST_ANSWER_AFTER_INTERRUPT if interrupted else _LONGEST_START
+            with suppress(_ServiceTimeoutError):  # The statistics of a busy planner stay unknown.
+                answer = self._call_services(services, Trigger.Request(), patience)["planner"]
+                self.statistics = PlannerStatistics.from_json(answer.message)
         processes = [self._processes[name] for name in present]
         for last in (False, True):
             group = [each for each in processes if (each.name == "recorder") is last]
@@ -338,7 +351,8 @@ class MultiProcessStack:
                 raise SpaceRobotError(f"{process.end_message}{process.restart_note}")
 
     def _supervise(self) -> None:
-        """Kill and start the nodes that the scenario names for this time; the others must run."""
+        """Kill and start the nodes that the scenario names for this time, and restart commanders
+        that have died; the others must run."""
         # Without a plant there is no clock, so wall time advances the schedule.
         factor = self.scenario.plant.real_time_factor
         since = factor * (time.monotonic() - self._clock_seen)
@@ -348,10 +362,6 @@ class MultiProcessStack:
         for name in started:
             again = {"resume_bag": str(self.bag or ""), "autostart": True}
             self.launch(name, **(again if name == "plant" else {}))
-        self._restart_commanders()
-        self.require_alive()
-
-    def _restart_commanders(self) -> None:
         for name in self.scenario.commanders:
             process = self._processes[name]
             if name in self._timeline.away or not process.may_restart():
@@ -366,6 +376,7 @@ class MultiProcessStack:
                 values = event.to_values(time.time())
                 record = StatusRecord(self.client.node.get_name(), event.level, message, values)
                 self._events.publish(record.encoded())
+        self.require_alive()
 
     def _on_heartbeat(self, message: DiagnosticStatus) -> None:
         # Nodes of this stack send heartbeats once they are active, not before. A user's viewers and
@@ -409,13 +420,6 @@ class MultiProcessStack:
                 error = last_error(self._processes[name].log)
                 raise SpaceRobotError(f"The {name} refuses: {error}")
 
-    def _ask_statistics(self, patience: float) -> None:
-        """Request the planner's statistics, which stay unknown if the planner is busy."""
-        services = {"planner": self._get_statistics}
-        with suppress(_ServiceTimeoutError):
-            answer = self._call_services(services, Trigger.Request(), patience)["planner"]
-            self.statistics = PlannerStatistics.from_json(answer.message)
-
     def _call_services(
         self, services: Mapping[str, Client], request: Any, patience: float = _LONGEST_START
     ) -> dict[str, Any]:
@@ -450,20 +454,6 @@ class MultiProcessStack:
             self.executor.spin_once(timeout_sec=0.02)
 
 
-def _require_flyable(scenario: Scenario) -> None:
-    if scenario.kills and scenario.lockstep:
-        raise ParameterError(
-            f"The scenario '{scenario.name}' kills nodes during the flight: fly it with --nodes "
-            "and --realtime."
-        )
-    goal = scenario.goal
-    if goal.end_effectors and goal.base not in (frozenset(), POSE):
-        raise ParameterError(
-            "End-effector goals need the whole base pose or none: give --goal, or omit the base "
-            "attitude."
-        )
-
-
 _ACTING_ROLES = (Role.PLANT.value, Role.COMMANDER.value, Role.REPLAY.value)
 """Roles of nodes that must not share a domain with those of another stack."""
 
@@ -473,13 +463,7 @@ class _ServiceTimeoutError(SpaceRobotError):
 
 
 class KillTimeline:
-    """Schedule for killing and restarting nodes.
-
-    Parameters
-    ----------
-    kills
-        Ordered by time.
-    """
+    """Schedule for killing and restarting nodes; the kills are ordered by time."""
 
     def __init__(self, kills: Sequence[Kill]) -> None:
         self._kills, self._time = kills, -math.inf

@@ -33,14 +33,8 @@ _NICENESS = 5
 
 
 class Viewer(NodeProcess):
-    """A viewer process, restarted if it dies.
-
-    Parameters
-    ----------
-    parameters, show, namespace
-        As for :func:`viewing`.
-    folder
-        Folder for the log and the parameters of the viewer.
+    """A viewer process, restarted if it dies; its log and its parameters are in ``folder``. For
+    the other arguments, see :func:`viewing`.
     """
 
     def __init__(
@@ -67,16 +61,6 @@ class Viewer(NodeProcess):
         SpaceRobotError
             The page cannot be served.
         """
-        announcement = self._read_announcement()
-        self._announced = True
-        for line in (announcement, *self.log.strip().splitlines()):
-            self._show(line)  # The viewer warns of an address that other machines can reach.
-        # Open pages reconnect to a viewer at the same address.
-        port = urlsplit(announcement.split()[1]).port if " " in announcement else None
-        if port is not None:
-            self._parameters["port"] = port
-
-    def _read_announcement(self) -> str:
         output = self.child.stdout
         assert output is not None
         text, deadline = b"", time.monotonic() + _LONGEST_START
@@ -92,7 +76,13 @@ class Viewer(NodeProcess):
                 raise SpaceRobotError(
                     f"The viewer did not serve its page within {_LONGEST_START:g} s."
                 )
-        return text.decode(errors="replace").strip()
+        announcement, self._announced = text.decode(errors="replace").strip(), True
+        for line in (announcement, *self.log.strip().splitlines()):
+            self._show(line)  # The viewer warns of an address that other machines can reach.
+        # Open pages reconnect to a viewer at the same address.
+        port = urlsplit(announcement.split()[1]).port if " " in announcement else None
+        if port is not None:
+            self._parameters["port"] = port
 
     def supervise(self) -> None:
         """Restart the viewer if it has died and the limit allows it."""

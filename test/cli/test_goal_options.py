@@ -32,7 +32,6 @@ from spacerobot_ros.cli.options import (
     end_effector_goals,
     goal_options,
     warn_of_large_angles,
-    with_goal,
 )
 from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
@@ -59,7 +58,7 @@ def test_beside_goals_of_end_effectors_the_base_has_what_is_asked(
     pose: Any, rotvec: Any, rpy_deg: Any, base: list[str]
 ) -> None:
     hands = end_effector_goals((), (HAND,), ("link_7",))
-    goal = with_goal(load_scenario("reach"), pose, rotvec, rpy_deg, hands).goal
+    goal = load_scenario("reach").with_goal(pose, rotvec, rpy_deg, end_effectors=hands).goal
     assert ([hand.link for hand in goal.end_effectors], sorted(goal.base)) == (["link_7"], base)
     if pose is not None:
         np.testing.assert_array_equal(goal.position, pose[:3])
@@ -106,23 +105,20 @@ def test_end_effectors_with_more_or_fewer_names_are_refused(
         (
             (0.0, -30.0, 40.0),
             "The goal rotates by 50 rad, which is 7.96 revolutions: only the final attitude "
-            "matters. For degrees, use --here.\n",
+            "matters. For degrees, use --goal-rpy-deg.\n",
         ),
         (
             (6.5, 0.0, 0.0),
             "The goal rotates by 6.5 rad, which is 1.03 revolutions: only the final attitude "
-            "matters. For degrees, use --here.\n",
+            "matters. For degrees, use --goal-rpy-deg.\n",
         ),
     ],
 )
 def test_a_rotation_of_more_than_a_turn_is_noted(
     rotvec: tuple[float, float, float], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    warn_of_large_angles(rotvec, "--here")
+    warn_of_large_angles(rotvec)
     assert capsys.readouterr() == ("", said)
-    if said:
-        with_goal(load_scenario("reach"), None, rotvec, None)
-        assert capsys.readouterr().err == said.replace("--here", "--goal-rpy-deg")
 
 
 # -- how commands end -----------------------------------------------------------------------------
@@ -194,6 +190,9 @@ def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) ->
     def fly(scenario: str, goal: GoalOptions) -> None:
         found.append(goal(load_scenario(scenario)).goal)
 
+    options = ["--goal-rotvec", "0", "0", "7"]
+    assert "1.11 revolutions" in CliRunner().invoke(fly, ["sliding_masses", *options]).stderr
+    found.clear()
     result = CliRunner().invoke(fly, ["sliding_masses", "--goal", *words])
     assert result.exit_code == 0, result.output
     (goal,) = found
