@@ -9,29 +9,25 @@ from __future__ import annotations
 import os
 
 import pytest
-from support.random_actions import SETUPS, RandomFlight, random_flights
+from support.random_actions.flight import RandomFlight, random_flights
+from support.random_actions.setups import SETUPS
 from support.ros_harness import Harness
 
 SEED = int(os.environ.get("SPACEROBOT_ACTIONS_SEED", "1"))
 COUNT = int(os.environ.get("SPACEROBOT_ACTIONS", "2000"))
 
-MODES = pytest.mark.parametrize("real_time", [False, True], ids=["lockstep", "real_time"])
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("setup", "real_time", "count"),
-    [
-        ("planar_manipulator", False, 20),
-        pytest.param("sliding_masses", True, 20, marks=pytest.mark.slow),
-    ],
+    ("setup", "real_time"),
+    [("planar_manipulator", False), ("sliding_masses", True)],
     ids=["lockstep", "real_time"],
 )
 def test_some_random_actions_leave_every_state_as_specified(
-    harness: Harness, setup: str, real_time: bool, count: int
+    harness: Harness, setup: str, real_time: bool
 ) -> None:
     flight = RandomFlight(harness, SETUPS[setup], seed=3, real_time=real_time)
-    flight.run(count)
+    flight.run(20)
     assert not flight.figures.violations, flight.figures.violations[0]
     assert flight.figures.states > 100
     assert flight.figures.samples > 3
@@ -63,7 +59,7 @@ def test_actions_that_once_found_a_defect_find_none(
 
 
 @pytest.mark.study
-@MODES
+@pytest.mark.parametrize("real_time", [False, True], ids=["lockstep", "real_time"])
 @pytest.mark.parametrize("setup", list(SETUPS))
 def test_many_random_actions_leave_every_state_as_specified(
     ros_domain: int, setup: str, real_time: bool

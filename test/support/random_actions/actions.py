@@ -6,36 +6,39 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from support.random_actions.setups import CONTROLLER, PLANNER, Setup
+from support.random_actions.setups import CONTROLLER, Setup
 
 PLANT = "plant"
 
 
-class Kind(str, Enum):
-    """What is done."""
+class Kind(Enum):
+    """What is done, and how often it is drawn beside the others."""
 
-    GOAL = "goal"
-    BURST = "burst of goals"
-    SHAPE_GOAL = "goal with a shape"
-    UNREACHABLE = "unreachable goal"
-    BAD_GOAL = "goal that is none"
-    BAD_SHAPE = "shape that is none"
-    TIP_GOAL = "goal of the end-effector"
-    TWIST = "twist of the end-effector"
-    BAD_TWIST = "twist that is none"
-    DETUMBLE = "detumble"
-    ABORT = "abort"
-    REARM = "rearm"
-    PAUSE = "pause"
-    RESUME = "resume"
-    RESET = "reset"
-    DEACTIVATE = "deactivate"
-    ACTIVATE = "activate"
-    RECONFIGURE = "cleanup and configure"
-    FAULT = "fault"
-    BAD_FAULT = "fault that is none"
-    CLEAR = "clear faults"
-    WAIT = "wait"
+    GOAL = ("goal", 6.0)
+    BURST = ("burst of goals", 2.0)
+    SHAPE_GOAL = ("goal with a shape", 2.0)
+    UNREACHABLE = ("unreachable goal", 2.0)
+    BAD_GOAL = ("goal that is none", 1.0)
+    BAD_SHAPE = ("shape that is none", 0.5)
+    TIP_GOAL = ("goal of the end-effector", 3.0)
+    TWIST = ("twist of the end-effector", 3.0)
+    BAD_TWIST = ("twist that is none", 1.0)
+    DETUMBLE = ("detumble", 1.5)
+    ABORT = ("abort", 4.0)
+    REARM = ("rearm", 3.0)
+    PAUSE = ("pause", 1.5)
+    RESUME = ("resume", 2.5)
+    RESET = ("reset", 1.0)
+    DEACTIVATE = ("deactivate", 1.5)
+    ACTIVATE = ("activate", 3.0)
+    RECONFIGURE = ("cleanup and configure", 1.0)
+    FAULT = ("fault", 3.0)
+    BAD_FAULT = ("fault that is none", 0.7)
+    CLEAR = ("clear faults", 2.0)
+    WAIT = ("wait", 3.0)
+
+    def __init__(self, words: str, weight: float) -> None:
+        self.words, self.weight = words, weight
 
 
 @dataclass(frozen=True)
@@ -74,90 +77,55 @@ class Action:
     ticks: int = 0
 
     def __str__(self) -> str:
-        words = [self.kind.value, self.node, self.text]
+        words = [self.kind.words, self.node, self.text]
         words += [f"{aim.offset} {aim.turn}" for aim in self.aims]
         words += [str(self.shape)] if self.shape else []
         return f"{' '.join(word for word in words if word)}; {self.ticks} ticks"
 
 
-_WEIGHTS: dict[Kind, float] = {
-    Kind.GOAL: 6.0,
-    Kind.BURST: 2.0,
-    Kind.SHAPE_GOAL: 2.0,
-    Kind.UNREACHABLE: 2.0,
-    Kind.BAD_GOAL: 1.0,
-    Kind.BAD_SHAPE: 0.5,
-    Kind.TIP_GOAL: 3.0,
-    Kind.TWIST: 3.0,
-    Kind.BAD_TWIST: 1.0,
-    Kind.DETUMBLE: 1.5,
-    Kind.ABORT: 4.0,
-    Kind.REARM: 3.0,
-    Kind.PAUSE: 1.5,
-    Kind.RESUME: 2.5,
-    Kind.RESET: 1.0,
-    Kind.DEACTIVATE: 1.5,
-    Kind.ACTIVATE: 3.0,
-    Kind.RECONFIGURE: 1.0,
-    Kind.FAULT: 3.0,
-    Kind.BAD_FAULT: 0.7,
-    Kind.CLEAR: 2.0,
-    Kind.WAIT: 3.0,
-}
-
 _TICK_VARIABLES = (0, 0, 1, 2, 5, 20, 60, 200)
 
-_BAD_FAULTS = (
-    "joint_stuck nobody",
-    "joint_slow",
-    "sensor_noise position 1e200",
-    "sensor_bias position_x 1e308",
-    "sensor_delay odom 1e9",
-    "meteor base",
-    "sensor_dropout odom at 1e308 until 1",
-    "\x00",
-    "sensor_noise position nan",
-)
-
-_BAD_GOALS = ("frame", "quaternion", "nan", "infinite")
-_BAD_SHAPES = ("unknown", "short", "nan", "twice")
-_BAD_TWISTS = ("1e308", "-1e155", "1e7", "nan", "inf")
+_BAD: dict[Kind, tuple[str, ...]] = {
+    Kind.BAD_GOAL: ("frame", "quaternion", "nan", "infinite"),
+    Kind.BAD_SHAPE: ("unknown", "short", "nan", "twice"),
+    Kind.BAD_TWIST: ("1e308", "-1e155", "1e7", "nan", "inf"),
+    Kind.BAD_FAULT: (
+        "joint_stuck nobody",
+        "joint_slow",
+        "sensor_noise position 1e200",
+        "sensor_bias position_x 1e308",
+        "sensor_delay odom 1e9",
+        "meteor base",
+        "sensor_dropout odom at 1e308 until 1",
+        "\x00",
+        "sensor_noise position nan",
+    ),
+}
+"""What is wrong with what is none."""
 
 
 class Draw:
-    """Draws actions for a setup.
-
-    Parameters
-    ----------
-    setup
-        What they are for.
-    rng
-        Where randomness comes from.
-    """
+    """Draws actions for a setup."""
 
     def __init__(self, setup: Setup, rng: np.random.Generator) -> None:
         self._setup, self._rng = setup, rng
         self._joints = setup.model.joint_names
-        unused = set()
-        if not setup.shapes:
-            unused |= {Kind.SHAPE_GOAL}
-        if not setup.planner:
-            unused |= {Kind.BAD_SHAPE}
-        if not setup.tip:
-            unused |= {Kind.TIP_GOAL}
-        if not setup.twists:
-            unused |= {Kind.TWIST, Kind.BAD_TWIST}
-        if not setup.controller or not setup.tip:
-            unused |= {Kind.DETUMBLE}
-        kinds = [kind for kind in _WEIGHTS if kind not in unused]
-        weights = np.array([_WEIGHTS[kind] for kind in kinds])
-        self._kinds, self._chances = kinds, weights / weights.sum()
+        possible = {
+            Kind.SHAPE_GOAL: setup.shapes,
+            Kind.BAD_SHAPE: setup.planner,
+            Kind.TIP_GOAL: setup.tip,
+            Kind.TWIST: setup.twists,
+            Kind.BAD_TWIST: setup.twists,
+            Kind.DETUMBLE: setup.controller and setup.tip,
+        }
+        self._kinds = [kind for kind in Kind if possible.get(kind, True)]
+        weights = np.array([kind.weight for kind in self._kinds])
+        self._chances = weights / weights.sum()
 
     def action(self) -> Action:
         """Return the next action."""
         kind = self._kinds[self._rng.choice(len(self._kinds), p=self._chances)]
         ticks = int(self._rng.choice(_TICK_VARIABLES))
-        nodes = (PLANT, *self._setup.commanders)
         match kind:
             case Kind.GOAL | Kind.TIP_GOAL:
                 return Action(kind, aims=(self._aim(),), ticks=ticks)
@@ -170,26 +138,18 @@ class Draw:
             case Kind.UNREACHABLE:
                 return Action(kind, aims=(self._aim(300.0),), ticks=ticks)
             case Kind.BAD_GOAL:
-                return Action(kind, aims=(self._aim(),), text=self._one(_BAD_GOALS), ticks=ticks)
-            case Kind.BAD_SHAPE:
-                return Action(kind, text=self._one(_BAD_SHAPES), ticks=ticks)
+                return Action(kind, aims=(self._aim(),), text=self._one(_BAD[kind]), ticks=ticks)
+            case Kind.BAD_SHAPE | Kind.BAD_TWIST | Kind.BAD_FAULT:
+                return Action(kind, text=self._one(_BAD[kind]), ticks=ticks)
             case Kind.TWIST:
                 v, w = self._rng.uniform(-0.1, 0.1, (2, 3)).round(6).tolist()
                 return Action(kind, aims=(Aim(tuple(v), tuple(w)),), ticks=ticks)
             case Kind.DETUMBLE:
                 return Action(kind, CONTROLLER, ticks=ticks)
-            case Kind.BAD_TWIST:
-                return Action(kind, text=self._one(_BAD_TWISTS), ticks=ticks)
-            case Kind.ABORT:
-                return Action(kind, self._one(nodes), ticks=ticks)
-            case Kind.DEACTIVATE | Kind.RECONFIGURE:
-                return Action(kind, self._one(nodes), ticks=ticks)
-            case Kind.ACTIVATE:
-                return Action(kind, self._one(nodes), ticks=ticks)
+            case Kind.ABORT | Kind.DEACTIVATE | Kind.RECONFIGURE | Kind.ACTIVATE:
+                return Action(kind, self._one((PLANT, *self._setup.commanders)), ticks=ticks)
             case Kind.FAULT:
                 return Action(kind, text=self._fault(), ticks=ticks)
-            case Kind.BAD_FAULT:
-                return Action(kind, text=self._one(_BAD_FAULTS), ticks=ticks)
             case _:
                 return Action(kind, ticks=ticks)
 
@@ -231,6 +191,3 @@ class Draw:
             lines += [f"nozzle_weak {nozzle} 0.4"]
         times = ["", " until NOW+2", " at NOW+1 until NOW+3", " at NOW+0.5"]
         return self._one(tuple(lines)) + self._one(tuple(times))
-
-
-__all__ = ["CONTROLLER", "PLANNER", "PLANT", "Action", "Aim", "Draw", "Kind"]

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from support.planner_flight import Array, goal_at, pose_arrays
 from support.random_actions.actions import PLANT, Action, Draw, Kind
 from support.random_actions.expectations import SECOND, Disturbance
-from support.random_actions.messages import bad_shape, fill_pose, moved, spoilt
 from support.random_actions.observer import Figures, Observer
 from support.random_actions.setups import CONTROLLER, PLANNER, Setup
 from support.ros_harness import Harness
@@ -47,20 +47,43 @@ _TRANSITIONS = {
 }
 
 
-class RandomFlight:
-    """Does random actions to a stack, and checks every state that is published.
+def moved(
+    position: Array, attitude: Rotation, offset: tuple[float, ...], turn: tuple[float, ...]
+) -> PoseStamped:
+    """Return a goal at an offset in the world, m, and turned about the own axes, rad."""
+    turned = attitude * Rotation.from_rotvec(turn)
+    return goal_at(((position + offset).tolist(), turned.as_rotvec().tolist()))
 
-    Parameters
-    ----------
-    harness
-        Where the nodes run.
-    setup
-        Which nodes.
-    seed
-        Of all randomness.
-    real_time
-        Whether the plant runs on the wall clock.
-    """
+
+def spoilt(goal: PoseStamped, how: str) -> PoseStamped:
+    o = goal.pose.orientation
+    match how:
+        case "frame":
+            goal.header.frame_id = "moon"
+        case "quaternion":
+            o.x = o.y = o.z = o.w = 0.0
+        case "nan":
+            goal.pose.position.y = np.nan
+        case _:
+            goal.pose.position.z = np.inf
+    return goal
+
+
+def bad_shape(names: list[str], how: str) -> JointState:
+    zeros = [0.0] * len(names)
+    match how:
+        case "unknown":
+            return JointState(name=["nobody", *names[1:]], position=zeros)
+        case "short":
+            return JointState(name=names, position=zeros[1:])
+        case "nan":
+            return JointState(name=names, position=[np.nan, *zeros[1:]])
+        case _:
+            return JointState(name=[names[0]] * 2, position=[0.0, 0.0])
+
+
+class RandomFlight:
+    """Does random actions to a stack, and checks every state that is published."""
 
     def __init__(self, harness: Harness, setup: Setup, seed: int, *, real_time: bool) -> None:
         self._harness, self._setup, self._real_time = harness, setup, real_time
@@ -215,7 +238,6 @@ class RandomFlight:
     def perform(self, action: Action) -> None:
         """Do one action, and let time pass."""
         self.figures.actions += 1
-        self.figures.kinds[action.kind.value] += 1
         time = f"[{self._seen.now_ns / SECOND:.6g} s]"
         self._seen.actions.append(f"{self.figures.actions}: {action}  {time}")
         self._do(action)
@@ -241,7 +263,7 @@ class RandomFlight:
                 for aim in action.aims:
                     tip = self._seen.parts.get("end_effector_pose")
                     if tip is not None:
-                        self._send(moved(tip, aim.offset, aim.turn), tip=True)
+                        self._send(moved(*pose_arrays(tip.pose), aim.offset, aim.turn), tip=True)
             case Kind.TWIST:
                 self._send_twist((*action.aims[0].offset, *action.aims[0].turn))
             case Kind.BAD_TWIST:
@@ -274,7 +296,7 @@ class RandomFlight:
             case Kind.DEACTIVATE | Kind.ACTIVATE:
                 if situation.lifecycle[action.node] == "unconfigured":
                     self._transit(action.node, "configure")
-                self._transit(action.node, action.kind.value)
+                self._transit(action.node, action.kind.words)
                 self._harness.connect()
             case Kind.RECONFIGURE:
                 self._reconfigure(action.node)
@@ -357,12 +379,9 @@ class RandomFlight:
 
     def _pose(self, offset: tuple[float, ...], turn: tuple[float, ...]) -> PoseStamped:
         """Return a pose relative to where the base is."""
-        message = PoseStamped()
-        message.header.frame_id = "world"
         state = self._seen.state
         pose = np.array([0, 0, 0, 0, 0, 0, 1.0]) if state is None else state.pose
-        fill_pose(message, pose[:3], pose[3:])
-        return moved(message, offset, turn)
+        return moved(pose[:3], Rotation.from_quat(pose[3:]), offset, turn)
 
     def _send(self, goal: PoseStamped, *, tip: bool = False) -> str:
         self._goal_count += 1
@@ -431,7 +450,7 @@ class RandomFlight:
         goal_id = self._send(self._pose(step, turn))
         if tip is not None:
             # Otherwise the end-effector stays where it is held.
-            goal_id = self._send(moved(tip, step, turn), tip=True)
+            goal_id = self._send(moved(*pose_arrays(tip.pose), step, turn), tip=True)
         end = self._seen.now_ns + round(setup.patience * SECOND)
         # A plan that is made in the background takes its time on the wall, however fast the flight.
         soonest = monotonic() + _WALL_LIMIT * self._real_time

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any
 
@@ -21,16 +21,15 @@ from support.random_actions.expectations import (
     Check,
     EventBook,
     GoalCheck,
+    Goals,
     LimitCheck,
     MomentumCheck,
     Situation,
-    StandstillCheck,
     State,
     StatusCheck,
     TimeCheck,
-    commanders,
 )
-from support.random_actions.rest import EnergyCheck, RateCheck, RestCheck
+from support.random_actions.rest import EnergyCheck, RestCheck
 from support.random_actions.setups import CONTROLLER, PLANNER, Setup
 from support.ros_harness import DEEP, DEEP_LATCHED, nanoseconds
 
@@ -57,28 +56,14 @@ class Figures:
     recoveries: int = 0
     second_attempts: int = 0
     decisions: Counter[str] = field(default_factory=Counter)
-    kinds: Counter[str] = field(default_factory=Counter)
     violations: list[str] = field(default_factory=list)
-
     stacks: int = 0
 
     def add(self, other: Figures) -> None:
         """Add the figures of one more stack."""
+        for each in fields(self):
+            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
         self.stacks += 1
-        for name in (
-            "actions",
-            "states",
-            "samples",
-            "stopped",
-            "rearmed",
-            "goals",
-            "recoveries",
-            "second_attempts",
-        ):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.decisions.update(other.decisions)
-        self.kinds.update(other.kinds)
-        self.violations += other.violations
 
     def __str__(self) -> str:
         decided = ", ".join(f"{count} {word}" for word, count in sorted(self.decisions.items()))
@@ -91,20 +76,9 @@ class Figures:
 
 
 class Observer:
-    """Listens to a stack, and checks every state and every status.
+    """Listens to the nodes ``names`` of a stack, and checks every state and every status.
 
-    Parameters
-    ----------
-    node
-        Whose subscriptions it uses.
-    setup
-        Of the stack.
-    names
-        Its nodes.
-    name
-        Of the flight, for violations.
-    real_time
-        Whether the plant runs on the wall clock.
+    Violations are told with the ``name`` of the flight.
     """
 
     def __init__(
@@ -118,7 +92,10 @@ class Observer:
         self._heard: deque[str] = deque(maxlen=_HEARD)
         self.situation = situation = Situation(dict.fromkeys(names, "unconfigured"))
         situation.may_repeat = not real_time
-        self.books = commanders(setup, self.violate)
+        self.books = {
+            each: Goals(repeats=each == CONTROLLER, report=self.violate)
+            for each in setup.commanders
+        }
         lockstep = not real_time
         self._momentum = MomentumCheck(setup, situation, lockstep=lockstep)
         self.plant_status = StatusCheck(setup, situation, lockstep=lockstep, report=self.violate)
@@ -126,17 +103,13 @@ class Observer:
         self.events = EventBook(self.violate)
         self._checks: list[Check] = [
             TimeCheck(setup, situation),
-            StandstillCheck(setup, situation),
             self.plant_status,
-            LimitCheck(setup, situation),
+            LimitCheck(setup, situation, lockstep=lockstep),
             self._momentum,
             GoalCheck(self.books, situation),
             RestCheck(setup, situation, self.books[setup.decider]),
             self._energy,
         ]
-        if lockstep:
-            # On a busy machine commands come late, and what joints do then is what they do.
-            self._checks.append(RateCheck(setup, situation))
         self.state: State | None = None
         """The last one."""
         self.first: State | None = None

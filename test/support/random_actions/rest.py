@@ -26,7 +26,6 @@ class RestCheck:
         self._since = 0
 
     def look(self, now: State, before: State | None) -> str | None:
-        """Look whether joints move that must not."""
         if before is not None and now.time_ns == before.time_ns and now.equals(before):
             return None  # The state is shown again; the rates are those of the tick before it.
         if self._setup.servos:
@@ -133,7 +132,6 @@ class EnergyCheck:
         """States that were compared, and those of them that came after the rearm."""
 
     def look(self, now: State, before: State | None) -> str | None:
-        """Compare the kinetic energy with that under the latch."""
         situation = self._situation
         stopped = situation.latched or not situation.goal_since_stop
         if self._setup.servos or self._has_wheels:
@@ -163,23 +161,3 @@ class EnergyCheck:
         return any(
             d.start - 1.0 < time and d.end + 0.5 > latched for d in self._situation.disturbances
         )
-
-
-class RateCheck:
-    """Motors that are sound keep joints about as slow as their URDF says, whatever is asked."""
-
-    MOST = 5.0
-    """How many times the rate of the URDF a joint may reach for a moment."""
-
-    def __init__(self, setup: Setup, situation: Situation) -> None:
-        self._setup, self._situation = setup, situation
-        self._rates = setup.model.velocity_limit
-
-    def look(self, now: State, before: State | None) -> str | None:
-        """Compare the rates with those of the URDF."""
-        acting = self._situation.acting(
-            now.time_ns, 500 * self._setup.period_ns, "joint_slow", "joint_stuck", "actuator_bias"
-        )
-        if acting or np.all(np.abs(now.qdot) <= self.MOST * self._rates):
-            return None
-        return f"joints move at {now.qdot}, their rates are {self._rates}"

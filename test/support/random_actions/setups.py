@@ -17,6 +17,13 @@ _ROOT = Path(__file__).parents[3]
 
 PLANNER, CONTROLLER = "planner", "coordinated_control"
 
+# Loops that are closed over joint motors want their commands in time: not much faster than life.
+_WALL: dict[str, Any] = {
+    "time_mode": "realtime",
+    "real_time_factor": 1.0,
+    "command_timeout": 1.0,
+}
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -48,7 +55,7 @@ class Setup:
     plant: Mapping[str, Any]
     planner: Mapping[str, Any] = field(default_factory=dict)
     controller: Mapping[str, Any] = field(default_factory=dict)
-    real_time: Mapping[str, Any] = field(default_factory=dict)
+    real_time: Mapping[str, Any] = field(default_factory=lambda: _WALL)
     reach: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shapes: tuple[float, ...] = ()
@@ -100,8 +107,6 @@ def _of(scenario: str, node: str, **changes: Any) -> dict[str, Any]:
 
 
 _QUIET = {"marker_period": 0.0, "diagnostics_period": 0.5, "base_pose_period": 0.0}
-# Loops that are closed over joint motors want their commands in time: not much faster than life.
-_WALL = {"time_mode": "realtime", "command_timeout": 2.0}
 
 # The least inertia of the wrist is 0.012 kg m^2, and commands are held for 0.02 s, in real time now
 # and then for twice as long: the gains of the scenarios, which are for 0.01 s, would be unstable.
@@ -177,7 +182,7 @@ SETUPS: dict[str, Setup] = {
             joint_tolerance=0.01,
         ),
         controller=_of("planar_chain", "coordinated_control", tick_rate=50.0),
-        real_time={**_WALL, "real_time_factor": 2.0, "command_timeout": 1.0},
+        real_time={**_WALL, "real_time_factor": 2.0},
         turn=(0.0, 0.0, 0.3),
         shapes=(0.5, 0.5),
     ),
@@ -194,7 +199,6 @@ SETUPS: dict[str, Setup] = {
             time_limit=30.0,
             **_HALF,
         ),
-        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
         reach=(0.1, 0.1, 0.0),
         turn=(0.0, 0.0, 0.1),
         tip=True,
@@ -220,7 +224,6 @@ SETUPS: dict[str, Setup] = {
             time_limit=100.0,
             **_WRIST,
         ),
-        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
         reach=(0.05, 0.05, 0.05),
         turn=(0.05, 0.05, 0.05),
         tip=True,
@@ -240,7 +243,6 @@ SETUPS: dict[str, Setup] = {
             time_limit=100.0,
             **_WRIST,
         ),
-        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
         reach=(0.05, 0.05, 0.05),
         turn=(0.05, 0.05, 0.05),
         tip=True,
@@ -268,7 +270,6 @@ SETUPS: dict[str, Setup] = {
             attitude_tolerance=0.01,
             time_limit=100.0,
         ),
-        real_time={**_WALL, "real_time_factor": 1.0, "command_timeout": 1.0},
         reach=(0.05, 0.05, 0.05),
         turn=(0.05, 0.05, 0.05),
         tip=True,
