@@ -11,12 +11,10 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.lifecycle import TransitionCallbackReturn
 from std_msgs.msg import Float64MultiArray, String
-from std_srvs.srv import Trigger
 from support.control_loop import TICK_NS, Loop
 from support.made_bags import array, joint_states, made_bag, odometry
-from support.odometry import pose_of, twist_of
 from support.planner_flight import values_of
-from support.plant_rig import Rig
+from support.plant_rig import Rig, pose_of, twist_of
 from support.ros_harness import Harness
 from support.sentences import assert_one_sentence
 from visualization_msgs.msg import MarkerArray
@@ -184,18 +182,13 @@ def test_a_plant_without_a_target_captures_nothing(harness: Harness) -> None:
         )
 
 
-def asked(loop: Loop, task: str) -> Any:
-    client = loop.probe.create_client(Trigger, f"control/{task}")
-    return loop.harness.call(client, Trigger.Request())
-
-
 def test_an_approach_without_a_target_is_refused(harness: Harness) -> None:
     loop = Loop(harness)
     loop.answer()
-    refused = asked(loop, "approach")
+    refused = loop.trigger("approach")
     assert not refused.success
     assert_one_sentence(refused.message, "no target to approach", "'target/robot_description'")
-    assert asked(loop, "detumble").success, "which needs none"
+    assert loop.trigger("detumble").success, "which needs none"
 
 
 def test_tasks_are_done_on_request(harness: Harness) -> None:
@@ -205,10 +198,10 @@ def test_tasks_are_done_on_request(harness: Harness) -> None:
     described = loop.probe.create_publisher(String, "target/robot_description", LATCHED)
     described.publish(String(data=BLOCK.read_text("utf-8")))
     harness.connect()
-    assert asked(loop, "approach").success is False
+    assert loop.trigger("approach").success is False
     assert loop.node.trigger_activate() is TransitionCallbackReturn.SUCCESS
     loop.answer()
-    assert asked(loop, "approach").success is True
+    assert loop.trigger("approach").success is True
 
     def answer() -> None:
         state = Odometry(child_frame_id="block")
@@ -228,6 +221,6 @@ def test_tasks_are_done_on_request(harness: Harness) -> None:
     assert loop.status["task"] == "approach"
     # The handle is 0.3 m on this side of the block.
     assert "Approaching the target: the end-effector is 0.502 m" in status.message, status
-    assert asked(loop, "detumble").message.startswith("The task 'detumble' has started")
+    assert loop.trigger("detumble").message.startswith("The task 'detumble' has started")
     answer()
     harness.spin_until(lambda: loop.status.get("task") == "detumble", "the task")

@@ -18,10 +18,10 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 from support.control_loop import KD, KP, STATUS, TICK_NS, TIP, URDF, Loop, pose
 from support.executive_loop import STEP, Array
-from support.ros_harness import LATCHED, Harness, Probe, construction, nanoseconds
+from support.planner_flight import goal_at, pose_arrays, stamp_of
+from support.ros_harness import LATCHED, Harness, construction, nanoseconds
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.control import ControlState, Reference
@@ -95,9 +95,6 @@ def test_the_status_carries_the_stamp_of_the_goal_as_its_id(harness: Harness) ->
         assert (loop.status["state"], loop.status["goal_id"]) == ("reached", f"unstamped-{n}")
 
 
-# -- gains ------------------------------------------------------------------------------------
-
-
 def test_gains_that_change_in_flight_take_effect(harness: Harness) -> None:
     loop = Loop(harness)
     loop.aim(base=pose([1.0, 0.0, 0.0]), end_effector=pose(TIP))
@@ -108,9 +105,6 @@ def test_gains_that_change_in_flight_take_effect(harness: Harness) -> None:
     np.testing.assert_allclose(loop.answer()[0][:3], [70.0, -2 * KD * 0.5, 0.0], atol=1e-12)
     assert loop.set("gains.end_effector_position.kd", 10.0).successful
     np.testing.assert_allclose(loop.answer()[0][:3], [70.0, -(KD + 10.0) * 0.5, 0.0], atol=1e-12)
-
-
-# -- goals ------------------------------------------------------------------------------------
 
 
 REFUSED: dict[str, tuple[PoseStamped, tuple[str, ...]]] = {
@@ -178,73 +172,52 @@ def test_abort_holds_the_robot_where_it_is(harness: Harness) -> None:
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     loop.answer()
     loop.place = np.array([0.25, 0.0, 0.0])
-    assert loop.abort().success
+    assert loop.trigger("abort").success
     wrench, effort = loop.answer()
     np.testing.assert_allclose([*wrench, *effort], 0.0, atol=1e-12)
     assert loop.wait_for("aborted").level == DiagnosticStatus.WARN
 
 
-def test_an_inactive_node_commands_nothing_and_then_answers_the_waiting_state(
+def test_an_inactive_node_forgets_goals_and_then_answers_the_waiting_state(
     harness: Harness,
 ) -> None:
-    loop = Loop(harness, activate=False)
-    loop.show()
-    loop.goals["base"].publish(pose([1.0, 0.0, 0.0]))
-    harness.settle(loop.probe)
-    assert loop.probe.count("base_wrench") == loop.probe.count("joint_commands") == 0
-    assert not loop.abort().success
-    loop.node.trigger_activate()
-    harness.spin_until(lambda: loop.probe.count("joint_commands"), "the answer")
-    harness.settle(loop.probe)
-    wrench, effort = loop.last_command
-    # A goal that came to an inactive node was not taken.
-    np.testing.assert_allclose([*wrench, *effort], 0.0, atol=1e-12)
-
-
-def test_goals_are_forgotten_by_a_deactivation(harness: Harness) -> None:
     loop = Loop(harness)
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     assert loop.answer()[0][0] == pytest.approx(2 * KP)
     loop.node.trigger_deactivate()
     loop.wait_for("aborted")
-    count = loop.probe.count("base_wrench")
+    commands = {topic: loop.probe.count(topic) for topic in ("base_wrench", "joint_commands")}
     loop.place = np.array([0.5, 0.0, 0.0])
     loop.show()
-    harness.settle(loop.probe)
-    assert loop.probe.count("base_wrench") == count
+    loop.aim(base=pose([1.0, 0.0, 0.0]))
+    assert {topic: loop.probe.count(topic) for topic in commands} == commands
+    assert not loop.trigger("abort").success
     loop.node.trigger_activate()
-    harness.spin_until(lambda: loop.probe.count("base_wrench") > count, "the answer")
+    harness.spin_until(
+        lambda: loop.probe.count("joint_commands") > commands["joint_commands"], "the answer"
+    )
     harness.settle(loop.probe)
-    np.testing.assert_allclose(loop.last_command[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.concatenate(loop.last_command), 0.0, atol=1e-12)
     loop.wait_for("holding")
 
 
-def test_the_robot_is_taken_from_the_description(harness: Harness) -> None:
+def test_the_robot_is_taken_from_the_description_and_replaced_by_another(
+    harness: Harness,
+) -> None:
+    """A goal of the robot before is not reached by the one that is there now."""
     loop = Loop(harness, robot="")
     loop.show()
     harness.settle(loop.probe)
-    assert loop.probe.count("base_wrench") == 0
     description = loop.probe.create_publisher(String, "robot_description", LATCHED)
     harness.connect()
     description.publish(String(data="<robot"))
     harness.settle(loop.probe)
     assert loop.probe.count("base_wrench") == 0
-    description.publish(String(data=URDF.read_text("utf-8")))
+    text = URDF.read_text("utf-8")
+    description.publish(String(data=text))
     harness.spin_until(lambda: loop.probe.count("joint_commands"), "the state that waited")
     loop.aim(base=pose([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(loop.answer()[0][:3], [2 * KP, 0.0, 0.0], atol=1e-12)
-
-
-def test_another_description_replaces_the_robot_and_ends_its_goal(harness: Harness) -> None:
-    """A goal of the robot before is not reached by the one that is there now."""
-    loop = Loop(harness, robot="")
-    description = loop.probe.create_publisher(String, "robot_description", LATCHED)
-    harness.connect()
-    text = URDF.read_text("utf-8")
-    description.publish(String(data=text))
-    loop.answer()
-    loop.aim(base=pose([1.0, 0.0, 0.0]))
-    loop.answer()
     loop.wait_for("tracking")
     description.publish(String(data=text))
     harness.settle(loop.probe)
@@ -264,16 +237,6 @@ MASS, THRUST = 16.0, 0.4 * np.sqrt(3)
 """Of the cube, kg, and a bound of the force of its thrusters in any direction, N."""
 
 
-def stamped_pose(node: Node, goal: tuple[list[float], list[float]]) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = "world"
-    message.header.stamp = node.get_clock().now().to_msg()
-    place, attitude = message.pose.position, message.pose.orientation
-    place.x, place.y, place.z = goal[0]
-    attitude.x, attitude.y, attitude.z, attitude.w = Rotation.from_rotvec(goal[1]).as_quat()
-    return message
-
-
 def mine(context: rclpy.Context) -> Node:
     return Node("mine", context=context)
 
@@ -288,19 +251,18 @@ def test_a_path_is_flown_pose_by_pose() -> None:
     with Stack("free_flyer", nodes, rates, timeout=200.0) as stack:
         stack.nodes["mine"].create_subscription(Odometry, "odom", states.append, 100)
         assert stack.fly_to(goal=Goal.through(poses)).reached
-    places = np.array([[p.x, p.y, p.z] for p in (s.pose.pose.position for s in states)])
+    places = np.array([pose_arrays(s.pose.pose)[0] for s in states])
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(stamps(states))
     for aim in poses:
         there = int(np.argmin(np.linalg.norm(places - aim[:3], axis=1)))
-        o = states[there].pose.pose.orientation
+        _, attitude = pose_arrays(states[there].pose.pose)
         assert np.linalg.norm(places[there] - aim[:3]) < 5e-3
-        apart = Rotation.from_quat([o.x, o.y, o.z, o.w]).inv() * Rotation.from_quat(aim[3:])
-        assert apart.magnitude() < 2e-2
+        assert (attitude.inv() * Rotation.from_quat(aim[3:])).magnitude() < 2e-2
         assert speeds[there - 6 : there + 6].min() < 2e-3
 
 
 def stamps(states: list[Odometry]) -> np.ndarray:
-    return np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in states])
+    return np.array([stamp_of(state) / 1e9 for state in states])
 
 
 @pytest.mark.slow
@@ -323,18 +285,14 @@ def test_a_goal_in_flight_is_flown_from_where_the_robot_is_without_a_stop() -> N
             assert isinstance(flown, FlightNode)
             flown.require_transition(flown.trigger_activate)
         stack.spin_until(lambda: bool(states) and goals.get_subscription_count() > 0)
-        goals.publish(stamped_pose(node, FIRST))
+        goals.publish(goal_at(FIRST))
         stack.spin_until(lambda: states[-1].pose.pose.position.x > 0.4)
         flying = len(states)
-        goals.publish(stamped_pose(node, SECOND))
+        goals.publish(goal_at(SECOND))
         stack.spin_until(lambda: bool(reached))
-    place, attitude = (
-        states[-1].pose.pose.position,
-        states[-1].pose.pose.orientation,
-    )
-    assert np.linalg.norm(np.array([place.x, place.y, place.z]) - SECOND[0]) < 5e-3
-    ended = Rotation.from_quat([attitude.x, attitude.y, attitude.z, attitude.w])
-    assert (ended.inv() * Rotation.from_rotvec(SECOND[1])).magnitude() < 1e-2
+    place, attitude = pose_arrays(states[-1].pose.pose)
+    assert np.linalg.norm(place - SECOND[0]) < 5e-3
+    assert (attitude.inv() * Rotation.from_rotvec(SECOND[1])).magnitude() < 1e-2
     twists = [each.twist.twist for each in states]
     omega = np.array([[t.angular.x, t.angular.y, t.angular.z] for t in twists])
     speeds = np.linalg.norm([[t.linear.x, t.linear.y, t.linear.z] for t in twists], axis=1)
@@ -437,50 +395,26 @@ def test_a_silent_reference_is_done_without_until_it_comes_again(harness: Harnes
     )
 
 
-AIM = np.array([0.5, 0.25, 0.0])
-
-
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     return tmp_path / "goals.json"
 
 
-def kill(harness: Harness, probe: Probe, node: FlightNode) -> None:
-    """Destroy a node without any of its cleanup, when it hears nothing any more."""
-    harness.executor.remove_node(node)
-    harness.settle(probe)
-    harness.remove(node)
-
-
-def replaced(loop: Loop, file: Path, **settings: Any) -> None:
-    """Kill the node of a loop, and start another in its place."""
-    kill(loop.harness, loop.probe, loop.node)
-    defaults = {"robot": "planar_manipulator", "tick_rate": 100.0, "status_period": 0.01, **STEP}
-    loop.node = loop.harness.make(
-        CoordinatedControlNode,
-        {**defaults, "resume_file": str(file), **settings},
-        name="control",
-    )
-    loop.harness.connect()
-
-
-# -- going on ---------------------------------------------------------------------------------
-
-
-def test_a_node_that_is_activated_again_goes_on(harness: Harness, file: Path) -> None:
+def test_a_node_that_is_activated_again_or_killed_goes_on(harness: Harness, file: Path) -> None:
+    """Another node in its place may be told the robot later."""
     loop = Loop(harness, resume_file=str(file))
-    loop.aim(base=pose(AIM))
+    loop.aim(base=pose([0.5, 0.25, 0.0]))
     before, _ = loop.answer()
     loop.node.trigger_deactivate()
     loop.node.trigger_activate()
     np.testing.assert_allclose(loop.answer()[0], before, atol=1e-12)
-
-
-def test_the_robot_may_be_told_later(harness: Harness, file: Path) -> None:
-    loop = Loop(harness, resume_file=str(file))
-    loop.aim(base=pose(AIM))
-    before, _ = loop.answer()
-    replaced(loop, file, robot="")
+    # Without any of its cleanup, when it hears nothing any more.
+    harness.executor.remove_node(loop.node)
+    harness.settle(loop.probe)
+    harness.remove(loop.node)
+    settings = {"tick_rate": 100.0, "status_period": 0.01, **STEP, "resume_file": str(file)}
+    loop.node = harness.make(CoordinatedControlNode, settings, name="control")
+    harness.connect()
     loop.show()
     description = loop.probe.create_publisher(String, "robot_description", LATCHED)
     harness.connect()
@@ -489,9 +423,6 @@ def test_the_robot_may_be_told_later(harness: Harness, file: Path) -> None:
     harness.spin_until(lambda: loop.probe.count("joint_commands") > count, "the answer")
     harness.settle(loop.probe)
     np.testing.assert_allclose(loop.last_command[0], before, atol=1e-12)
-
-
-# -- files that are refused -------------------------------------------------------------------
 
 
 def written(name: str = "base", **values: Any) -> str:
@@ -550,12 +481,11 @@ def test_a_goal_that_is_aborted_before_the_robot_is_known_is_not_flown_to(
     loop = Loop(harness, robot="", resume_file=str(file))
     description = loop.probe.create_publisher(String, "robot_description", LATCHED)
     harness.connect()
-    client = loop.probe.create_client(Trigger, "control/abort")
-    answer = harness.call(client, Trigger.Request())
+    answer = loop.trigger("abort")
     assert answer.success
     assert loop.wait_for("aborted").message == answer.message
     assert not file.exists()
-    assert not harness.call(client, Trigger.Request()).success, "nothing waits any more"
+    assert not loop.trigger("abort").success, "nothing waits any more"
     description.publish(String(data=URDF.read_text("utf-8")))
     harness.spin_until(lambda: loop.node.commander.robot is not None, "the robot is known")
     np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-12)

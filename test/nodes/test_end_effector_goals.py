@@ -14,14 +14,13 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Path as PathMessage
 from nodes.test_verified_flights import Flight as RecordedFlight
 from planning.test_given_paths import distance_from
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.hand_motion import end_of_motion
 from support.oracles import PinocchioOracle
-from support.planner_flight import Flight, values_of
-from support.ros_harness import Harness
+from support.planner_flight import Array, Flight, joint_values, position_goal, values_of
+from support.ros_harness import LATCHED, Harness
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import PlanningError
@@ -29,9 +28,10 @@ from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes.common.messages import path_poses
 from spacerobot_ros.report import write_report
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.topics import link_topic
 
-URDF = Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf"
+URDF = robot_file("three_joint_arm").read_text("utf-8")
 NAMES = ("shoulder_yaw", "shoulder_pitch", "elbow_pitch")
 START, END = [0.4, -0.9, 1.1], [-0.2, -0.5, 1.6]
 PLACE, ATTITUDE = [0.4, -0.3, 0.2], Rotation.from_rotvec([0.3, -0.5, 0.4])
@@ -54,30 +54,18 @@ def flight_of(harness: Harness, **planner: object) -> Flight:
     )
 
 
-def reachable(link: str, end: npt.ArrayLike = END) -> npt.NDArray[np.float64]:
-    way = START + np.linspace(0, 1, 40)[:, np.newaxis] * (np.asarray(end) - START)
-    urdf = URDF.read_text("utf-8")
-    return end_of_motion(urdf, NAMES, way, [link], PLACE, ATTITUDE)[link][0]
+def end_of(shapes: Array, link: str) -> Array:
+    """Return where a link is after shapes (N, n) of the arm."""
+    return end_of_motion(URDF, NAMES, shapes, [link], PLACE, ATTITUDE)[link][0]
 
 
-def place(position: npt.ArrayLike, sec: int = 0) -> PoseStamped:
-    """Return a goal position; the orientation of zeros asks for no attitude."""
-    message = PoseStamped()
-    message.header.frame_id, message.header.stamp.sec = "world", sec
-    p, o = message.pose.position, message.pose.orientation
-    p.x, p.y, p.z = np.asarray(position).tolist()
-    o.x = o.y = o.z = o.w = 0.0
-    return message
+def reachable(link: str, end: npt.ArrayLike = END) -> Array:
+    return end_of(START + np.linspace(0, 1, 40)[:, np.newaxis] * np.subtract(end, START), link)
 
 
-def flown_to(flight: Flight, link: str) -> npt.NDArray[np.float64]:
+def flown_to(flight: Flight, link: str) -> Array:
     """Return where the joint states that were published put a link."""
-    shapes = [
-        [dict(zip(m.name, m.position, strict=True))[name] for name in NAMES]
-        for m in flight.probe.messages["joint_states"]
-    ]
-    urdf = URDF.read_text("utf-8")
-    return end_of_motion(urdf, NAMES, np.array(shapes), [link], PLACE, ATTITUDE)[link][0]
+    return end_of(joint_values(flight.probe.messages["joint_states"], NAMES), link)
 
 
 def await_reached(flight: Flight, goal_id: str) -> None:
@@ -101,7 +89,7 @@ def test_positions_on_the_topics_of_links_are_reached_one_after_the_other(harnes
     harness.connect()
     flight.start()
     for number, (link, aim) in enumerate(aims.items(), 1):
-        topics[link].publish(place(aim, number))
+        topics[link].publish(position_goal(aim, number))
         await_reached(flight, f"{number}.000000000")
         np.testing.assert_allclose(flown_to(flight, link), aim, atol=1e-6)
         values = values_of(flight.probe.last("planner/status"))
@@ -119,19 +107,19 @@ def test_goals_of_one_stamp_are_one_goal(harness: Harness) -> None:
     link = flight.probe.create_publisher(PoseStamped, "link_3/goal_pose", 10)
     harness.connect()
     # Each could be reached, in another shape than the other.
-    hand.publish(place(reachable("end_effector"), 7))
-    link.publish(place(reachable("link_3", [0.5, -1.2, 0.6]), 7))
+    hand.publish(position_goal(reachable("end_effector"), 7))
+    link.publish(position_goal(reachable("link_3", [0.5, -1.2, 0.6]), 7))
     harness.settle(flight.probe)
     flight.start()
     status = flight.wait("refused")
     assert values_of(status)["goal_id"] == "7.000000000"
     assert_one_sentence(status.message, "'end_effector' and 'link_3'", "independent coordinates")
     # Both parts are bound to each other; one alone is no such goal.
-    hand.publish(place(reachable("end_effector"), 8))
+    hand.publish(position_goal(reachable("end_effector"), 8))
     assert values_of(flight.wait("reached"))["goal_id"] == "8.000000000"
     aims = {each: reachable(each, [0.3, -1.0, 0.9]) for each in ("end_effector", "link_3")}
-    hand.publish(place(aims["end_effector"], 9))
-    link.publish(place(aims["link_3"], 9))
+    hand.publish(position_goal(aims["end_effector"], 9))
+    link.publish(position_goal(aims["link_3"], 9))
     await_reached(flight, "9.000000000")
     for each, aim in aims.items():
         np.testing.assert_allclose(flown_to(flight, each), aim, atol=1e-6)
@@ -143,8 +131,11 @@ def test_a_planner_for_a_controller_leaves_the_end_effector_to_it(harness: Harne
 
 
 HAND = "end_effector"
+ORIGIN = end_of(np.array([START]), HAND)
+"""Where the hand is at the start, m."""
+
 WAY = np.array([[0.05, 0.0, 0.02], [0.12, -0.1, 0.03], [0.12, -0.15, 0.08]])
-"""From the start of the hand, m."""
+"""From there, m."""
 
 
 def path_through(positions: npt.ArrayLike, sec: int = 0, frame: str = "world") -> PathMessage:
@@ -159,20 +150,6 @@ def path_through(positions: npt.ArrayLike, sec: int = 0, frame: str = "world") -
     return message
 
 
-def places_of_hand(flight: Flight) -> npt.NDArray[np.float64]:
-    """Return where some of the published joint states put the hand."""
-    shapes = np.array(
-        [
-            [dict(zip(m.name, m.position, strict=True))[name] for name in NAMES]
-            for m in flight.probe.messages["joint_states"]
-        ]
-    )
-    urdf, ends = URDF.read_text("utf-8"), range(1, len(shapes) + 1, 3)
-    return np.array(
-        [end_of_motion(urdf, NAMES, shapes[:k], [HAND], PLACE, ATTITUDE)[HAND][0] for k in ends]
-    )
-
-
 def test_a_path_on_a_topic_is_followed_and_another_takes_its_place(harness: Harness) -> None:
     flight = flight_of(
         harness,
@@ -182,20 +159,21 @@ def test_a_path_on_a_topic_is_followed_and_another_takes_its_place(harness: Harn
     sender = flight.probe.create_publisher(PathMessage, "end_effector/path", 10)
     harness.connect()
     flight.start()
-    urdf = URDF.read_text("utf-8")
-    start = end_of_motion(urdf, NAMES, np.array([START]), [HAND], PLACE, ATTITUDE)[HAND][0]
     for message, said in (
         (path_through([]), "The path of 'end_effector' has no poses."),
-        (path_through([start, start * np.nan]), "Pose 2 of the path of 'end_effector' is invalid"),
         (
-            path_through(start + WAY, frame="moon"),
+            path_through([ORIGIN, ORIGIN * np.nan]),
+            "Pose 2 of the path of 'end_effector' is invalid",
+        ),
+        (
+            path_through(ORIGIN + WAY, frame="moon"),
             "is in frame 'moon'; goals are accepted in 'world'",
         ),
     ):
         flight.probe.messages["planner/status"].clear()
         sender.publish(message)
         assert_one_sentence(flight.wait("refused").message, said)
-    sender.publish(path_through(start + WAY, 3))
+    sender.publish(path_through(ORIGIN + WAY, 3))
 
     def executing() -> list[DiagnosticStatus]:
         found = flight.probe.messages["planner/status"]
@@ -204,17 +182,19 @@ def test_a_path_on_a_topic_is_followed_and_another_takes_its_place(harness: Harn
     harness.spin_until(lambda: bool(executing()), "the path is followed")
     values = values_of(executing()[0])
     assert (values["method"], values["waypoints_of_end_effector"]) == ("resolved_rate", "2")
-    assert values["goal_of_end_effector"].split() == [f"{x:.9g}" for x in start + WAY[-1]]
+    assert values["goal_of_end_effector"].split() == [f"{x:.9g}" for x in ORIGIN + WAY[-1]]
     await_reached(flight, "3.000000000")
-    lines = np.vstack([start, start + WAY])
-    off = [distance_from(lines, each) for each in places_of_hand(flight)]
+    lines = np.vstack([ORIGIN, ORIGIN + WAY])
+    shapes = joint_values(flight.probe.messages["joint_states"], NAMES)
+    ends = range(1, len(shapes) + 1, 3)
+    off = [distance_from(lines, end_of(shapes[:k], HAND)) for k in ends]
     assert 1e-4 < max(off) < 0.01
     # The next path begins elsewhere; it is replaced while the hand moves to its first pose.
-    sender.publish(path_through(start + WAY + 0.05, 4))
+    sender.publish(path_through(ORIGIN + WAY + 0.05, 4))
     harness.spin_until(lambda: len(executing()) > 1, "the second path is followed")
-    sender.publish(path_through([start + WAY[1], start + WAY[0]], 5))
+    sender.publish(path_through([ORIGIN + WAY[1], ORIGIN + WAY[0]], 5))
     await_reached(flight, "5.000000000")
-    np.testing.assert_allclose(flown_to(flight, HAND), start + WAY[0], atol=TOLERANCE)
+    np.testing.assert_allclose(flown_to(flight, HAND), ORIGIN + WAY[0], atol=TOLERANCE)
     decided = [values_of(each) for each in flight.probe.messages["planner/status"]]
     assert {v["goal_id"] for v in decided if v["state"] == "reached"} == {
         "3.000000000",
@@ -304,16 +284,10 @@ def test_twists_on_a_topic_move_the_hand_until_they_stop(harness: Harness) -> No
     statuses = [(values_of(each)["state"], each.message) for each in heard["planner/status"]]
     assert ("teleoperating", "'end_effector' follows twists.") in statuses
     assert statuses[-1] == ("idle", "No more twists arrive: the joints are at rest.")
-    oracle = PinocchioOracle(URDF.read_text("utf-8"), NAMES)
-    commands = [
-        np.array([dict(zip(m.name, m.velocity, strict=True))[name] for name in NAMES])
-        for m in heard["joint_commands"]
-    ]
-    states = [
-        np.array([dict(zip(m.name, m.position, strict=True))[name] for name in NAMES])
-        for m in heard["joint_states"]
-    ]
-    fastest = int(np.argmax([np.abs(rates).max() for rates in commands]))
+    oracle = PinocchioOracle(URDF, NAMES)
+    commands = joint_values(heard["joint_commands"], NAMES, "velocity")
+    states = joint_values(heard["joint_states"], NAMES)
+    fastest = int(np.abs(commands).max(axis=1).argmax())
     q, rates = (states[fastest] + states[fastest + 1]) / 2, commands[fastest]
     u = oracle.joint_velocities(rates)
     u[:6] = -oracle.connection(q) @ rates
@@ -325,14 +299,7 @@ def test_twists_on_a_topic_move_the_hand_until_they_stop(harness: Harness) -> No
     assert commands[-1].tolist() == [0.0, 0.0, 0.0]
 
 
-LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-
-
-def box_at(position: npt.NDArray[np.float64]) -> String:
+def box_at(position: Array) -> String:
     """Return a URDF with a cube of 6 cm about a place in the world."""
     xyz = " ".join(map(repr, position.tolist()))
     return String(
@@ -356,10 +323,8 @@ def test_obstacles_that_come_in_flight_stop_it_and_may_go_again(harness: Harness
     probe.watch("clearance", DiagnosticStatus)
     harness.connect()
     flight.start()
-    urdf = URDF.read_text("utf-8")
-    start = end_of_motion(urdf, NAMES, np.array([START]), [HAND], PLACE, ATTITUDE)[HAND][0]
-    goal = start + np.array([0.14, -0.12, 0.05])
-    goals.publish(place(goal, 1))
+    goal = np.add(ORIGIN, [0.14, -0.12, 0.05])
+    goals.publish(position_goal(goal, 1))
     flight.wait("executing")
     obstacles.publish(box_at(goal))
     status = flight.wait("failed")
@@ -379,7 +344,7 @@ def test_obstacles_that_come_in_flight_stop_it_and_may_go_again(harness: Harness
     # Without obstacles the goal is reached.
     obstacles.publish(String(data=""))
     flight.ticks(2)
-    goals.publish(place(goal, 2))
+    goals.publish(position_goal(goal, 2))
     assert values_of(flight.wait("reached"))["goal_id"] == "2.000000000"
     flight.ticks(21)
     assert "second_is" not in values_of(probe.last("clearance"))

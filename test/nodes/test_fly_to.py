@@ -22,7 +22,17 @@ from rclpy.node import Node
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from support.hand_motion import end_of_motion
-from support.planner_flight import NEAR, PLANT, TURNED, Flight, goal_at, values_of
+from support.planner_flight import (
+    NEAR,
+    PLANT,
+    TURNED,
+    Array,
+    Flight,
+    goal_at,
+    joint_values,
+    position_goal,
+    values_of,
+)
 from support.ros_harness import Harness
 
 from spacerobot_ros.bag import read_bag
@@ -30,6 +40,7 @@ from spacerobot_ros.nodes import CoordinatedControlNode, PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import interface_class
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
+from spacerobot_ros.resources import robot_file
 
 STATES = {
     GoalStatus.STATUS_SUCCEEDED: "succeeded",
@@ -49,10 +60,6 @@ class SentGoal:
     """State and message of each result: there is to be one."""
 
     @property
-    def ended(self) -> bool:
-        return bool(self.results)
-
-    @property
     def state(self) -> str:
         return self.results[0][0]
 
@@ -62,32 +69,15 @@ class SentGoal:
 
 
 class Sender:
-    """A client of one action.
-
-    Parameters
-    ----------
-    harness, node
-        The node that has the client, and where it is.
-    kind, name
-        Class and name of the action.
-    """
+    """A client of one action whose server is there."""
 
     def __init__(self, harness: Harness, node: Node, kind: Any, name: str) -> None:
         self.harness, self.kind = harness, kind
         self.client = ActionClient(node, kind, name)
-
-    def connect(self) -> None:
-        """Wait until the server is there."""
-        self.harness.spin_until(self.client.server_is_ready, f"the action {self.kind}")
+        harness.spin_until(self.client.server_is_ready, f"the action {kind}")
 
     def send(self, **fields: Any) -> SentGoal:
         """Send a goal, and return it once the server has accepted it."""
-        sent = self.post(**fields)
-        self.harness.spin_until(lambda: sent.handle is not None, "the goal is accepted")
-        return sent
-
-    def post(self, **fields: Any) -> SentGoal:
-        """Send a goal without waiting."""
         sent = SentGoal("")
 
         def on_result(future: Any) -> None:
@@ -105,11 +95,12 @@ class Sender:
             feedback_callback=lambda message: sent.feedback.append(message.feedback),
         )
         future.add_done_callback(on_answer)
+        self.harness.spin_until(lambda: sent.handle is not None, "the goal is accepted")
         return sent
 
     def end_of(self, sent: SentGoal) -> Any:
         """Wait for a result, and return its message."""
-        self.harness.spin_until(lambda: sent.ended, "the result")
+        self.harness.spin_until(lambda: sent.results, "the result")
         return sent.result
 
 
@@ -129,15 +120,6 @@ pytestmark = [
 
 NAMES = ("shoulder_yaw", "shoulder_pitch", "elbow_pitch")
 START, END = [0.4, -0.9, 1.1], [-0.2, -0.5, 1.6]
-ARM_URDF = Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf"
-ARM = {"robot": "three_joint_arm"}
-ARM_PLANNER = {
-    **ARM,
-    "method": "optimal",
-    "optimal.answers": 1,
-    "optimal.intervals": 30,
-    "optimal.cache": 0,
-}
 PLANAR = {"robot": "planar_manipulator", "tick_rate": 50.0}
 
 
@@ -153,8 +135,6 @@ class ActionFlight(Flight):
         super().__init__(harness, planner, plant)
         self.fly_to = Sender(harness, self.probe, FLY_TO, "planner/fly_to")
         self.navigate = Sender(harness, self.probe, NAVIGATE, "planner/navigate_to_pose")
-        self.fly_to.connect()
-        self.navigate.connect()
 
     def decisions(self, goal_id: str) -> list[tuple[str, str]]:
         """State and message of the statuses that decide a goal."""
@@ -275,29 +255,18 @@ def test_a_goal_of_a_topic_replaces_one_of_an_action(harness: Harness) -> None:
 
 
 def arm_flight(harness: Harness) -> ActionFlight:
-    flight = ActionFlight(harness, ARM_PLANNER, {**ARM, "initial_joint_positions": START})
+    arm = {"robot": "three_joint_arm"}
+    quick = {"optimal.answers": 1, "optimal.intervals": 30, "optimal.cache": 0}
+    planner = {**arm, "method": "optimal", **quick}
+    flight = ActionFlight(harness, planner, {**arm, "initial_joint_positions": START})
     flight.start()
     return flight
 
 
-def place_at(position: npt.ArrayLike) -> PoseStamped:
-    """Return a goal of a position alone: its quaternion is zero."""
-    message = goal_at((np.asarray(position).tolist(), [0.0, 0.0, 0.0]))
-    message.pose.orientation.w = 0.0
-    return message
-
-
-def end_of(shapes: npt.ArrayLike) -> np.ndarray[Any, Any]:
+def end_of(shapes: npt.ArrayLike) -> Array:
     """Return where Pinocchio has the end-effector after a motion of the joints from the start."""
-    poses = end_of_motion(ARM_URDF.read_text("utf-8"), NAMES, np.array(shapes), ["end_effector"])
-    return poses["end_effector"][0]
-
-
-def shapes_of(flight: Flight) -> list[list[float]]:
-    return [
-        [dict(zip(m.name, m.position, strict=True))[name] for name in NAMES]
-        for m in flight.probe.messages["joint_states"]
-    ]
+    urdf = robot_file("three_joint_arm").read_text("utf-8")
+    return end_of_motion(urdf, NAMES, np.array(shapes), ["end_effector"])["end_effector"][0]
 
 
 @pytest.mark.parametrize("name", ["", "end_effector"])
@@ -306,10 +275,11 @@ def test_an_end_effector_is_brought_to_a_place(harness: Harness, name: str) -> N
     way = START + np.linspace(0, 1, 40)[:, np.newaxis] * np.subtract(END, START)
     place = end_of(way)
     sent = flight.fly_to.send(
-        end_effectors=[name], end_effector_poses=[place_at(place)], position_tolerance=1e-4
+        end_effectors=[name], end_effector_poses=[position_goal(place)], position_tolerance=1e-4
     )
     assert flight.check(sent) == "reached"
-    np.testing.assert_allclose(end_of(shapes_of(flight)), place, atol=1e-4)
+    flown = joint_values(flight.probe.messages["joint_states"], NAMES)
+    np.testing.assert_allclose(end_of(flown), place, atol=1e-4)
     assert sent.result.errors.end_effector_position <= 1e-4
     for left_open in ("position", "attitude", "end_effector_attitude", "joints"):
         assert math.isnan(getattr(sent.result.errors, left_open)), left_open
@@ -372,7 +342,6 @@ def controller_client(harness: Harness) -> Sender:
     harness.make(CoordinatedControlNode, {**PLANAR, **settings}, name="controller")
     sender = Sender(harness, harness.probe({}), FLY_TO, "controller/fly_to")
     harness.connect()
-    sender.connect()
     return sender
 
 

@@ -161,6 +161,9 @@ def test_the_goal_is_a_ghost_of_the_base_and_the_path_a_line(name: str) -> None:
     assert colour == pytest.approx((0.95, 0.6, 0.1, 1.0))
 
 
+LAST = 2**31 - 1
+
+
 def test_a_path_begins_at_its_start() -> None:
     message = deserialize_message(path_message(PATH, 7_900_000_000, "map"), PathMessage)
     assert (message.header.frame_id, nanoseconds(message.header.stamp)) == ("map", 7_900_000_000)
@@ -170,6 +173,9 @@ def test_a_path_begins_at_its_start() -> None:
     for k, stamped in enumerate(message.poses):
         expected = [*PATH.position[k], *PATH.quaternion[k]]
         assert numbers(stamped.pose) == pytest.approx(expected)
+    # Beyond the last time that a stamp may have, it ends there.
+    message = deserialize_message(path_message(PATH, LAST * 1_000_000_000, "map"), PathMessage)
+    assert [pose.header.stamp.sec for pose in message.poses] == [LAST] * 3
 
 
 def test_a_goal_pose_is_taken_in_its_frame() -> None:
@@ -442,26 +448,18 @@ ACTION = NavigateToPoseAction(NavigateToPose)
 POSE = np.array([0.1, -0.2, 0.3, 0.0, 0.6, 0.0, 0.8])
 
 
-def seconds(duration: Any) -> float:
-    return float(duration.sec + duration.nanosec / 1e9)
-
-
 def test_the_course_of_a_goal_of_nav2() -> None:
     progress = Progress("executing", 12.5, 3.25, 4_500_000_000, POSE, GoalErrors(position=0.75))
     message = ACTION.feedback(progress, "map")
-    assert seconds(message.navigation_time) == 3.25
-    assert seconds(message.estimated_time_remaining) == 12.5
+    assert nanoseconds(message.navigation_time) == 3_250_000_000
+    assert nanoseconds(message.estimated_time_remaining) == 12_500_000_000
     assert message.distance_remaining == 0.75
     here = message.current_pose
-    assert (here.header.frame_id, seconds(here.header.stamp)) == ("map", 4.5)
-    place, turn = here.pose.position, here.pose.orientation
-    found = [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
-    assert found == pytest.approx(POSE.tolist())
-
-
-def test_what_is_not_known_is_zero() -> None:
+    assert (here.header.frame_id, nanoseconds(here.header.stamp)) == ("map", 4_500_000_000)
+    assert numbers(here.pose) == pytest.approx(POSE.tolist())
+    # What is not known is zero.
     message = ACTION.feedback(Progress("planning", None, 1.0, 0, None, GoalErrors()), "map")
-    assert seconds(message.estimated_time_remaining) == message.distance_remaining == 0.0
+    assert nanoseconds(message.estimated_time_remaining) == message.distance_remaining == 0.0
     assert message.current_pose is None
 
 

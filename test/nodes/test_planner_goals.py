@@ -13,19 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from rcl_interfaces.srv import SetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
-from std_srvs.srv import Trigger
 from support.planner_flight import (
     HERE,
     NEAR,
-    PLANNER,
     TOPICS,
     TURNED,
     Flight,
@@ -36,12 +32,10 @@ from support.planner_flight import (
     values_of,
 )
 from support.plant_rig import SLIDERS, TICK_NS
-from support.ros_harness import Harness, construction, nanoseconds
+from support.ros_harness import Harness, nanoseconds
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.nodes import PlannerNode
-from spacerobot_ros.nodes.common.messages import goal_of, interface_class
+from spacerobot_ros.nodes.common.messages import goal_of
 from spacerobot_ros.planning import METHODS, GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
@@ -73,12 +67,7 @@ def test_a_goal_is_met_within_tolerance(harness: Harness) -> None:
     flight.ticks(20)
     assert flight.error_to(TURNED) == pytest.approx((distance, angle), abs=1e-9)
     assert flight.states[-1] == "reached"
-
-
-def test_every_state_is_answered_with_one_command_of_its_stamp(harness: Harness) -> None:
-    flight = Flight(harness)
-    flight.decide(NEAR)
-    flight.ticks(5)
+    # Every state was answered with one command of its stamp.
     states = [stamp_of(m) for m in flight.probe.messages["joint_states"]]
     commands = [stamp_of(m) for m in flight.probe.messages["joint_commands"]]
     assert states == [k * TICK_NS for k in range(len(states))]
@@ -122,29 +111,22 @@ def test_what_cannot_be_done_is_refused_and_the_next_goal_flies(harness: Harness
     flight.ticks(3)
     assert not any(any(m.velocity) for m in flight.probe.messages["joint_states"])
     assert not flight.probe.messages["gait_schedule"]
-    flight.decide(NEAR)
-    assert flight.states == ["idle", *["refused"] * len(REFUSED), "executing", "reached"]
-    assert max(flight.error_to(NEAR)) <= 1e-3
-
-
-def test_a_refused_goal_does_not_disturb_the_one_that_is_flown(harness: Harness) -> None:
-    flight = Flight(harness)
     flight.send(NEAR)
-    flight.start()
     flight.wait("executing")
     flight.ticks(10)
+    # One that is refused now does not disturb the one that is flown.
     flight.send(REFUSED["beyond the stroke"][0])
     flight.wait("refused")
     flight.wait("reached")
-    assert flight.states == ["idle", "executing", "refused", "reached"]
+    refused = ["refused"] * len(REFUSED)
+    assert flight.states == ["idle", *refused, "executing", "refused", "reached"]
     assert max(flight.error_to(NEAR)) <= 1e-3
     assert len(flight.probe.messages["gait_schedule"]) == 1
 
 
-@pytest.fixture
-def flown(harness: Harness) -> Flight:
-    """Return a flight with a slide and a turn, from a pose and a shape that are not zero."""
-    flight = Flight(
+def test_the_schedule_is_what_is_flown_and_stays_for_late_readers(harness: Harness) -> None:
+    """With a slide and a turn, from a pose and a shape that are not zero."""
+    flown = Flight(
         harness,
         {"position_tolerance": 2e-3, "attitude_tolerance": 2e-3},
         {
@@ -153,13 +135,9 @@ def flown(harness: Harness) -> Flight:
             "initial_joint_positions": [0.2, -0.1, 0.15],
         },
     )
-    status = flight.decide(([1.01, -0.52, 0.26], [0.41, -0.31, 0.215]))
+    status = flown.decide(([1.01, -0.52, 0.26], [0.41, -0.31, 0.215]))
     assert values_of(status)["state"] == "reached", status.message
-    return flight
-
-
-def test_the_schedule_is_what_is_flown(flown: Flight) -> None:
-    (schedule,) = flown.probe.messages["gait_schedule"]
+    (schedule,), (path,) = (flown.probe.messages[t] for t in ("gait_schedule", "planned_path"))
     assert list(schedule.joint_names) == SLIDERS
     assert schedule.header.frame_id == "base_link"
     measured = {stamp_of(m): m for m in flown.probe.messages["joint_states"]}
@@ -173,10 +151,7 @@ def test_the_schedule_is_what_is_flown(flown: Flight) -> None:
             held = schedule.points[k - 1].velocities
             np.testing.assert_allclose(held, state.velocity, rtol=0, atol=1e-9)
     assert list(schedule.points[-1].velocities) == [0.0] * 3
-
-
-def test_schedule_and_path_fit_each_other(flown: Flight) -> None:
-    (schedule,), (path,) = (flown.probe.messages[t] for t in ("gait_schedule", "planned_path"))
+    # The path fits the schedule.
     assert path.header.stamp == schedule.header.stamp
     assert stamp_of(path.poses[0]) == stamp_of(schedule)
     times = [stamp_of(knot) - stamp_of(schedule) for knot in path.poses]
@@ -196,12 +171,10 @@ def test_schedule_and_path_fit_each_other(flown: Flight) -> None:
         shape = np.array(schedule.points[at // TICK_NS].positions)
         centres.append(position + attitude.apply(shape / 8))
     np.testing.assert_allclose(centres, np.tile(centres[0], (len(centres), 1)), atol=1e-12)
-
-
-def test_schedule_path_and_status_are_there_for_a_late_reader(flown: Flight) -> None:
+    # Schedule, path and status are there for a late reader.
     latched = ("gait_schedule", "planned_path", "planner/status")
-    late = flown.harness.probe({t: TOPICS[t] for t in latched}, latched=latched, name="late")
-    flown.harness.spin_until(lambda: all(late.count(t) for t in latched), "the latched topics")
+    late = harness.probe({t: TOPICS[t] for t in latched}, latched=latched, name="late")
+    harness.spin_until(lambda: all(late.count(t) for t in latched), "the latched topics")
     for topic in latched:
         assert late.count(topic) == 1
         assert late.last(topic) == flown.probe.last(topic)
@@ -280,11 +253,6 @@ def interrupted(harness: Harness, path: Path) -> Flight:
     return flight
 
 
-def abort(flight: Flight) -> Trigger.Response:
-    client = flight.probe.create_client(Trigger, "planner/abort")
-    return flight.harness.call(client, Trigger.Request())
-
-
 def test_a_goal_is_flown_to_once_the_robot_is_known(harness: Harness, tmp_path: Path) -> None:
     path = tmp_path / "goal.json"
     flight = interrupted(harness, path)
@@ -297,7 +265,7 @@ def test_a_goal_is_flown_to_once_the_robot_is_known(harness: Harness, tmp_path: 
 def test_a_goal_that_is_aborted_before_is_not_flown_to(harness: Harness, tmp_path: Path) -> None:
     path = tmp_path / "goal.json"
     flight = interrupted(harness, path)
-    answer = abort(flight)
+    answer = flight.trigger("planner/abort")
     assert answer.success
     # Who follows the goal learns of its end.
     status = flight.wait("aborted")
@@ -308,7 +276,7 @@ def test_a_goal_that_is_aborted_before_is_not_flown_to(harness: Harness, tmp_pat
     flight.ticks(20)
     assert "executing" not in flight.states
     assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
-    assert not abort(flight).success, "nothing is pursued"
+    assert not flight.trigger("planner/abort").success, "nothing is pursued"
     # A new goal is.
     assert values_of(flight.decide(NEAR))["state"] == "reached"
     assert max(flight.error_to(NEAR)) <= 1e-3
@@ -373,26 +341,6 @@ def test_a_planner_that_is_configured_again_in_flight_is_shown_the_state_it_has_
 # -- parameters -------------------------------------------------------------------------------
 
 
-BAD: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
-    "method": ({"method": "wings"}, ("'method'", "wings", "lie_bracket")),
-    "description": ({"robot_description": "<robot/>"}, ("robot",)),
-    "robot": ({"robot": "octopus"}, ("'robot'", "octopus")),
-    "slow tick rate": ({"tick_rate": 1e-4}, ("'tick_rate'", "0.001 Hz")),
-    "attitude tolerance": ({"attitude_tolerance": math.nan}, ("'attitude_tolerance'",)),
-    "corrections": ({"max_corrections": 1.5}, ("'max_corrections'", "whole number")),
-    "option of the method": ({"lie_bracket.t1": 0.0}, ("'lie_bracket.t1'", "s")),
-}
-
-
-@pytest.mark.parametrize(("parameters", "mentions"), BAD.values(), ids=BAD)
-def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
-    ros_context: rclpy.Context, parameters: dict[str, Any], mentions: tuple[str, ...]
-) -> None:
-    with pytest.raises(SpaceRobotError) as refusal:
-        PlannerNode(**construction(ros_context, {**PLANNER, **parameters}))
-    assert_one_sentence(str(refusal.value), *mentions)
-
-
 def test_a_planner_that_is_configured_again_finds_its_robot_again(harness: Harness) -> None:
     flight = Flight(harness, {"robot": ""})
     assert values_of(flight.decide(NEAR))["state"] == "reached"
@@ -410,23 +358,12 @@ def test_a_planner_that_is_configured_again_finds_its_robot_again(harness: Harne
     assert flight.error_to(HERE)[0] < 1e-3
 
 
-def test_without_the_package_of_the_action_the_planner_says_so(harness: Harness) -> None:
-    if interface_class("control_msgs.action", "FollowJointTrajectory") is not None:
-        pytest.skip("control_msgs is installed")
-    with pytest.raises(SpaceRobotError, match="requires the package control_msgs: install it"):
-        harness.make(PlannerNode, {"robot": "sliding_masses", "output": "trajectory"})
-
-
-# -- services ---------------------------------------------------------------------------------
-
-
 def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     flight = Flight(harness)
     flight.send(NEAR)
     flight.start()
     flight.wait("executing")
-    client = flight.probe.create_client(Trigger, "planner/abort")
-    answer = harness.call(client, Trigger.Request())
+    answer = flight.trigger("planner/abort")
     assert answer.success
     assert_one_sentence(answer.message, "brake along the planned path")
     status = flight.wait("aborted")
@@ -435,12 +372,9 @@ def test_abortion_brings_the_joints_to_rest(harness: Harness) -> None:
     flight.ticks(10**9 // TICK_NS + 3)  # abort_time, and commands that were on their way.
     assert list(flight.probe.last("joint_states").velocity) == [0.0] * 3
     assert flight.states == ["idle", "executing", "aborted"]
-    answer = harness.call(client, Trigger.Request())
+    answer = flight.trigger("planner/abort")
     assert not answer.success
     assert answer.message
-
-
-# -- corrections ------------------------------------------------------------------------------
 
 
 def test_a_tolerance_that_is_tightened_in_flight_makes_corrections_happen(harness: Harness) -> None:
@@ -457,14 +391,8 @@ def test_a_tolerance_that_is_tightened_in_flight_makes_corrections_happen(harnes
     flight.send(TURNED)
     flight.start()
     flight.wait("executing")
-    request = SetParameters.Request(
-        parameters=[
-            Parameter(f"{what}_tolerance", value=1e-6).to_parameter_msg()
-            for what in ("position", "attitude")
-        ]
-    )
-    client = flight.probe.create_client(SetParameters, "planner/set_parameters")
-    assert [r.successful for r in harness.call(client, request).results] == [True, True]
+    tight = [Parameter(f"{what}_tolerance", value=1e-6) for what in ("position", "attitude")]
+    assert [result.successful for result in flight.planner.set_parameters(tight)] == [True, True]
     status = flight.wait("reached", "failed")
     assert values_of(status)["state"] == "reached", status.message
     assert max(flight.error_to(TURNED)) <= 1e-6
@@ -472,9 +400,6 @@ def test_a_tolerance_that_is_tightened_in_flight_makes_corrections_happen(harnes
     assert corrections >= 1
     assert flight.states == ["idle", "executing", *["executing"] * corrections, "reached"]
     assert len(flight.probe.messages["gait_schedule"]) == 1 + corrections
-
-
-# -- ids --------------------------------------------------------------------------------------
 
 
 def stamped(place: Place, sec: int, nanosec: int) -> PoseStamped:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -12,26 +11,20 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
-from nav_msgs.msg import Path as PathMessage
-from rclpy.serialization import deserialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support import crossing
-from support.bad_commands import BAD_COMMANDS
 from support.control_loop import JOINTS, Loop
-from support.odometry import pose_of, twist_of
 from support.oracles import PinocchioOracle
 from support.planner_flight import values_of
-from support.plant_rig import SLIDERS, STATE, TICK, TICK_NS, Rig
+from support.plant_rig import BAD_COMMANDS, SLIDERS, STATE, TICK, TICK_NS, Rig, pose_of, twist_of
 from support.ros_harness import LATCHED, Harness, nanoseconds
 from support.sentences import assert_one_sentence
 from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.nodes import PlantNode
-from spacerobot_ros.planning import BasePath
-from spacerobot_ros.simulation.status import PlantState
+from spacerobot_ros.resources import robot_file
 
 # -- commands ---------------------------------------------------------------------------------
 
@@ -52,6 +45,7 @@ def test_a_command_of_the_right_stamp_steps_exactly_once(harness: Harness) -> No
     harness.settle(rig.probe)
     assert {topic: rig.probe.count(topic) for topic in STATE} == dict.fromkeys(STATE, 6)
     assert rig.diagnosed("commands", "refused") == 2
+    assert not rig.probe.diagnoses("plant: timing"), "lockstep has no deadlines"
 
 
 def test_a_bad_command_is_a_tick_at_rest_with_a_reason(harness: Harness) -> None:
@@ -129,28 +123,14 @@ def test_a_command_from_before_a_reset_is_forgotten(harness: Harness) -> None:
 REALTIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 0.0}
 
 
-def velocity(rig: Rig) -> float:
-    return float(rig.probe.last("joint_states").velocity[0])
-
-
 def wait_for_velocity(rig: Rig, wanted: float) -> None:
-    rig.harness.spin_until(lambda: velocity(rig) == wanted, f"a velocity of {wanted} m/s")
+    rig.harness.spin_until(
+        lambda: rig.probe.last("joint_states").velocity[0] == wanted, f"{wanted} m/s"
+    )
 
 
-def started(rig: Rig) -> int:
-    """Return the time of a state after the first: a stamp of zero is none."""
-    rig.harness.spin_until(lambda: rig.now_ns > 0, "a second state")
-    return rig.now_ns
-
-
-def assert_nothing_moves(rig: Rig, states: int = 5) -> None:
-    before = rig.probe.count("joint_states")
-    rig.wait("joint_states", before + states)
-    assert not any(any(m.velocity) for m in rig.probe.messages["joint_states"][before + 1 :])
-
-
-def assert_state(rig: Rig, state: PlantState) -> None:
-    assert rig.plant.state is state
+def state_of(rig: Rig) -> str:
+    return rig.plant.state.value
 
 
 def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness) -> None:
@@ -158,13 +138,15 @@ def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness
     intruder = harness.probe({}, name="intruder")
     other = intruder.create_publisher(JointState, "joint_commands", 100)
     harness.connect()
-    stamp = started(rig)
-    rig.send([0.1, 0.0, 0.0], stamp_ns=stamp)
+    # A stamp of zero is none.
+    harness.spin_until(lambda: rig.now_ns > 0, "a second state")
+    command = JointState(name=SLIDERS, velocity=[0.1, 0.0, 0.0])
+    command.header.stamp = rig.probe.last("joint_states").header.stamp
+    rig.commands.publish(command)
     wait_for_velocity(rig, 0.1)
     # Until the plant has counted its commanders, a repeated stamp is one commander's own.
-    rig.harness.spin_until(
-        lambda: (other.publish(command_at(stamp)), rig.diagnosed("commands", "refused"))[1],
-        "a refusal",
+    harness.spin_until(
+        lambda: (other.publish(command), rig.diagnosed("commands", "refused"))[1], "a refusal"
     )
     wait_for_velocity(rig, 0.0)
     status = rig.diagnosis("commands")
@@ -172,16 +154,12 @@ def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness
     assert_one_sentence(status.message, "rearm", "is active", "2 nodes")
     rig.send([0.2, 0.0, 0.0])
     rig.wait_for_refusals(int(rig.diagnosed("commands", "refused")))
-    assert_nothing_moves(rig)
+    before = rig.probe.count("joint_states")
+    rig.wait("joint_states", before + 5)
+    assert not any(any(m.velocity) for m in rig.probe.messages["joint_states"][before + 1 :])
     assert "is active" in rig.trigger("plant/rearm").message
     rig.send([0.2, 0.0, 0.0])
     wait_for_velocity(rig, 0.2)
-
-
-def command_at(stamp_ns: int) -> JointState:
-    message = JointState(name=["slider_1", "slider_2", "slider_3"], velocity=[0.1, 0.0, 0.0])
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-    return message
 
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
@@ -189,38 +167,38 @@ def test_abort_holds_everything_until_rearm(harness: Harness, mode: str) -> None
     rig = Rig(harness, {**REALTIME, "time_mode": mode})
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.3)
-    assert_state(rig, PlantState.RUNNING)
+    assert state_of(rig) == "running"
     assert rig.trigger("plant/abort").success
-    assert_state(rig, PlantState.LATCHED)
+    assert state_of(rig) == "latched"
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.0)
     status = rig.diagnosis("commands")
     assert status.level == DiagnosticStatus.ERROR
     assert_one_sentence(status.message, "stopped on request")
     rig.pause(True)
-    assert_state(rig, PlantState.PAUSED)
+    assert state_of(rig) == "paused"
     rig.pause(False)
-    assert_state(rig, PlantState.LATCHED)
+    assert state_of(rig) == "latched"
     assert "stopped" in rig.trigger("plant/rearm").message
     # In real time no command is in force yet; lockstep waits for one.
-    assert_state(rig, PlantState.RUNNING if mode == "lockstep" else PlantState.RESTING)
+    assert state_of(rig) == ("running" if mode == "lockstep" else "resting")
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.3)
     assert "No fault" in rig.trigger("plant/rearm").message
     rig.plant.trigger_deactivate()
-    assert_state(rig, PlantState.INACTIVE)
+    assert state_of(rig) == "inactive"
 
 
 # -- efforts and wrenches ---------------------------------------------------------------------
 
 MASS, MOTOR_TICK = 47.0, 0.02
 STATUS = "plant/status"
-URDF = Path(__file__).parents[2] / "urdf" / "planar_manipulator.urdf"
 
 
 def moving(odom: Odometry, joints: JointState) -> PinocchioOracle:
     """Return the arm in a published state."""
-    oracle = PinocchioOracle(URDF.read_text("utf-8"), list(joints.name))
+    urdf = robot_file("planar_manipulator").read_text("utf-8")
+    oracle = PinocchioOracle(urdf, list(joints.name))
     r, quaternion = pose_of(odom)
     oracle.set_configuration(np.array(joints.position), quaternion, r)
     twist, rates = np.concatenate(twist_of(odom)), np.array(joints.velocity)
@@ -351,12 +329,6 @@ def test_faults_from_before_the_decision_stay(harness: Harness) -> None:
     assert elbow == 0.0
 
 
-# -- states ---------------------------------------------------------------------------------------
-
-
-ROBOTS = Path(__file__).parents[2] / "urdf"
-
-
 # -- what is published ------------------------------------------------------------------------
 
 
@@ -376,7 +348,6 @@ def test_activation_publishes_the_state_of_tick_0_and_the_clock_first(harness: H
     assert not set(rig.probe.order) & set(STATE), "published before activation"
     rig.activate()
     harness.settle(rig.probe)
-    print(rig.probe.order)
     states = [topic for topic in rig.probe.order if topic in STATE]
     assert sorted(states) == sorted(STATE), "every topic once"
     assert states[0] == "/clock"
@@ -421,7 +392,7 @@ def test_the_description_is_there_for_a_late_reader(harness: Harness) -> None:
     for each in carried:
         received.remove(each)
     text = ElementTree.tostring(received, encoding="unicode")
-    file = (ROBOTS / "sliding_masses.urdf").read_text("utf-8")
+    file = robot_file("sliding_masses").read_text("utf-8")
     assert ElementTree.canonicalize(text, strip_text=True) == ElementTree.canonicalize(
         file, strip_text=True
     )
@@ -547,7 +518,7 @@ def test_clearances_are_published_with_events_of_contacts(harness: Harness) -> N
     truth = crossing.distance(np.array(shapes))
     assert (truth[::2] <= 0).tolist() == [False, True, True, False]
     rig.wait("clearance", 4)
-    found = [{pair.key: pair.value for pair in m.values} for m in rig.probe.messages["clearance"]]
+    found = [values_of(m) for m in rig.probe.messages["clearance"]]
     assert [float(each["time"]) for each in found] == pytest.approx(
         [0, 2 * TICK, 4 * TICK, 6 * TICK]
     )
@@ -555,7 +526,7 @@ def test_clearances_are_published_with_events_of_contacts(harness: Harness) -> N
     assert {(each["first"], each["second"]) for each in found} == {("left", "right")}
     levels = [m.level for m in rig.probe.messages["clearance"]]
     assert levels == [b"\0", b"\2", b"\2", b"\0"]
-    events = [{p.key: p.value for p in m.values} for m in rig.probe.messages["events"]]
+    events = [values_of(m) for m in rig.probe.messages["events"]]
     contacts = {e["event"]: float(e["time"]) for e in events if e["event"].startswith("contact")}
     assert contacts == pytest.approx({"contact": 2 * TICK, "contact_ended": 6 * TICK})
 
@@ -573,8 +544,7 @@ def test_a_contact_ends_with_its_obstacle(harness: Harness) -> None:
     harness.connect()
 
     def contacts() -> str:
-        last = rig.probe.messages["plant/status"][-1]
-        return next((pair.value for pair in last.values if pair.key == "contacts"), "")
+        return values_of(rig.probe.last("plant/status")).get("contacts", "")
 
     obstacles.publish(String(data=CRATE))
     harness.settle(rig.probe)
@@ -583,22 +553,6 @@ def test_a_contact_ends_with_its_obstacle(harness: Harness) -> None:
     harness.spin_until(lambda: "crate" in contacts(), "a contact")
     obstacles.publish(String(data=""))
     harness.spin_until(lambda: not contacts(), "its end")
-
-
-LAST = 2**31 - 1
-
-
-def joints(names: list[str], stamp: tuple[int, int] = (1, 0), value: float = 0.5) -> JointState:
-    values = [value] * len(names)
-    message = JointState(name=names, position=values, velocity=values, effort=values)
-    message.header.stamp.sec, message.header.stamp.nanosec = stamp
-    return message
-
-
-def test_a_path_that_ends_beyond_all_stamps_ends_at_the_last() -> None:
-    path = BasePath(np.array([0.0, 5.0]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
-    message = deserialize_message(path_message(path, LAST * 1_000_000_000, "world"), PathMessage)
-    assert [pose.header.stamp.sec for pose in message.poses] == [LAST, LAST]
 
 
 # -- states of others -------------------------------------------------------------------------
@@ -615,8 +569,10 @@ def test_beside_another_robot_a_controller_sees_every_pose(harness: Harness) -> 
 
         def publish(message: Odometry, late: int = number % 2) -> None:
             send(message)
-            stamp = message.header.stamp
-            stranger.publish(joints(["wing"], (stamp.sec, stamp.nanosec + late)))
+            wing = JointState(header=message.header, name=["wing"])
+            wing.position = wing.velocity = wing.effort = [0.5]
+            wing.header.stamp.nanosec += late
+            stranger.publish(wing)
 
         loop.odom.publish = publish
         beside = loop.answer()

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from support.made_bags import array, joint_states, made_bag, odometry
-from support.odometry import pose_of, twist_of
-from support.plant_rig import SLIDERS, STATE, TICK_NS, Rig
-from support.ros_harness import Harness, construction, nanoseconds
-from support.sentences import assert_one_sentence
+from support.plant_rig import SLIDERS, STATE, TICK_NS, Rig, pose_of, twist_of
+from support.ros_harness import Harness, nanoseconds
 
-from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.nodes import PlantNode
-
-JOINTS = ["slider_1", "slider_2", "slider_3"]
-
-URDF = Path(__file__).parents[2] / "urdf"
-
+from spacerobot_ros.resources import robot_file
 
 # -- managed life -----------------------------------------------------------------------------
 
@@ -49,7 +38,7 @@ def test_a_supervisor_can_take_the_plant_through_its_life(harness: Harness) -> N
 
     def step(publisher: Publisher) -> None:
         before = probe.count("joint_states")
-        message = JointState(name=JOINTS, velocity=[0.2, 0.0, 0.0])
+        message = JointState(name=SLIDERS, velocity=[0.2, 0.0, 0.0])
         message.header.stamp = probe.last("joint_states").header.stamp
         publisher.publish(message)
         harness.spin_until(lambda: probe.count("joint_states") > before, "a step")
@@ -95,19 +84,13 @@ def test_a_transition_that_is_not_possible_is_answered_and_changes_nothing(
     assert rig.plant.is_active
     np.testing.assert_array_equal(rig.step([0.2, 0.0, 0.0]).velocity, [0.2, 0.0, 0.0])
     assert succeeds(label="deactivate")
+    before = rig.probe.count("joint_states")
+    rig.send([0.1, 0.1, 0.1])
+    harness.settle(rig.probe)
+    assert rig.probe.count("joint_states") == before, "an inactive plant takes no command"
     assert not succeeds(id=Transition.TRANSITION_DEACTIVATE)
     assert succeeds(id=Transition.TRANSITION_INACTIVE_SHUTDOWN)
     assert not succeeds(id=Transition.TRANSITION_INACTIVE_SHUTDOWN)
-
-
-def test_a_deactivated_lockstep_plant_takes_no_command(harness: Harness) -> None:
-    rig = Rig(harness)
-    rig.plant.trigger_deactivate()
-    rig.send([0.1, 0.1, 0.1])
-    harness.settle(rig.probe)
-    assert rig.probe.count("joint_states") == 1
-    rig.activate()
-    np.testing.assert_array_equal(rig.step([0.2, 0.0, 0.0]).velocity, [0.2, 0.0, 0.0])
 
 
 def test_a_node_shuts_down_from_every_state(harness: Harness) -> None:
@@ -126,79 +109,20 @@ def test_a_node_shuts_down_from_every_state(harness: Harness) -> None:
 # -- parameters -------------------------------------------------------------------------------
 
 
-REFUSED: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
-    "no robot": ({"robot": ""}, ("robot",)),
-    "unknown robot": ({"robot": "octopus"}, ("'robot'", "octopus", "sliding_masses")),
-    "missing file": ({"robot": "nowhere/robot.urdf"}, ("'robot'", "nowhere/robot.urdf")),
-    "broken description": ({"robot_description": "<robot"}, ("robot description",)),
-    "joint positions of wrong length": (
-        {"initial_joint_positions": [0.1, 0.2]},
-        ("initial joint positions", "2", "slider_1, slider_2, slider_3"),
-    ),
-    "joint positions not finite": (
-        {"initial_joint_positions": [0.0, math.nan, 0.0]},
-        ("initial joint positions",),
-    ),
-    "no tick rate": ({"tick_rate": 0.0}, ("'tick rate'", "0.001", "Hz")),
-    "tick rate is not a number": ({"tick_rate": math.nan}, ("'tick rate'",)),
-    "time mode": ({"time_mode": "foo"}, ("'time mode'", "foo", "realtime", "lockstep")),
-    "actuation": ({"actuation": "magnets"}, ("'actuation'", "magnets", "velocity")),
-    "real time factor": ({"real_time_factor": 0.0}, ("'real time factor'",)),
-    "negative timeout": ({"command_timeout": -1.0}, ("'command timeout'", "s")),
-    "integration step": ({"integration_step": -0.01}, ("'integration step'", "s")),
-    "zero quaternion": ({"initial_orientation": [0.0] * 4}, ("initial orientation",)),
-    "three quaternion entries": (
-        {"initial_orientation": [0.0, 0.0, 1.0]},
-        ("'initial orientation'", "4 numbers"),
-    ),
-    "momentum not finite": ({"linear_momentum": [0.0, math.inf, 0.0]}, ("'linear momentum'",)),
-    "end effector": ({"end_effector_frame": "claw"}, ("'end effector frame'", "claw", "mass_1")),
-}  # Words of names are compared without their underscores.
-
-
-@pytest.mark.parametrize(("parameters", "mentions"), REFUSED.values(), ids=REFUSED)
-def test_a_bad_parameter_is_refused_with_a_sentence_that_names_it(
-    ros_context: rclpy.Context, parameters: dict[str, Any], mentions: tuple[str, ...]
-) -> None:
-    given = {"robot": "sliding_masses", "time_mode": "lockstep", **parameters}
-    with pytest.raises(SpaceRobotError) as refusal:
-        PlantNode(**construction(ros_context, given))
-    plain = str(refusal.value).replace("_", " ")
-    assert_one_sentence(plain, *(mention.replace("_", " ") for mention in mentions))
-
-
-def test_parameters_are_described_and_fixed_while_the_plant_lives(harness: Harness) -> None:
-    rig = Rig(harness)
-    descriptor = rig.plant.describe_parameter("tick_rate")
-    assert descriptor.read_only
-    assert "Hz" in descriptor.description
-    assert descriptor.floating_point_range[0].from_value == 0.001
-    (result,) = rig.plant.set_parameters([Parameter("tick_rate", value=50.0)])
-    assert not result.successful
-    assert result.reason
-    rig.step([0.0, 0.0, 0.0])
-    assert rig.now_ns == TICK_NS
-
-
-@pytest.mark.parametrize("name", ["sliding_masses.urdf", "the file", "the text"])
-def test_a_robot_is_a_name_a_file_or_a_text(harness: Harness, tmp_path: Path, name: str) -> None:
-    text = (URDF / "sliding_masses.urdf").read_text("utf-8").replace("slider_2", "boom")
+@pytest.mark.parametrize("given", ["file", "text"])
+def test_a_robot_is_a_file_or_a_text(harness: Harness, tmp_path: Path, given: str) -> None:
+    text = robot_file("sliding_masses").read_text("utf-8").replace("slider_2", "boom")
     file = tmp_path / "mine.urdf"
     file.write_text(text, "utf-8")
-    choose: dict[str, Callable[[], dict[str, str]]] = {
-        "sliding_masses.urdf": lambda: {"robot": str(URDF / "sliding_masses.urdf")},
-        "the file": lambda: {"robot": str(file)},
-        "the text": lambda: {"robot": "octopus", "robot_description": text},
-    }
-    rig = Rig(harness, choose[name]())
-    second = "slider_2" if name == "sliding_masses.urdf" else "boom"
-    assert list(rig.probe.last("joint_states").name) == ["slider_1", second, "slider_3"]
+    of_text = {"robot": "octopus", "robot_description": text}
+    rig = Rig(harness, of_text if given == "text" else {"robot": str(file)})
+    assert list(rig.probe.last("joint_states").name) == ["slider_1", "boom", "slider_3"]
 
 
 MASS = 10 + 3 * 2.0
 P, L = [0.8, -0.4, 0.2], [0.03, 0.02, -0.01]
 POSE = (1.0, -2.0, 3.0, 0.0, 0.6, 0.0, 0.8)
-JOINTS_PLANT_RESUMPTION, RATES = [0.5, -0.25, 0.125], [0.01, 0.02, 0.03]
+SHAPE, RATES = [0.5, -0.25, 0.125], [0.01, 0.02, 0.03]
 
 
 def bag_of(path: Path, names: list[str] = SLIDERS, prefix: str = "", L: list[float] = L) -> Path:
@@ -209,23 +133,26 @@ def bag_of(path: Path, names: list[str] = SLIDERS, prefix: str = "", L: list[flo
             say(f"{prefix}/momentum", array(*momenta), time)
             pose = (POSE[0] + more, *POSE[1:])
             say(f"{prefix}/odom", odometry(time, *pose, *([0.7] * 6)), time)
-            joints = [q + more for q in JOINTS_PLANT_RESUMPTION[: len(names)]]
+            joints = [q + more for q in SHAPE[: len(names)]]
             rates = [q + more for q in RATES[: len(names)]]
             say(f"{prefix}/joint_states", joint_states(time, names, joints, rates), time)
     return path
 
 
-def resumed(harness: Harness, bag: Path, **parameters: Any) -> Rig:
-    return Rig(harness, {"resume_bag": str(bag), **parameters})
-
-
-def test_the_first_state_is_the_last_of_the_bag(harness: Harness, tmp_path: Path) -> None:
-    rig = resumed(harness, bag_of(tmp_path / "a.mcap"))
+@pytest.mark.parametrize(("actuation", "rates"), [("velocity", [0.0] * 3), ("effort", RATES)])
+def test_the_first_state_is_the_last_of_the_bag(
+    harness: Harness, tmp_path: Path, actuation: str, rates: list[float]
+) -> None:
+    """Only motors leave joints moving."""
+    bag = bag_of(tmp_path / "a.mcap")
+    rig = Rig(harness, {"resume_bag": str(bag), "actuation": actuation})
     harness.settle(rig.probe)
     joints, odom = rig.probe.last("joint_states"), rig.probe.last("odom")
+    np.testing.assert_allclose(joints.velocity, rates, atol=1e-14)
+    assert np.linalg.norm(np.concatenate(twist_of(odom))) > 0.01
     assert nanoseconds(joints.header.stamp) == nanoseconds(odom.header.stamp) == 23 * TICK_NS
     assert nanoseconds(rig.probe.last("/clock").clock) == 23 * TICK_NS
-    np.testing.assert_allclose(joints.position, JOINTS_PLANT_RESUMPTION, atol=1e-15)
+    np.testing.assert_allclose(joints.position, SHAPE, atol=1e-15)
     position, quaternion = pose_of(odom)
     np.testing.assert_allclose([*position, *quaternion], POSE, atol=1e-15)
     np.testing.assert_allclose(rig.probe.last("momentum").data[:6], [*P, *L], atol=1e-14)
@@ -233,7 +160,7 @@ def test_the_first_state_is_the_last_of_the_bag(harness: Harness, tmp_path: Path
 
 def test_time_goes_on_from_there_tick_by_tick(harness: Harness, tmp_path: Path) -> None:
     # Without angular momentum the base coasts and does not turn: by hand, r + p t / m.
-    rig = resumed(harness, bag_of(tmp_path / "a.mcap", L=[0.0] * 3))
+    rig = Rig(harness, {"resume_bag": str(bag_of(tmp_path / "a.mcap", L=[0.0] * 3))})
     assert rig.plant.tick == 23
     for k in (1, 2):
         joints = rig.step([0.0] * 3)
@@ -243,30 +170,15 @@ def test_time_goes_on_from_there_tick_by_tick(harness: Harness, tmp_path: Path) 
     expected = np.array(POSE[:3]) + np.array(P) / MASS * 0.1
     np.testing.assert_allclose(pose_of(odom)[0], expected, atol=1e-13)
     np.testing.assert_allclose(pose_of(odom)[1], POSE[3:], atol=1e-13)
-    np.testing.assert_allclose(joints.position, JOINTS_PLANT_RESUMPTION, atol=1e-15)
+    np.testing.assert_allclose(joints.position, SHAPE, atol=1e-15)
     np.testing.assert_allclose(rig.probe.last("momentum").data[:3], P, atol=1e-13)
 
 
-@pytest.mark.parametrize(("actuation", "rates"), [("velocity", [0.0] * 3), ("effort", RATES)])
-def test_only_motors_leave_joints_moving(
-    harness: Harness, tmp_path: Path, actuation: str, rates: list[float]
-) -> None:
-    rig = resumed(harness, bag_of(tmp_path / "a.mcap"), actuation=actuation)
-    joints = rig.probe.last("joint_states")
-    np.testing.assert_allclose(joints.velocity, rates, atol=1e-14)
-    harness.settle(rig.probe)
-    np.testing.assert_allclose(rig.probe.last("momentum").data[:6], [*P, *L], atol=1e-14)
-    assert np.linalg.norm(np.concatenate(twist_of(rig.probe.last("odom")))) > 0.01
-
-
 def test_a_bag_of_another_robot_is_refused(harness: Harness, tmp_path: Path) -> None:
-    bags = {
-        "others": bag_of(tmp_path / "a.mcap", ["slider_2", "slider_1", "slider_3"]),
-        "fewer": bag_of(tmp_path / "b.mcap", SLIDERS[:2]),
-        "elsewhere": bag_of(tmp_path / "c.mcap", prefix="/a"),
-    }
-    for bag, mention in zip(
-        bags.values(), ("slider_2, slider_1", "slider_1, slider_2;", "no messages on"), strict=True
+    for bag, mention in (
+        (bag_of(tmp_path / "a.mcap", ["slider_2", "slider_1", "slider_3"]), "slider_2, slider_1"),
+        (bag_of(tmp_path / "b.mcap", SLIDERS[:2]), "slider_1, slider_2;"),
+        (bag_of(tmp_path / "c.mcap", prefix="/a"), "no messages on"),
     ):
         plant = harness.make(
             PlantNode,

@@ -13,11 +13,10 @@ from rcl_interfaces.msg import Log
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool, Trigger
-from support.bad_commands import BAD_COMMANDS
+from std_srvs.srv import SetBool
 from support.control_loop import Loop, pose
 from support.planner_flight import NEAR, PLANNER, Flight, stamp_of, values_of
-from support.plant_rig import SLIDERS, TICK, TICK_NS, Rig
+from support.plant_rig import BAD_COMMANDS, SLIDERS, TICK, TICK_NS, Rig
 from support.ros_harness import LATCHED, Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
 
@@ -36,11 +35,6 @@ SLOW = {**PLANNER, "lie_bracket.t1": 4.0}
 """A slide of 4 s."""
 
 
-def call(flight: Flight, service: str) -> Any:
-    client = flight.probe.create_client(Trigger, f"plant/{service}")
-    return flight.harness.call(client, Trigger.Request())
-
-
 def pause(flight: Flight, paused: bool) -> None:
     client = flight.probe.create_client(SetBool, "plant/pause")
     assert flight.harness.call(client, SetBool.Request(data=paused)).success
@@ -48,13 +42,6 @@ def pause(flight: Flight, paused: bool) -> None:
 
 def place(flight: Flight) -> list[float]:
     return list(flight.probe.last("joint_states").position)
-
-
-def stays(flight: Flight) -> None:
-    """Check that nothing moves, as long as any watch for joints that do not follow could take."""
-    rest = place(flight)
-    flight.ticks(60)
-    assert place(flight) == rest
 
 
 def flies_again(flight: Flight, *states: str) -> None:
@@ -76,7 +63,7 @@ def test_an_abort_of_the_plant_ends_the_goal_until_there_is_another(
     flight.wait("executing")
     flight.ticks(15)
     assert file.exists()
-    call(flight, "abort")
+    flight.trigger("plant/abort")
     status = flight.wait("aborted")
     assert_one_sentence(status.message, "Aborted by the plant: stopped on request.")
     assert not file.exists()
@@ -85,8 +72,9 @@ def test_an_abort_of_the_plant_ends_the_goal_until_there_is_another(
     flight.send(OTHER)
     refused = flight.wait("refused")
     assert_one_sentence(refused.message, "'/plant' is latched", "rearm it")
-    call(flight, "rearm")
-    stays(flight)
+    flight.trigger("plant/rearm")
+    # As long as any watch for joints that do not follow could take.
+    flight.ticks(60)
     assert place(flight) == rest
     flies_again(flight, "idle", "executing", "aborted", "refused")
 
@@ -141,7 +129,7 @@ def test_a_goal_on_file_is_not_resumed_while_the_plant_is_latched(
                     '"joint_positions": null, "id": "7.000000000"}}')  # fmt: skip
     flight = Flight(harness, {"resume_file": str(file)})
     flight.start()
-    call(flight, "abort")
+    flight.trigger("plant/abort")
     flight.planner.trigger_deactivate()
     flight.planner.trigger_activate()
     flight.ticks(5)
@@ -187,11 +175,11 @@ def test_a_status_of_another_node_stops_nothing_and_is_reported(harness: Harness
     assert flight.states == ["idle", "executing"]
     pause(flight, True)
     # The plant's own statuses count again, the one that was not heard first, once it is alone.
-    call(flight, "abort")
+    flight.trigger("plant/abort")
     harness.remove(forger)
     status = flight.wait("aborted")
     assert_one_sentence(status.message, "stopped on request")
-    call(flight, "rearm")
+    flight.trigger("plant/rearm")
     pause(flight, False)
     flies_again(flight, "idle", "executing", "aborted")
 
@@ -214,9 +202,6 @@ def test_a_status_of_a_node_that_has_left_locks_nothing(harness: Harness) -> Non
     plant = flight.planner.commander.plant
     harness.spin_until(lambda: not plant.refusal_of_goals, "the plant's own status")
     flies_again(flight, *flight.states)
-
-
-# -- the controller ---------------------------------------------------------------------------
 
 
 HOSTILE = "A fuse: \x1b[2J\x1b]0;title\x07 it is\rblown.\n"
@@ -303,9 +288,8 @@ def test_real_time_holds_the_last_good_command(harness: Harness) -> None:
         rig.wait_for_refusals(count)
         warned = [
             status.message
-            for array in rig.probe.messages["/diagnostics"]
-            for status in array.status
-            if status.name == "plant: commands" and status.level == DiagnosticStatus.WARN
+            for status in rig.probe.diagnoses("plant: commands")
+            if status.level == DiagnosticStatus.WARN
         ]
         assert_one_sentence(warned[-1], "refused", reason)
     np.testing.assert_array_equal(rig.probe.last("joint_states").velocity, [0.1, 0.0, -0.1])
@@ -461,9 +445,3 @@ def test_a_plant_in_real_time_tells_its_timing(harness: Harness) -> None:
     assert set(status["plant: strokes"]) == set(SLIDERS)
     left = float(status["plant: strokes"]["slider_2"])
     assert left == pytest.approx(rig.plant.plant.robot.upper[1], abs=1e-9), "it has not moved"
-
-
-def test_lockstep_has_no_deadlines(harness: Harness) -> None:
-    rig = Rig(harness)
-    rig.wait("/diagnostics", 1)
-    assert not any("timing" in s.name for s in rig.probe.last("/diagnostics").status)

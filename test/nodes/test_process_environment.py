@@ -87,9 +87,7 @@ def test_without_shared_memory_messages_go_through_sockets(
     assert ("messages go through sockets" in caplog.text) == bool(transport)
 
 
-def test_memory_that_cannot_be_written_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_memory_that_cannot_be_written_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     with_free(monkeypatch, 2**30)
     monkeypatch.setattr("os.access", lambda *_: False)
     process.use_loopback_discovery()
@@ -129,10 +127,7 @@ def test_domains_are_numbers_that_have_ports(monkeypatch: pytest.MonkeyPatch, do
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "options",
-    ["ro", "size=256k"],
-)
+@pytest.mark.parametrize("options", ["ro", "size=256k"])
 def test_a_flight_without_shared_memory_reaches_its_goal(
     options: str, tmp_path: Path, own_domain: None
 ) -> None:
@@ -140,13 +135,9 @@ def test_a_flight_without_shared_memory_reaches_its_goal(
     unshare = shutil.which("unshare")
     if unshare is None or subprocess.run([unshare, "-m", "true"], check=False).returncode:
         pytest.skip("no mount namespaces here")
-    command = " ".join(
-        [
-            f"mount -t tmpfs -o {options} none /dev/shm && exec {sys.executable} -m spacerobot_ros",
-            "run sliding_masses --bag",
-            str(tmp_path / "flight.mcap"),
-            "--nodes",
-        ]
+    command = (
+        f"mount -t tmpfs -o {options} none /dev/shm && exec {sys.executable} -m spacerobot_ros "
+        f"run sliding_masses --bag {tmp_path / 'flight.mcap'} --nodes"
     )
     ended = subprocess.run(
         [unshare, "-m", "sh", "-c", command],
@@ -210,11 +201,6 @@ RELEASED = {"_state_machine"}
 """Set to None when the node is destroyed: it would keep the node in the graph."""
 
 
-def own_classes(kind: type) -> list[type]:
-    """Return a node's class and its bases down to rclpy's."""
-    return [each for each in kind.__mro__ if issubclass(each, FlightNode)]
-
-
 def assigned(kind: type) -> set[str]:
     """Return the attributes of ``self`` that the methods of a class assign."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
@@ -228,26 +214,18 @@ def assigned(kind: type) -> set[str]:
     }
 
 
-@pytest.fixture
-def rclpy_attributes(ros_context: rclpy.Context) -> set[str]:
-    """Return the attributes of a node that is rclpy's alone, and those of its class."""
+def test_no_attribute_of_rclpy_is_assigned_and_no_private_method_replaced(
+    ros_context: rclpy.Context,
+) -> None:
     node = LifecycleNode("plain", context=ros_context)
-    names = {*vars(node), *(name for name in dir(LifecycleNode) if not name.startswith("__"))}
+    inherited = {*vars(node), *(name for name in dir(LifecycleNode) if not name.startswith("__"))}
     node.destroy_node()
-    assert {"_clock", "_timers", "_parameters", "_logger"} <= names
-    return names
-
-
-@pytest.mark.parametrize("kind", NODES, ids=lambda kind: kind.__name__)
-def test_no_attribute_of_rclpy_is_assigned(kind: type, rclpy_attributes: set[str]) -> None:
-    found = {name for each in own_classes(kind) for name in assigned(each)}
-    assert {"_failure", "fault"} <= found
-    assert found & rclpy_attributes <= RELEASED
-
-
-@pytest.mark.parametrize("kind", NODES, ids=lambda kind: kind.__name__)
-def test_no_private_method_of_rclpy_is_replaced(kind: type, rclpy_attributes: set[str]) -> None:
-    own = {name for each in own_classes(kind) for name in vars(each)}
-    assert not {name for name in own & rclpy_attributes if name.startswith("_")} - {
-        "__init__", "__module__", "__doc__", "__annotations__",
-    }  # fmt: skip
+    assert {"_clock", "_timers", "_parameters", "_logger"} <= inherited
+    for kind in NODES:
+        # A node's class and its bases down to rclpy's.
+        own = [each for each in kind.__mro__ if issubclass(each, FlightNode)]
+        found = {name for each in own for name in assigned(each)}
+        assert {"_failure", "fault"} <= found
+        assert found & inherited <= RELEASED, kind
+        replaced = {name for each in own for name in vars(each)} & inherited
+        assert not [name for name in replaced if name.startswith("_")], kind

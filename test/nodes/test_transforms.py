@@ -96,9 +96,7 @@ def record_states(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "robot", [pytest.param("servicer", marks=pytest.mark.slow), "sliding_masses"]
-)
+@pytest.mark.parametrize("robot", ["servicer", "sliding_masses"])
 def test_a_bag_has_the_frames_of_odom_and_of_pinocchio(
     harness: Harness, tmp_path: Path, robot: str
 ) -> None:
@@ -108,9 +106,7 @@ def test_a_bag_has_the_frames_of_odom_and_of_pinocchio(
     odom, joints = recorded["odom"], recorded["joint_states"]
     poses = odom.table(columns("odom", "pose.pose"))
     positions = np.asarray(joints.field("position"))
-    static = [message for _, message in bag["/tf_static"].messages()] if "/tf_static" in (
-        bag.topics
-    ) else []  # fmt: skip
+    static = [m for _, m in bag["/tf_static"].messages()] if "/tf_static" in bag.topics else []
     model = pinocchio.buildModelFromXML(
         robot_file(robot).read_text(), pinocchio.JointModelFreeFlyer()
     )

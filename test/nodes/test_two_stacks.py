@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, String
 from std_srvs.srv import Trigger
+from support.planner_flight import goal_at, values_of
 from support.recorded_stack import has_parameters
 from support.ros_harness import Harness, Probe, nanoseconds
 
@@ -40,11 +41,10 @@ ROBOTS: dict[str, dict[str, Any]] = {
 class NamedStack:
     """Plant, planner and recorder of one namespace, in lockstep."""
 
-    def __init__(self, harness: Harness, name: str, bag: Path, *, own_clock: bool = True) -> None:
+    def __init__(self, harness: Harness, name: str, bag: Path) -> None:
         self.harness, self.name = harness, name
-        namespace = [] if not name else ["-r", f"__ns:=/{name}"]
-        moved = ["-r", "/clock:=clock"] if name and own_clock else []
-        words = {"cli_args": ["--ros-args", *namespace, *moved], "autostart": False}
+        moved = ["-r", f"__ns:=/{name}", "-r", "/clock:=clock"] if name else []
+        words = {"cli_args": ["--ros-args", *moved], "autostart": False}
         values = ROBOTS[name or "one"]
         robot = {key: values[key] for key in ("robot", "tick_rate")}
         lockstep = {**values, "time_mode": "lockstep", "marker_period": 0.0}
@@ -70,34 +70,23 @@ class NamedStack:
 
     def fly(self) -> Callable[[], bool]:
         """Begin a flight to a goal 1 cm ahead; return whether it is decided."""
-        goal = PoseStamped()
-        goal.header.frame_id = "world"
-        goal.pose.position.x = ROBOTS[self.name or "one"].get("initial_position", [0.0])[0] + 0.01
-        goal.pose.orientation.w = 1.0
-        self.goals.publish(goal)
+        x = ROBOTS[self.name or "one"].get("initial_position", [0.0])[0] + 0.01
+        self.goals.publish(goal_at(([x, 0.0, 0.0], [0.0] * 3)))
         self.plant.require_transition(self.plant.trigger_activate)
-        return self.is_decided
-
-    def is_decided(self) -> bool:
-        states = [
-            pair.value
-            for status in self.probe.messages["planner/status"]
-            for pair in status.values
-            if pair.key == "state"
-        ]
-        return "reached" in states
+        heard = self.probe.messages["planner/status"]
+        return lambda: any(values_of(status)["state"] == "reached" for status in heard)
 
     def finish(self) -> None:
+        def has_all() -> bool:
+            self.recorder.scan()
+            self.recorder.flush()
+            return has_parameters(self.bag, "plant", "planner")
+
         self.plant.trigger_deactivate()
         self.harness.settle(self.probe)
-        self.harness.spin_until(self.parameters_are_there, "the plant's parameters")
+        self.harness.spin_until(has_all, "the nodes' parameters")
         self.recorder.trigger_deactivate()
         self.recorder.trigger_cleanup()
-
-    def parameters_are_there(self) -> bool:
-        self.recorder.scan()
-        self.recorder.flush()
-        return has_parameters(self.bag, "plant", "planner")
 
 
 @pytest.mark.slow
@@ -203,9 +192,7 @@ def test_all_have_met_or_the_topics_say_who_has_not() -> None:
     # Readers from elsewhere are no matter.
     more = endpoints({"/odom": 7, "/clock": 7}, [("/joint_commands", 1)])
     assert topics_without_all_matches([*more, *PLANNER, *RECORDER]) == set()
-
-
-def test_two_readers_of_one_node_are_two() -> None:
+    # Two readers of one node are two.
     twice = endpoints({}, [("/clock", 1), ("/clock", 1)])
     assert topics_without_all_matches([*PLANT, *PLANNER, *RECORDER, *twice]) == {"/clock"}
 

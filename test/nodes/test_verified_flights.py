@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,12 @@ import pytest
 import yaml
 from geometry_msgs.msg import WrenchStamped
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from support.altered_bags import altered
 from support.command_line import CliRunner, Result
-from support.recorded_stack import Stack, has_parameters, parameters_of
-from support.ros_harness import Harness
+from support.recorded_stack import Stack, has_parameters
+from support.ros_harness import Harness, dumped
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros import fly, load_scenario, read_bag
@@ -27,6 +25,7 @@ from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlantNode, RecorderNode
+from spacerobot_ros.parameters import values_of
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario_files import read_scenario
 
@@ -78,12 +77,18 @@ class Flight:
         harness.spin_until(scanned, "the recorder listens")
         harness.connect()
         self.recorder.trigger_activate()
-        self.recorder.describe("parameters/plant", parameters_of(self.plant))
+        values = {"autostart": True, **values_of(self.plant.config)}
+        texts = {name: json.dumps(value) for name, value in values.items()}
+        self.recorder.describe("parameters/plant", texts)
 
     def fly(self, ticks: int = TICKS) -> Path:
         """Fly so many ticks and complete the bag."""
-        timer = self.probe.create_timer(0.001, self._launch)
-        self._timer = timer
+
+        def launch() -> None:
+            self.probe.destroy_timer(timer)
+            self.plant.trigger_activate()
+
+        timer = self.probe.create_timer(0.001, launch)
         self.harness.spin_until(lambda: self.plant.tick >= ticks, f"{ticks} ticks")
         self.plant.trigger_deactivate()
         before = -1
@@ -93,10 +98,6 @@ class Flight:
         self.recorder.trigger_deactivate()
         self.recorder.trigger_cleanup()
         return self.bag
-
-    def _launch(self) -> None:
-        self.probe.destroy_timer(self._timer)
-        self.plant.trigger_activate()
 
     def _on_state(self, state: JointState) -> None:
         stamp = state.header.stamp
@@ -187,31 +188,15 @@ OF_ROS = {"use_sim_time", "start_type_description_service"}
 QOS_OVERRIDE = "qos_overrides./clock.subscription.durability"
 
 
-def dumped(node: Node) -> dict[str, Any]:
-    """Return what ``ros2 param dump`` writes of a node: its parameters, in groups by the dots."""
-    section: dict[str, Any] = {}
-    for name, parameter in node.get_parameters_by_prefix("").items():
-        *groups, last = name.split(".")
-        inner = section
-        for group in groups:
-            inner = inner.setdefault(group, {})
-        value = parameter.value
-        plain = None | bool | int | float | str
-        inner[last] = value if isinstance(value, plain) else list(value)
-    return {node.get_fully_qualified_name(): {"ros__parameters": section}}
+def told(*words: str | Path) -> Result:
+    """Return what a command says."""
+    return CliRunner().invoke(main, list(map(str, words)))
 
 
-@dataclass
-class Recorded:
-    """A flight by nodes that the recorder does not compose: their parameters, its bag, a dump."""
-
-    bag: Path
-    dump: Path
-    parameters: dict[str, dict[str, Any]]
-
-
-@pytest.fixture
-def recorded(harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recorded:
+def test_bags_and_dumps_with_the_parameters_of_ros_are_read(
+    harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a flight by nodes that the recorder does not compose."""
     monkeypatch.chdir(tmp_path)
     stack = Stack(harness, tmp_path / "flight.mcap")
     results = stack.planner.set_parameters([Parameter("use_sim_time", value=True)])
@@ -232,50 +217,36 @@ def recorded(harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     dump = tmp_path / "dump.yaml"
     dump.write_text("".join(yaml.safe_dump(dumped(node)) for node in nodes), "utf-8")
     metadata = stack.close_bag().metadata
-    names = ("plant", "planner")
-    given = {
-        node: {name: json.loads(text) for name, text in metadata[f"parameters/{node}"].items()}
-        for node in names
-    }
-    return Recorded(stack.bag, dump, given)
-
-
-def told(*words: str | Path) -> Result:
-    """Return what a command says."""
-    return CliRunner().invoke(main, list(map(str, words)))
-
-
-def test_bags_and_dumps_with_the_parameters_of_ros_are_read(recorded: Recorded) -> None:
-    assert set(recorded.parameters["plant"]) >= {"robot", "autostart", *OF_ROS}
-    assert set(recorded.parameters["planner"]) >= {QOS_OVERRIDE, *OF_ROS}
+    assert set(metadata["parameters/plant"]) >= {"robot", "autostart", *OF_ROS}
+    assert set(metadata["parameters/planner"]) >= {QOS_OVERRIDE, *OF_ROS}
     for words in (
-        ("report", recorded.bag, "-o", "out.html"),
-        ("figures", recorded.bag, "--format", "png", "-o", "figures"),
-        ("verify", recorded.bag),
-        ("export", recorded.bag, "--format", "csv", "-o", "tables"),
+        ("report", stack.bag, "-o", "out.html"),
+        ("figures", stack.bag, "--format", "png", "-o", "figures"),
+        ("verify", stack.bag),
+        ("export", stack.bag, "--format", "csv", "-o", "tables"),
     ):
         result = told(*words)
         assert result.exit_code == 0, (words, result.output)
-    assert read_bag(recorded.bag)["/odom"].field("pose.pose.position.x")[-1] == pytest.approx(
+    assert read_bag(stack.bag)["/odom"].field("pose.pose.position.x")[-1] == pytest.approx(
         0.05, abs=2e-3
     )
-    scenario = read_flight(open_flight_bag(recorded.bag)).scenario
+    scenario = read_flight(open_flight_bag(stack.bag)).scenario
     assert scenario.plant.tick_rate == 20.0
     assert (scenario.planner.method, scenario.planner.tick_rate) == ("lie_bracket", 20.0)
 
-    sections, _ = read_scenario(recorded.dump)
+    sections, _ = read_scenario(dump)
     assert set(sections) == {"plant", "planner", "recorder"}
     assert sections["planner"]["use_sim_time"] is True
     assert sections["planner"][QOS_OVERRIDE] == "volatile"
-    flight = fly(load_scenario(str(recorded.dump)), position=(0.05, 0.0, 0.0))
+    flight = fly(load_scenario(str(dump)), position=(0.05, 0.0, 0.0))
     assert flight.succeeded
     assert flight.scenario.planner.options["lie_bracket"].t1 == 2.0
-    none = told("run", recorded.dump)
+    none = told("run", dump)
     assert none.exit_code == 2
     assert_one_sentence(none.stderr, "'dump' has no goal", "--goal-rpy-deg 0 0 10")
-    text = recorded.dump.read_text("utf-8")
-    recorded.dump.write_text(text.replace("tick_rate", "tick_rat"), "utf-8")
-    misspelt = told("run", recorded.dump, "--goal", *["0.05", "0", "0", "0", "0", "0", "1"])
+    text = dump.read_text("utf-8")
+    dump.write_text(text.replace("tick_rate", "tick_rat"), "utf-8")
+    misspelt = told("run", dump, "--goal", *["0.05", "0", "0", "0", "0", "0", "1"])
     assert misspelt.exit_code == 2
     assert_one_sentence(misspelt.stderr, "has no parameter 'tick_rat'")
 

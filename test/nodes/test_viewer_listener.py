@@ -91,6 +91,12 @@ def pose_of(x: float, y: float, z: float) -> Pose:
     return Pose(position=Point(x=x, y=y, z=z), orientation=turn)
 
 
+def odom_at(x: float, y: float, z: float) -> Odometry:
+    odom = Odometry()
+    odom.pose.pose = pose_of(x, y, z)
+    return odom
+
+
 def joints(order: list[int], sec: int = 3, **changed: Any) -> JointState:
     """Return joint states whose entry of the joint i is i + 0.1, 0.2, 0.3, in an order."""
     values: dict[str, Any] = {
@@ -106,9 +112,7 @@ def joints(order: list[int], sec: int = 3, **changed: Any) -> JointState:
 
 def test_a_state_is_shown_once_pose_and_joints_are_there(viewed: Viewed) -> None:
     n = len(NAMES)
-    odom = Odometry()
-    odom.pose.pose = pose_of(1.0, 2.0, 3.0)
-    viewed.say("odom", odom)
+    viewed.say("odom", odom_at(1.0, 2.0, 3.0))
     assert viewed.look().measured is None
     order = list(reversed(range(n)))
     viewed.say("joint_states", joints(order))
@@ -123,13 +127,11 @@ def test_a_state_is_shown_once_pose_and_joints_are_there(viewed: Viewed) -> None
         assert values == pytest.approx(first + np.arange(n)), "in the order of the description"
     assert viewed.look().age_s > state.age_s == 0.0
     # Half a state is a new one.
-    odom.pose.pose = pose_of(4.0, 2.0, 3.0)
-    viewed.say("odom", odom)
+    viewed.say("odom", odom_at(4.0, 2.0, 3.0))
     state = viewed.look()
     assert state.measured is not None
     assert (state.age_s, state.measured.pose[0], state.measured.time_s) == (0.0, 4.0, 3.25)
-    odom.pose.pose = pose_of(math.nan, 2.0, 3.0)
-    viewed.say("odom", odom)
+    viewed.say("odom", odom_at(math.nan, 2.0, 3.0))
     state = viewed.look()
     assert state.measured is not None
     assert state.measured.pose[0] == 4.0
@@ -152,9 +154,7 @@ def test_a_state_is_shown_once_pose_and_joints_are_there(viewed: Viewed) -> None
 def test_joint_states_that_lack_values_are_shown_as_far_as_they_go(
     viewed: Viewed, changed: dict[str, Any], shown: tuple[Any, ...] | None
 ) -> None:
-    odom = Odometry()
-    odom.pose.pose = pose_of(1.0, 2.0, 3.0)
-    viewed.say("odom", odom)
+    viewed.say("odom", odom_at(1.0, 2.0, 3.0))
     viewed.say("joint_states", joints(list(range(len(NAMES))), **changed))
     measured = viewed.look().measured
     if shown is None:
@@ -182,9 +182,7 @@ def test_other_streams_are_shown_as_they_come(viewed: Viewed) -> None:
     state = viewed.look()
     assert state.firing is not None
     assert state.firing.duty.tolist() == [0.25, 1.0]
-    odom = Odometry()
-    odom.pose.pose = pose_of(1.5, -0.25, 0.75)
-    viewed.say("target/odom", odom)
+    viewed.say("target/odom", odom_at(1.5, -0.25, 0.75))
     target = viewed.look().target
     assert target is not None
     assert target.tolist() == [1.5, -0.25, 0.75, *TURNED]
@@ -192,22 +190,18 @@ def test_other_streams_are_shown_as_they_come(viewed: Viewed) -> None:
 
 def test_statuses_are_read_by_the_kind_of_their_node(viewed: Viewed) -> None:
     pose = (0.5, 0.25, 0.125, *TURNED)
-    planner = PlannerStatus(PlannerState.PLANNING, "A plan is made.", goal=pose)
-    controller = ControllerStatus(ControllerState.TRACKING, "The goal is approached.")
-    plant = PlantStatus(PlantState.RUNNING, "A command is active.")
-    replay = ReplayStatus(1.0, 2.0, state="paused", rate=1.5)
-    for name, status in (
-        ("planner", planner),
-        ("controller", controller),
-        ("plant", plant),
-        ("replay", replay),
-    ):
+    statuses = {
+        "planner": PlannerStatus(PlannerState.PLANNING, "A plan is made.", goal=pose),
+        "controller": ControllerStatus(ControllerState.TRACKING, "The goal is approached."),
+        "plant": PlantStatus(PlantState.RUNNING, "A command is active."),
+        "replay": ReplayStatus(1.0, 2.0, state="paused", rate=1.5),
+    }
+    for name, status in statuses.items():
         viewed.report(f"{name}/status", status, f"/{name}")
         viewed.say(f"{name}/status", DiagnosticStatus(name="/other", message="of another kind"))
     state = viewed.look()
-    assert (state.planner, state.controller) == (planner, controller)
-    assert (state.plant, state.replay) == (plant, replay)
-    assert viewed.reported == [(n, f"/{n}") for n in ("planner", "controller", "plant", "replay")]
+    assert {name: getattr(state, name) for name in statuses} == statuses
+    assert viewed.reported == [(name, f"/{name}") for name in statuses]
     goal = state.goals["base"]
     assert (*goal.position, *goal.quaternion) == pytest.approx(pose)
     assert state.absent == frozenset()
@@ -286,13 +280,7 @@ def test_goals_of_links_are_those_of_the_planner(viewed: Viewed) -> None:
     assert set(tell(goal=pose)) == {"base", "end_effector"}
 
 
-@pytest.mark.parametrize(
-    ("count", "places"),
-    [
-        (3, [0, 1, 2]),
-        (2000, [*range(0, 1999, 2), 1999]),
-    ],
-)
+@pytest.mark.parametrize(("count", "places"), [(3, [0, 1, 2]), (2000, [*range(0, 1999, 2), 1999])])
 def test_a_long_planned_path_is_thinned_and_keeps_its_ends(
     viewed: Viewed, count: int, places: list[int]
 ) -> None:

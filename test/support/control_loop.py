@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from support.executive_loop import KD, KP, SHAPE, STEP, TIP, URDF, Array
+from support.planner_flight import goal_at
 from support.ros_harness import Harness
 
 from spacerobot_ros.nodes import CoordinatedControlNode
@@ -27,10 +28,7 @@ STATUS = "controller/status"
 
 
 def pose(position: npt.ArrayLike, frame: str = "world", w: float = 1.0) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = frame
-    p = message.pose.position
-    p.x, p.y, p.z = np.asarray(position, dtype=float).tolist()
+    message = goal_at((np.asarray(position).tolist(), [0.0] * 3), frame)
     message.pose.orientation.w = w
     return message
 
@@ -133,6 +131,7 @@ class Loop:
         (result,) = self.node.set_parameters([Parameter(name, value=value)])
         return result
 
-    def abort(self) -> Any:
-        client = self.probe.create_client(Trigger, "control/abort")
+    def trigger(self, service: str) -> Any:
+        """Call a service of the node."""
+        client = self.probe.create_client(Trigger, f"control/{service}")
         return self.harness.call(client, Trigger.Request())

@@ -13,6 +13,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.lifecycle import TransitionCallbackReturn
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 from support.ros_harness import Harness, nanoseconds
 from trajectory_msgs.msg import JointTrajectory
 
@@ -62,6 +63,21 @@ def goal_at(place: Place, frame: str = "world") -> PoseStamped:
     return message
 
 
+def position_goal(position: npt.ArrayLike, sec: int = 0) -> PoseStamped:
+    """Return a goal position in the world; the orientation of zeros asks for no attitude."""
+    message = goal_at((np.asarray(position).tolist(), [0.0, 0.0, 0.0]))
+    message.header.stamp.sec, message.pose.orientation.w = sec, 0.0
+    return message
+
+
+def joint_values(
+    messages: Sequence[JointState], names: Sequence[str], field: str = "position"
+) -> Array:
+    """Return a field (N, n) of messages, in the order of the names."""
+    found = [dict(zip(m.name, getattr(m, field), strict=True)) for m in messages]
+    return np.array([[each[name] for name in names] for each in found])
+
+
 def pose_arrays(pose: Any) -> tuple[Array, Rotation]:
     p, o = pose.position, pose.orientation
     return np.array([p.x, p.y, p.z]), Rotation.from_quat([o.x, o.y, o.z, o.w])
@@ -100,6 +116,10 @@ class Flight:
 
     def send(self, place: Place | PoseStamped) -> None:
         self.goals.publish(place if isinstance(place, PoseStamped) else goal_at(place))
+
+    def trigger(self, service: str) -> Any:
+        client = self.probe.create_client(Trigger, service)
+        return self.harness.call(client, Trigger.Request())
 
     @property
     def states(self) -> list[str]:

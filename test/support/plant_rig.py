@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
@@ -23,6 +26,8 @@ TICK = 0.05
 TICK_NS = 50_000_000
 WARN = 30  # of rcl_interfaces/msg/Log
 
+Array = npt.NDArray[np.float64]
+
 STATE = {
     "/clock": Clock,
     "base_pose": PoseStamped,
@@ -31,6 +36,29 @@ STATE = {
     "joint_states": JointState,
 }
 TOPICS = {**STATE, "/diagnostics": DiagnosticArray, "/rosout": Log}
+
+BAD_COMMANDS = {
+    "NaN": ([math.nan, 0.1, 0.1], SLIDERS, "finite"),
+    "infinite": ([0.1, 0.1, -math.inf], SLIDERS, "finite"),
+    "infinities that cancel": ([math.inf, -math.inf, 0.1], SLIDERS, "finite"),
+    "unknown joint": ([0.1, 0.1, 0.1], ["slider_1", "rudder", "slider_3"], "'rudder'"),
+    "duplicate": ([0.1, 0.1, 0.1], ["slider_1", "slider_2", "slider_1"], "twice"),
+    "too few velocities": ([0.1, 0.1], SLIDERS, "3 joint names and 2"),
+    "too many velocities": ([0.1] * 4, SLIDERS, "3 joint names and 4"),
+    "no velocities": ([], SLIDERS, "3 joint names and 0"),
+    "no names": ([0.1, 0.1, 0.1], [], "joint 'slider_1' is missing"),
+}
+"""Velocities and names of commands that are refused, and the reason."""
+
+
+def pose_of(odom: Odometry) -> tuple[Array, Array]:
+    p, o = odom.pose.pose.position, odom.pose.pose.orientation
+    return np.array([p.x, p.y, p.z]), np.array([o.x, o.y, o.z, o.w])
+
+
+def twist_of(odom: Odometry) -> tuple[Array, Array]:
+    v, w = odom.twist.twist.linear, odom.twist.twist.angular
+    return np.array([v.x, v.y, v.z]), np.array([w.x, w.y, w.z])
 
 
 class Rig:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +11,10 @@ from mcap.reader import make_reader
 from rcl_interfaces.msg import Log
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.serialization import deserialize_message
-from support.planner_flight import PLANNER
+from support.planner_flight import PLANNER, goal_at, values_of
 from support.ros_harness import Harness, Probe
 
 from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
-from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.parameters import values_of
 
 PLANT = {
     "robot": "sliding_masses",
@@ -39,12 +35,6 @@ WRITTEN_BY_THE_RECORDER = ("/tf", "/tf_static")
 """Nobody publishes them where tf2_msgs is not installed."""
 
 
-def parameters_of(node: FlightNode) -> dict[str, str]:
-    """Return a node's parameters as JSON texts by name, for a bag's metadata."""
-    values = {"autostart": True, **values_of(node.config)}
-    return {name: json.dumps(value) for name, value in values.items()}
-
-
 def has_parameters(bag: Path, *nodes: str) -> bool:
     """Whether a file that is being written has the parameters of nodes; records are as they are."""
     written = bag.read_bytes()
@@ -56,39 +46,26 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
-@dataclass(frozen=True)
-class Recorded:
-    """One message of a bag: when it was written, ns, and what it says."""
-
-    log_ns: int
-    message: Any
-
-
 class BagContent:
     """A bag, read with nothing of this package."""
 
     def __init__(self, path: Path) -> None:
-        self.by_topic: dict[str, list[Recorded]] = {}
-        self.log_times: list[int] = []
+        self.by_topic: dict[str, list[tuple[int, Any]]] = {}
+        """When messages were written, ns, and what they say."""
+        self.count = 0
         with path.open("rb") as file:
             reader = make_reader(file)
             for schema, channel, record in reader.iter_messages(log_time_order=False):
                 assert schema is not None
-                self.log_times.append(record.log_time)
+                self.count += 1
                 if channel.topic in WRITTEN_BY_THE_RECORDER:
                     continue
                 message = deserialize_message(record.data, message_class(schema.name))
-                entry = Recorded(record.log_time, message)
-                self.by_topic.setdefault(channel.topic, []).append(entry)
+                self.by_topic.setdefault(channel.topic, []).append((record.log_time, message))
             self.metadata = {m.name: dict(m.metadata) for m in reader.iter_metadata()}
-            self.attachments = {a.name: (a.media_type, a.data) for a in reader.iter_attachments()}
 
     def __getitem__(self, topic: str) -> list[Any]:
-        return [entry.message for entry in self.by_topic.get(topic, [])]
-
-    @property
-    def count(self) -> int:
-        return len(self.log_times)
+        return [message for _, message in self.by_topic.get(topic, [])]
 
 
 class Stack:
@@ -131,19 +108,14 @@ class Stack:
         """Fly to a goal, and let everything arrive that is on its way."""
         if not self.planner.is_active:
             assert self.planner.trigger_activate() is TransitionCallbackReturn.SUCCESS
-        goal = PoseStamped()
-        goal.header.frame_id = "world"
-        goal.pose.position.x, goal.pose.orientation.w = x, 1.0
-        self.goals.publish(goal)
+        self.goals.publish(goal_at(([x, 0.0, 0.0], [0.0] * 3)))
         if not self.plant.is_active:
             assert self.plant.trigger_activate() is TransitionCallbackReturn.SUCCESS
         heard = self.probe.count("/planner/status")
         self.harness.spin_until(
             lambda: any(
-                value.value in ("reached", "failed", "refused")
+                values_of(status)["state"] in ("reached", "failed", "refused")
                 for status in self.probe.messages["/planner/status"][heard:]
-                for value in status.values
-                if value.key == "state"
             ),
             "the goal is decided",
         )

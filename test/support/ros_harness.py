@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.client import Client
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
@@ -94,6 +95,11 @@ class Probe(Node):
     def count(self, topic: str) -> int:
         """Return how many messages of a topic have come."""
         return len(self.messages[topic])
+
+    def diagnoses(self, name: str) -> list[DiagnosticStatus]:
+        """Return what has come on /diagnostics under a name."""
+        arrays = self.messages["/diagnostics"]
+        return [status for array in arrays for status in array.status if status.name == name]
 
 
 class Harness:
@@ -206,6 +212,20 @@ def construction(context: rclpy.Context, parameters: Mapping[str, Any]) -> dict[
         "context": context,
         "parameter_overrides": [Parameter(key, value=value) for key, value in parameters.items()],
     }
+
+
+def dumped(node: Node) -> dict[str, Any]:
+    """Return what ``ros2 param dump`` writes of a node: its parameters, in groups by the dots."""
+    section: dict[str, Any] = {}
+    for name, parameter in node.get_parameters_by_prefix("").items():
+        *groups, last = name.split(".")
+        inner = section
+        for group in groups:
+            inner = inner.setdefault(group, {})
+        value = parameter.value
+        plain = None | bool | int | float | str
+        inner[last] = value if isinstance(value, plain) else list(value)
+    return {node.get_fully_qualified_name(): {"ros__parameters": section}}
 
 
 def nanoseconds(stamp: Any) -> int:
