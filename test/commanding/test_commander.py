@@ -35,7 +35,7 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
     PursuedGoals,
 )
-from spacerobot_ros.resources import robot_file
+from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 LATCHED = PlantStatus(PlantState.LATCHED, "Nothing moves.", "abort", "a fuse is blown")
@@ -110,7 +110,7 @@ def test_a_jump_is_answered_with_its_pose_once_its_time_is_accepted(controller: 
     assert controller.commander.executive.state.value == "holding"
 
 
-def test_while_the_plant_is_paused_no_jump_is_accepted(planner: Rig) -> None:
+def test_while_the_plant_is_paused_no_jump_is_accepted_and_goals_say_so(planner: Rig) -> None:
     planner.state(0)
     planner.state(1)
     planner.commander.receive_plant_status(PlantStatus(PlantState.PAUSED, "Time stands still."))
@@ -119,12 +119,6 @@ def test_while_the_plant_is_paused_no_jump_is_accepted(planner: Rig) -> None:
         planner.wall += 0.1
         planner.commander.take_accepted_jump()
     assert planner.host.commands == [0, 1]
-
-
-def test_a_goal_for_a_paused_plant_says_that_it_is_paused(planner: Rig) -> None:
-    planner.state(0)
-    planner.state(1)
-    planner.commander.receive_plant_status(PlantStatus(PlantState.PAUSED, "Time stands still."))
     planner.goal()
     for _ in range(20):
         planner.wall += 0.1
@@ -216,16 +210,22 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     assert rig.host.states[-1] == "holding"
 
 
-@pytest.mark.parametrize("busy", [False, True])
-def test_states_wait_for_the_reference_of_a_planner_that_is_busy(
-    arm: SpaceRobot, busy: bool
-) -> None:
+def referenced(arm: SpaceRobot, *, busy: bool) -> Rig:
+    """Return a controller with a state, and a planner whose reference is still to come."""
     settings = config(ControllerConfig, law="computed_torque", reference_timeout=1.0)
     rig = Rig(ControllerCommander, settings, arm.n, partner_is_busy=lambda: busy)
     rig.use(arm)
     rig.host.publishers.add(JOINT_REFERENCE)
     rig.commander.activate()
     rig.state(1)
+    return rig
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_states_wait_for_the_reference_of_a_planner_that_is_busy(
+    arm: SpaceRobot, busy: bool
+) -> None:
+    rig = referenced(arm, busy=busy)
     for _ in range(30):
         rig.wall += 0.1
         rig.commander.take_accepted_jump()
@@ -242,12 +242,7 @@ def test_states_wait_for_the_reference_of_a_planner_that_is_busy(
 
 
 def test_a_process_that_slept_does_not_count_it_as_silence(arm: SpaceRobot) -> None:
-    settings = config(ControllerConfig, law="computed_torque", reference_timeout=1.0)
-    rig = Rig(ControllerCommander, settings, arm.n)
-    rig.use(arm)
-    rig.host.publishers.add(JOINT_REFERENCE)
-    rig.commander.activate()
-    rig.state(1)
+    rig = referenced(arm, busy=False)
     rig.wall += 60.0
     rig.commander.take_accepted_jump()
     assert rig.host.commands == []
@@ -278,19 +273,24 @@ def test_a_goal_is_never_lost_without_a_word(planner: Rig, controller: Rig) -> N
         assert told == [status.goal_id for status in refused]
 
 
+@pytest.mark.parametrize("kind", ["planner", "controller"])
 def test_a_commander_that_is_to_stop_with_the_decision_answers_no_later_state(
-    robot: SpaceRobot,
+    robot: SpaceRobot, arm: SpaceRobot, kind: str
 ) -> None:
-    settings = config(PlannerConfig, **METHOD, stop_when_decided=True)
-    rig = active(PlannerCommander, settings, robot)
+    if kind == "planner":
+        settings = config(PlannerConfig, **METHOD, stop_when_decided=True)
+        rig = active(PlannerCommander, settings, robot)
+    else:
+        settings = config(ControllerConfig, stop_when_decided=True, settle_time=0.1)
+        rig = active(ControllerCommander, settings, arm)
     rig.state(1)
     assert rig.commander.active
     rig.goal(goal=Goal.checked(np.zeros(3), [0.0, 0.0, 0.0, 1.0]))
-    for tick in range(2, 6):
+    for tick in range(2, 12):
         rig.state(tick)
     assert rig.host.states[-1] == "reached"
     assert rig.commander.activity is CommanderActivity.DECIDED
-    assert rig.host.commands[-1] < 5
+    assert rig.host.commands[-1] < 11
     rig.commander.deactivate()
     rig.commander.activate()
     assert rig.commander.active
@@ -318,19 +318,6 @@ def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
     assert (len(server.sent), server.cancelled) == (1, [1])
 
 
-def test_a_controller_that_is_to_stop_with_the_decision_does(arm: SpaceRobot) -> None:
-    settings = config(ControllerConfig, stop_when_decided=True, settle_time=0.1)
-    rig = active(ControllerCommander, settings, arm)
-    rig.state(1)
-    assert rig.commander.active
-    rig.goal(goal=Goal.checked(np.zeros(3), [0.0, 0.0, 0.0, 1.0]))
-    for tick in range(2, 12):
-        rig.state(tick)
-    assert rig.host.states[-1] == "reached"
-    assert rig.commander.activity is CommanderActivity.DECIDED
-    assert rig.host.commands[-1] < 11
-
-
 def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     planner: Rig,
 ) -> None:
@@ -345,8 +332,8 @@ def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     assert not second.results
 
 
-def test_goals_that_are_pursued_together_are_aborted_together(arm: SpaceRobot) -> None:
-    rig = active(ControllerCommander, config(ControllerConfig), arm)
+def test_goals_that_are_pursued_together_are_aborted_together(controller: Rig) -> None:
+    rig = controller
     rig.state(1)
     client, flat = Client(), Goal.checked([0.05, -0.03, 0.0], [0.0, 0.0, 0.0, 1.0])
     rig.commander.receive_fly_to("a", lambda: FlyTo(flat), client)
@@ -632,7 +619,7 @@ def test_a_plant_of_other_commands_is_named_once_and_goals_are_refused(kind: str
 
 
 TICK = 10_000_000
-TARGET = load_robot(Path(__file__).parents[2] / "config" / "targets" / "block.urdf")
+TARGET = load_robot(share_directory() / "config" / "targets" / "block.urdf")
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
 
@@ -667,8 +654,7 @@ def test_a_task_is_asked_of_an_active_controller() -> None:
     assert_one_sentence(rig.commander.request(Task.DETUMBLE), "'detumble' has started")
     rig.state(1)
     assert rig.host.statuses[-1].task == "detumble"  # type: ignore[union-attr]
-    latched = PlantStatus(PlantState.LATCHED, "Nothing moves.", "abort", "a fuse is blown")
-    rig.commander.receive_plant_status(latched)
+    rig.commander.receive_plant_status(LATCHED)
     with pytest.raises(CommandError, match="latched: a fuse is blown"):
         rig.commander.request(Task.APPROACH)
 
@@ -679,30 +665,19 @@ def test_a_task_that_does_not_exist_is_refused_with_the_robot() -> None:
     assert_one_sentence(str(refused.value), "Parameter 'tasks' names 'grab'")
 
 
-# The arm of this rig grasps obliquely, past a corner of the block.
-NEAR: dict[str, Any] = {"tasks": "approach", "target.clearance": 0.0}
-
-
-def test_the_goal_waits_for_its_tasks() -> None:
-    rig = TargetRig(**NEAR)
+def test_the_goal_waits_for_its_tasks_and_fails_with_a_target_that_is_lost() -> None:
+    # The arm of this rig grasps obliquely, past a corner of the block.
+    given = {"tasks": "approach", "target.clearance": 0.0, "target.timeout": 0.025}
+    rig = TargetRig(**given)
     rig.begin()
     rig.commander.use_target(TARGET)
-    goal = Goal.checked([0.1, 0.0, 0.0], UPRIGHT)
-    rig.commander.receive_goal("base", 0, 7, lambda: goal)
+    rig.commander.receive_goal("base", 0, 7, lambda: Goal.checked([0.1, 0.0, 0.0], UPRIGHT))
     rig.target(1)
     rig.state(1)
     last = rig.host.statuses[-1]
     assert (last.state.value, last.goal_id) == ("tracking", "0.000000007")
     assert last.task == "approach"  # type: ignore[union-attr]
-
-
-def test_a_target_that_is_not_heard_of_any_more_is_lost() -> None:
-    rig = TargetRig(**NEAR, **{"target.timeout": 0.025})
-    rig.begin()
-    rig.commander.use_target(TARGET)
-    rig.commander.receive_goal("base", 0, 7, lambda: Goal.checked([0.1, 0.0, 0.0], UPRIGHT))
-    rig.target(1)
-    for tick in range(1, 5):
+    for tick in range(2, 5):
         rig.state(tick)
     assert rig.host.statuses[-1].state.value == "aborted"
     assert "the target is lost: its odometry is 0.03 s old" in rig.host.statuses[-1].message

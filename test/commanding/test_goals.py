@@ -289,34 +289,30 @@ def test_time_that_goes_back_begins_the_goal_anew() -> None:
 ID, OTHER = "12.000000346", "12.000000345"
 
 
-def planner(state: PlannerState, goal_id: str = ID, message: str = "") -> PlannerStatus:
-    return PlannerStatus(state, message, goal_id=goal_id)
-
-
 def test_the_first_schedule_and_the_first_decision_of_the_goal_count() -> None:
     follower = GoalFollower(ID)
-    first, second = (planner(PlannerState.EXECUTING, message=text) for text in ("one", "two"))
-    reached, later = planner(PlannerState.REACHED), planner(PlannerState.ABORTED)
-    told: list[Status] = [planner(PlannerState.PLANNING), first, second, reached, later]
-    assert [follower.update(status) for status in told] == [False, False, False, True, False]
+    first, second = (status("executing", ID, text) for text in ("one", "two"))
+    reached, later = status("reached", ID), status("aborted", ID)
+    told: list[Status] = [status("planning", ID), first, second, reached, later]
+    assert [follower.update(each) for each in told] == [False, False, False, True, False]
     assert (follower.gait, follower.decision) == (first, reached)
 
 
-@pytest.mark.parametrize("state", [PlannerState.EXECUTING, PlannerState.REFUSED])
-def test_statuses_of_other_goals_tell_nothing(state: PlannerState) -> None:
+@pytest.mark.parametrize("state", ["executing", "refused"])
+def test_statuses_of_other_goals_tell_nothing(state: str) -> None:
     for follower, others in ((GoalFollower(ID), (OTHER, "")), (GoalFollower(), (ID, OTHER, ""))):
         for other in others:
-            assert not follower.is_about_goal(planner(state, other))
-            assert not follower.update(planner(state, other))
+            assert not follower.is_about_goal(status(state, other))
+            assert not follower.update(status(state, other))
         assert follower.gait is None
         assert follower.decision is None
 
 
 def test_statuses_without_an_id_are_those_of_the_goal_in_old_bags() -> None:
     follower = GoalFollower(ID, unnamed=True)
-    assert not follower.update(planner(PlannerState.FAILED, OTHER))
-    assert not follower.update(planner(PlannerState.EXECUTING, ""))
-    assert follower.update(planner(PlannerState.FAILED, ""))
+    assert not follower.update(status("failed", OTHER))
+    assert not follower.update(status("executing", ""))
+    assert follower.update(status("failed", ""))
     assert follower.gait is not None
 
 
