@@ -19,6 +19,7 @@ from support.warm_python import WarmPython
 
 if TYPE_CHECKING:
     import rclpy
+    from support.nodes_apart import NodesApart
     from support.ros_harness import Harness
 
 _WORKER = "PYTEST_XDIST_WORKER" in os.environ
@@ -173,6 +174,16 @@ def harness(ros_context: rclpy.Context) -> Iterator[Harness]:
     harness = Harness(ros_context)
     yield harness
     harness.close()
+
+
+@pytest.fixture
+def apart(harness: Harness, ros_domain: int, tmp_path: Path) -> Iterator[NodesApart]:
+    """Return nodes that are started apart; none of their processes outlives the test."""
+    from support.nodes_apart import NodesApart
+
+    nodes = NodesApart(harness, tmp_path, ros_domain)
+    yield nodes
+    nodes.close()
 
 
 @pytest.fixture

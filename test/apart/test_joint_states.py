@@ -7,7 +7,6 @@ and joints that are none of the robot's, or publish each joint in a message of i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 from nav_msgs.msg import Odometry
@@ -34,7 +33,6 @@ GRIPPER = """<robot name="gripper">
     <limit lower="0" upper="0.04" velocity="0.1" effort="10"/><mimic joint="finger"/></joint>
 </robot>
 """
-PERIOD = 0.05
 
 
 def states(*names: str, velocity: float | None = 0.0, effort: float | None = None) -> JointState:
@@ -72,8 +70,19 @@ def test_states_of_any_driver_are_answered(
     joints = apart.probe.create_publisher(JointState, "joint_states", 10)
     for publisher in (odometry, joints):
         apart.harness.matched(publisher)
-    drive = driver(apart, messages, odometry.publish, joints.publish)
-    timer = apart.probe.create_timer(PERIOD, drive)
+    pose = Odometry(child_frame_id="hull")
+    pose.header.frame_id = "world"
+    pose.pose.pose.orientation.w = 1.0
+
+    def drive() -> None:
+        now = apart.probe.get_clock().now().to_msg()
+        pose.header.stamp = now
+        odometry.publish(pose)
+        for message in messages:
+            message.header.stamp = now
+            joints.publish(message)
+
+    timer = apart.probe.create_timer(0.05, drive)
     apart.wait(lambda: apart.probe.count("joint_commands") > 40, "commands", 10.0)
     command = apart.probe.last("joint_commands")
     assert sorted(command.name) == ["arm", "finger"]
@@ -94,25 +103,3 @@ def test_states_of_any_driver_are_answered(
         assert int(values.get("ignored", "0")) < 10, values
     apart.probe.destroy_timer(timer)
     assert [line for line in apart.complaints if "unknown" in line] == []
-
-
-def driver(
-    apart: NodesApart,
-    messages: list[JointState],
-    publish_pose: Callable[[Odometry], None],
-    publish_joints: Callable[[JointState], None],
-) -> Callable[[], None]:
-    """Return what publishes the state of the present time."""
-    pose = Odometry(child_frame_id="hull")
-    pose.header.frame_id = "world"
-    pose.pose.pose.orientation.w = 1.0
-
-    def publish() -> None:
-        now = apart.probe.get_clock().now().to_msg()
-        pose.header.stamp = now
-        publish_pose(pose)
-        for message in messages:
-            message.header.stamp = now
-            publish_joints(message)
-
-    return publish

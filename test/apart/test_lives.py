@@ -65,7 +65,7 @@ def begin(apart: NodesApart, commander: str) -> None:
 def test_nodes_start_in_any_order_without_a_warning(apart: NodesApart, commander: str) -> None:
     for order in permutations(("plant", commander, "recorder")):
         for node in order:
-            given = {"robot": ROBOTS[commander]} if node == "plant" else {}
+            given: dict[str, Any] = {"robot": ROBOTS[commander]} if node == "plant" else {}
             apart.start(node, **given)
         apart.wait_state(commander, *AT_REST[commander])
         apart.wait_state("plant", "running")
@@ -237,24 +237,16 @@ def test_a_partner_that_publishes_half_of_the_states_is_named(
 ) -> None:
     apart.start(commander, robot="planar_manipulator")
     apart.wait_state(commander, "waiting")
-    probe = apart.probe
+    probe, message = apart.probe, Odometry(child_frame_id="base_link")
+    message.header.frame_id, message.pose.pose.orientation.w = "world", 1.0
     if missing == "odom":
-        states = probe.create_publisher(JointState, "joint_states", 10)
-    else:
-        states = probe.create_publisher(Odometry, "odom", 10)
-    apart.harness.matched(states)
+        joints = {"name": ["shoulder", "elbow"], "position": [0.1, 0.2]}
+        message = JointState(**joints, velocity=[0.0, 0.0])
+    topic = "joint_states" if missing == "odom" else "odom"
+    states = apart.harness.matched(probe.create_publisher(type(message), topic, 10))
 
     def publish() -> None:
-        now = probe.get_clock().now().to_msg()
-        message: JointState | Odometry
-        if missing == "odom":
-            message = JointState(name=["shoulder", "elbow"], position=[0.1, 0.2])
-            message.velocity = [0.0, 0.0]
-        else:
-            message = Odometry(child_frame_id="base_link")
-            message.header.frame_id = "world"
-            message.pose.pose.orientation.w = 1.0
-        message.header.stamp = now
+        message.header.stamp = probe.get_clock().now().to_msg()
         states.publish(message)
 
     timer = probe.create_timer(0.05, publish)
@@ -278,7 +270,10 @@ def test_a_node_alone_says_what_it_waits_for(apart: NodesApart, node: str) -> No
         assert apart.wait_state("plant", "resting")["reason"] == "no_command"
         assert apart.status("plant")["actuation"] == "auto"
     else:
-        apart.start(node)
-        assert "robot" in apart.wait_state(node, "waiting")["message"]
+        process = apart.start(node)
+        waits = "Waiting for a robot on 'robot_description'."
+        assert apart.wait_state(node, "waiting")["message"] == waits
+        apart.wait(lambda: "goals on '/goal_pose'" in process.said, "it is up")
+        assert process.said.count(waits) == 1
     apart.end()
     assert apart.complaints == []

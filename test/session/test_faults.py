@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.awaited import await_end, await_size
+from support.awaited import await_end, await_size, processes_with
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.bag import Bag, RecordingError, read_bag
@@ -215,14 +215,7 @@ class Supervisor:
 
     def left(self) -> list[int]:
         """Return the processes that carry our mark and have not ended."""
-        found = []
-        for folder in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
-                ours = f"{MARK}={self._mark}".encode() in (folder / "environ").read_bytes()
-                if ours and state not in "ZX":
-                    found.append(int(folder.name))
-        return found
+        return list(processes_with(f"{MARK}={self._mark}"))
 
     def await_flight(self) -> None:
         """Wait until states of a robot that moves are in the bag."""

@@ -11,7 +11,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,16 +25,17 @@ from nav_msgs.msg import Odometry
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
-from support.nodes_apart import NodeProcess
+from support.awaited import processes_with
+from support.nodes_apart import NodesApart
 from support.raw_messages import iterate_raw
 from support.ros_harness import LATCHED, Harness
 from support.warm_python import WarmProcess, WarmPython
 
+from spacerobot_ros import __version__
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.nodes.common.process import free_domain
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.execution.executive import Executive
@@ -43,16 +43,11 @@ from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.live import ros, send_goal
 from spacerobot_ros.session.processes import MultiProcessStack, checked_namespace
-from spacerobot_ros.session.run import RunResult, run_scenario
+from spacerobot_ros.session.run import run_scenario
 from spacerobot_ros.testing import Stack
 
 ROOT = Path(__file__).parents[2]
 COMMAND = ("-m", "spacerobot_ros.cli.main")
-GAIT = (
-    *("--set", "planner.method=lie_bracket"),
-    *("--set", "planner.lie_bracket.t1=4", "--set", "planner.lie_bracket.cycles=0"),
-    *("--set", "planner.attitude_tolerance=0.001", "--set", "planner.position_tolerance=0.001"),
-)
 PATIENCE = 120.0
 
 
@@ -91,9 +86,8 @@ def test_each_node_in_a_process_of_its_own_flies_the_same_manoeuvre(
     results = []
     for name, words in (("one", ()), ("many", ("--nodes",))):
         json_file = tmp_path / f"{name}.json"
-        run = spacerobot(
-            *("run", "planar_chain", *words, "--bag", f"{name}.mcap", "--json", str(json_file)),
-        )
+        files = ("--bag", f"{name}.mcap", "--json", str(json_file))
+        run = spacerobot("run", "planar_chain", *words, *files)
         assert run.returncode == 0, run.stderr
         results.append(json.loads(json_file.read_text("utf-8")))
     one, many = results
@@ -112,12 +106,9 @@ def pid_of(node: str, domain: int, other: int = 0) -> int:
     """Return the process of a node in a ROS domain that is not another one, once there is one."""
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
-        for folder in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                ours = f"ROS_DOMAIN_ID={domain}\0" in (folder / "environ").read_text()
-                named = f"__node:={node}\0" in (folder / "cmdline").read_text()
-                if ours and named and int(folder.name) != other:
-                    return int(folder.name)
+        found = processes_with(f"ROS_DOMAIN_ID={domain}", f"__node:={node}\0")
+        for pid in found.keys() - {other}:
+            return pid
     raise AssertionError(f"no process of {node}")
 
 
@@ -172,7 +163,10 @@ def test_a_flight_by_nodes_that_is_interrupted_says_so(tmp_path: Path) -> None:
 @pytest.fixture
 def robot(spacerobot: Command) -> Iterator[WarmProcess]:
     """Sliding masses that are up, five times as fast as real time."""
-    words = ("up", "sliding_masses", "--rate", "5", "--bag", "up.mcap", *GAIT)
+    gait = {"method": "lie_bracket", "lie_bracket.t1": 4, "lie_bracket.cycles": 0}
+    gait |= {"attitude_tolerance": 0.001, "position_tolerance": 0.001}
+    settings = [word for key in gait for word in ("--set", f"planner.{key}={gait[key]}")]
+    words = ("up", "sliding_masses", "--rate", "5", "--bag", "up.mcap", *settings)
     with spacerobot.start(*words) as process:
         yield process
 
@@ -188,9 +182,7 @@ def test_goals_are_sent_to_a_robot_that_is_up(
     assert reached.returncode == 0, reached.stdout + reached.stderr
     assert "The goal is reached" in reached.stdout
     # What is latched of the goal before is no answer to the next.
-    again = spacerobot(
-        *("goal", "0.02", "0", "0", "--rotvec", "0", "0", "0.01"),
-    )
+    again = spacerobot("goal", "0.02", "0", "0", "--rotvec", "0", "0", "0.01")
     assert again.returncode == 0, again.stdout + again.stderr
     assert "Executing" in again.stdout
     stopped = spacerobot("request", "stop")
@@ -322,42 +314,26 @@ def test_bad_words_are_refused(spacerobot: Command, words: tuple[str, ...], ment
     assert "Traceback" not in run.stderr
 
 
-@contextmanager
-def active(
-    harness: Harness, folder: Path, domain: int, node: str, parameters: dict[str, str]
-) -> Iterator[NodeProcess]:
-    """A node that is started by itself, once it sends heartbeats."""
-    probe = harness.probe({"heartbeat": DiagnosticStatus})
-    process = NodeProcess(folder, domain, node, parameters)
-    try:
-        harness.spin_until(lambda: probe.count("heartbeat") > 0)
-        yield process
-    finally:
-        process.kill()
-
-
 def test_a_second_stack_in_a_domain_leaves_the_first_one_alone(
-    spacerobot: Command, harness: Harness, ros_domain: int, tmp_path: Path
+    spacerobot: Command, apart: NodesApart
 ) -> None:
-    robot = {"robot": "sliding_masses"}
-    with active(harness, tmp_path, ros_domain, "plant", robot) as plant:
-        run = spacerobot("run", "planar_chain", "--nodes")
-        assert run.returncode == 2
-        assert run.stderr.splitlines()[-1] == (
-            f"Node '/plant' already runs in ROS domain {ros_domain}: end its stack, or set "
-            "ROS_DOMAIN_ID to another number."
-        )
-        plant.signal(signal.SIGINT)
-        assert plant.end() == 0, plant.said
+    apart.start("plant", robot="sliding_masses")
+    assert apart.life("plant") == "active"
+    run = spacerobot("run", "planar_chain", "--nodes")
+    assert run.returncode == 2
+    assert run.stderr.splitlines()[-1] == (
+        f"Node '/plant' already runs in ROS domain {apart.domain}: end its stack, or set "
+        "ROS_DOMAIN_ID to another number."
+    )
+    apart.end()
 
 
 @pytest.mark.slow
-def test_a_viewer_in_the_domain_is_no_other_stack(
-    spacerobot: Command, harness: Harness, ros_domain: int, tmp_path: Path
-) -> None:
-    with active(harness, tmp_path, ros_domain, "viewer", {"port": "0"}):
-        run = spacerobot("run", "planar_chain", "--nodes")
-        assert run.returncode == 0, run.stdout + run.stderr
+def test_a_viewer_in_the_domain_is_no_other_stack(spacerobot: Command, apart: NodesApart) -> None:
+    apart.start("viewer", port=0)
+    assert apart.life("viewer") == "active"
+    run = spacerobot("run", "planar_chain", "--nodes")
+    assert run.returncode == 0, run.stdout + run.stderr
 
 
 # -- stacks in namespaces ----------------------------------------------------------------------
@@ -454,11 +430,6 @@ def papers_own() -> Scenario:
     return load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
 
 
-@pytest.fixture
-def result(tmp_path: Path) -> RunResult:
-    return run_scenario(short(attitude_tolerance=1e-4), tmp_path / "run.mcap")
-
-
 def test_a_run_records_the_topics_that_are_chosen(tmp_path: Path) -> None:
     topics = {"/odom", "/joint_states", "/momentum", "/robot_description"}
     chosen = short().with_overrides("recorder", {"topics": " ".join(sorted(topics))})
@@ -467,7 +438,8 @@ def test_a_run_records_the_topics_that_are_chosen(tmp_path: Path) -> None:
     assert set(read_bag(tmp_path / "run.mcap").topics) == topics
 
 
-def test_nothing_is_lost_or_recorded_twice(result: RunResult) -> None:
+def test_a_bag_lacks_nothing_and_says_how_it_was_made(tmp_path: Path) -> None:
+    result = run_scenario(short(attitude_tolerance=1e-4), tmp_path / "run.mcap")
     bag = read_bag(result.summary["bag"])
     ticks = result.summary["ticks"]
     # The scenario asks for base_pose once a second, that is every 20 ticks.
@@ -477,14 +449,10 @@ def test_nothing_is_lost_or_recorded_twice(result: RunResult) -> None:
         assert len(times) == ticks + 1, topic
         np.testing.assert_allclose(times, np.arange(ticks + 1) * 0.05, atol=1e-9)
     np.testing.assert_allclose(bag["/odom"].stamp, bag["/odom"].time, atol=1e-9)
-
-
-def test_bag_says_how_it_was_made(result: RunResult) -> None:
-    bag = read_bag(result.summary["bag"])
     assert bag.metadata["scenario"]["name"] == "sliding_masses"
     assert json.loads(bag.metadata["parameters/plant"]["tick_rate"]) == 20.0
     assert json.loads(bag.metadata["parameters/planner"]["lie_bracket.t1"]) == 5.0
-    assert "version" in bag.metadata["spacerobot"]
+    assert bag.metadata["spacerobot"]["version"] == __version__
     assert b'<robot name="sliding_masses">' in bag.attachments["robot_description.urdf"]
 
 
@@ -600,7 +568,6 @@ def test_a_run_whose_commander_fails_ends_with_the_reason_and_a_whole_bag(
 
 # -- stacks of nodes in one executor -----------------------------------------------------------
 
-
 QUICK = {"planner": {"method": "optimal"}}
 
 
@@ -615,22 +582,17 @@ class Recorder(rclpy.node.Node):
         )
 
 
-def test_a_goal_is_reached_and_another_one_refused() -> None:
-    with Stack("sliding_masses", ["plant", "planner", Recorder], QUICK) as stack:
-        arrival = stack.fly_to(x=0.05)
-        assert arrival.reached
-        assert "The goal is reached" in arrival.message
-        assert stack.nodes["positions"].found[-1] == pytest.approx(0.05, abs=0.02)
-        refused = stack.fly_to(Goal.from_rotvec([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
-        assert (refused.reached, refused.outcome) == (False, Outcome.REFUSED)
-
-
-def test_a_stack_flies_the_same_states_every_time() -> None:
+def test_a_goal_is_reached_by_the_same_states_every_time_and_another_one_refused() -> None:
     flown = []
     for _ in range(2):
         with Stack("sliding_masses", ["plant", "planner", Recorder], QUICK) as stack:
-            stack.fly_to(x=0.03, rotvec=(0.0, 0.01, 0.0))
-            flown.append(stack.nodes["positions"].found)
+            arrival = stack.fly_to(x=0.03, rotvec=(0.0, 0.01, 0.0))
+            assert arrival.reached
+            assert "The goal is reached" in arrival.message
+            flown.append(list(stack.nodes["positions"].found))
+            refused = stack.fly_to(Goal.from_rotvec([9.0, 0.0, 0.0], [0.0, 0.0, 0.0]))
+            assert (refused.reached, refused.outcome) == (False, Outcome.REFUSED)
+    assert flown[0][-1] == pytest.approx(0.03, abs=0.02)
     count = min(map(len, flown))
     assert count > 50
     np.testing.assert_array_equal(flown[0][:count], flown[1][:count])
@@ -708,13 +670,11 @@ def test_two_stacks_have_domains_of_their_own() -> None:
         assert other.fly_to(x=0.02).reached
 
 
-def test_a_refused_robot_leaves_no_node() -> None:
+def test_a_robot_and_a_parameter_that_are_none_are_refused() -> None:
     with pytest.raises(ParameterError, match="no_such"):
         Stack("no_such")
     with pytest.raises(SpaceRobotError, match="tick_rate"):
         Stack("sliding_masses", parameters={"plant": {"tick_rate": -1.0}})
-    with free_domain() as domain:
-        assert 1 <= domain <= 101
 
 
 @pytest.mark.slow

@@ -7,8 +7,8 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,6 +41,14 @@ NOW = 12_000_000_345
 GOAL = Goal.checked([1.0, 2.0, 3.0], [0.0, 0.0, 0.0, 1.0])
 TOPICS = {"goal_pose": PoseStamped, "end_effector/goal_pose": PoseStamped}
 STATUS = {"planner": "planner/status", "coordinated_control": "controller/status"}
+Report = PlannerStatus | ControllerStatus
+
+
+def status_of(decider: str, state: str, message: str = "", **about: Any) -> Report:
+    """Return a status of a commander."""
+    if decider == "planner":
+        return PlannerStatus(PlannerState(state), message, **about)
+    return ControllerStatus(ControllerState(state), message, **about)
 
 
 class Mission:
@@ -80,12 +88,12 @@ class Mission:
         assert base.header.frame_id == "world"
         return f"{base.header.stamp.sec}.{base.header.stamp.nanosec:09d}"
 
-    def report(self, status: PlannerStatus | ControllerStatus) -> None:
+    def report(self, status: Report) -> None:
         """Publish a status, and wait for the client to receive it."""
         self.publish(status)
         self.harness.spin_until(lambda: self.client.status == status)
 
-    def publish(self, status: PlannerStatus | ControllerStatus) -> None:
+    def publish(self, status: Report) -> None:
         values = [KeyValue(key=key, value=value) for key, value in status.to_values().items()]
         self.status.publish(DiagnosticStatus(message=status.message, values=values))
 
@@ -95,25 +103,19 @@ def test_only_the_status_of_the_goal_that_was_sent_decides_it(
     harness: Harness, decider: str
 ) -> None:
     mission = Mission(harness, decider)
-    failed: PlannerStatus | ControllerStatus
-    kind, failed, reached = (
-        (PlannerStatus, PlannerStatus(PlannerState.FAILED), PlannerState.REACHED)
-        if decider == "planner"
-        else (ControllerStatus, ControllerStatus(ControllerState.FAILED), ControllerState.REACHED)
-    )
-    mission.report(replace(failed, message="Failed."))
+    mission.report(status_of(decider, "failed", "Failed."))
     assert mission.client.message == "Failed.", "there is no goal to follow yet"
     first = mission.send(GOAL)
     assert mission.client.message == ""
     assert first == "12.000000346"
     for other in ("", "unstamped-1", "12.000000345", "12.346"):
-        mission.report(kind(reached, f"Reached {other}.", goal_id=other))  # type: ignore[arg-type]
+        mission.report(status_of(decider, "reached", f"Reached {other}.", goal_id=other))
         assert mission.client.outcome is None
         assert mission.client.message == ""
-    waiting = PlannerState.IDLE if decider == "planner" else ControllerState.HOLDING
-    mission.report(kind(waiting, "Waiting for the plant."))  # type: ignore[arg-type]
+    waiting = "idle" if decider == "planner" else "holding"
+    mission.report(status_of(decider, waiting, "Waiting for the plant."))
     assert mission.client.message == "Waiting for the plant."
-    mission.report(kind(reached, "Reached.", goal_id=first))  # type: ignore[arg-type]
+    mission.report(status_of(decider, "reached", "Reached.", goal_id=first))
     assert mission.client.outcome is Outcome.REACHED
     assert mission.client.message == "Reached."
 
@@ -125,22 +127,10 @@ def test_the_end_of_a_replaced_goal_counts_though_the_next_status_comes_at_once(
     mission = Mission(harness, decider)
     goal_id, later = mission.send(GOAL), "12.9"
     replaced, waiting = f"Aborted: replaced by goal {later}.", "Waiting for the plant."
-    statuses: list[PlannerStatus | ControllerStatus]
-    if decider == "planner":
-        statuses = [
-            PlannerStatus(PlannerState.ABORTED, replaced, goal_id=goal_id),
-            PlannerStatus(PlannerState.EXECUTING, "Executing.", goal_id=later),
-            PlannerStatus(PlannerState.WAITING, waiting),
-        ]
-    else:
-        statuses = [
-            ControllerStatus(ControllerState.ABORTED, replaced, goal_id=goal_id),
-            ControllerStatus(ControllerState.TRACKING, "Flying.", goal_id=later),
-            ControllerStatus(ControllerState.WAITING, waiting),
-        ]
-    for status in statuses:
-        mission.publish(status)
-    harness.spin_until(lambda: mission.client.status == statuses[-1])
+    flying = "executing" if decider == "planner" else "tracking"
+    mission.publish(status_of(decider, "aborted", replaced, goal_id=goal_id))
+    mission.publish(status_of(decider, flying, "Flying.", goal_id=later))
+    mission.report(status_of(decider, "waiting", waiting))
     assert mission.client.outcome is Outcome.ABORTED
     assert mission.client.message == replaced
 
@@ -182,11 +172,8 @@ def test_a_status_that_comes_after_its_event_is_kept_for_what_it_says(
     harness: Harness, decider: str
 ) -> None:
     mission, events, goal_id = mission_with_events(harness, decider)
-    status: PlannerStatus | ControllerStatus
-    if decider == "planner":
-        status = PlannerStatus(PlannerState.FAILED, "Failed.", goal_id=goal_id, corrections=3)
-    else:
-        status = ControllerStatus(ControllerState.FAILED, "Failed.", goal_id=goal_id, task="x")
+    about: dict[str, Any] = {"corrections": 3} if decider == "planner" else {"task": "x"}
+    status = status_of(decider, "failed", "Failed.", goal_id=goal_id, **about)
     events.publish(event(f"/{decider}", "goal_failed", goal_id))
     looks = []
 
@@ -197,11 +184,6 @@ def test_a_status_that_comes_after_its_event_is_kept_for_what_it_says(
 
     assert mission.client.follow(harness.executor, look, 1.0) is Outcome.FAILED
     assert mission.client.status == status
-
-
-def test_every_goal_has_an_id_of_its_own_though_time_stands_still(harness: Harness) -> None:
-    mission = Mission(harness, "planner")
-    assert [mission.send(GOAL) for _ in range(3)] == [f"12.000000{346 + n}" for n in range(3)]
 
 
 def test_the_first_gait_for_the_goal_is_kept(harness: Harness) -> None:
@@ -229,33 +211,31 @@ def test_the_first_gait_for_the_goal_is_kept(harness: Harness) -> None:
 
 
 def test_a_follower_stops_when_its_look_is_true(harness: Harness) -> None:
-    mission = Mission(harness, "planner")
-    looks: list[int] = []
-
-    def look() -> bool:
-        looks.append(0)
-        return len(looks) == 3
-
-    outcome = mission.client.follow(harness.executor, look, 0.01)
-    assert outcome is mission.client.outcome is Outcome.INTERRUPTED
-    assert len(looks) == 3
+    client = Mission(harness, "planner").client
+    looks = iter([False, False, True])
+    outcome = client.follow(harness.executor, lambda: next(looks), 0.01)
+    assert outcome is client.outcome is Outcome.INTERRUPTED
+    assert list(looks) == []
 
 
 def test_a_follower_raises_what_its_look_raises(harness: Harness) -> None:
-    mission = Mission(harness, "planner")
+    client = Mission(harness, "planner").client
 
     def fail() -> bool:
         raise SpaceRobotError("A node has ended.")
 
     with pytest.raises(SpaceRobotError, match="A node has ended"):
-        mission.client.follow(harness.executor, fail, 0.01)
-    assert mission.client.outcome is Outcome.INTERRUPTED
+        client.follow(harness.executor, fail, 0.01)
+    assert client.outcome is Outcome.INTERRUPTED
 
 
-def test_the_pose_of_a_goal_is_that_of_the_message(harness: Harness) -> None:
+def test_the_pose_of_a_goal_is_that_of_the_message_and_its_id_is_its_own(
+    harness: Harness,
+) -> None:
+    """Though time stands still."""
     mission = Mission(harness, "planner")
     tool = Goal.checked([0.1, 0.2, 0.3], [0.0, 0.6, 0.0, 0.8])
-    mission.send(tool)
+    assert [mission.send(tool) for _ in range(3)] == [f"12.000000{346 + n}" for n in range(3)]
     for topic, goal in (("goal_pose", GOAL), ("end_effector/goal_pose", tool)):
         pose = mission.commander.last(topic).pose
         p, o = pose.position, pose.orientation
@@ -364,13 +344,7 @@ def test_a_path_of_an_end_effector_is_sent_on_its_topic(harness: Harness) -> Non
         ]
     )
     assert goal.links_with_paths == {"left"}
-    client = MissionClient(
-        "planner",
-        "world",
-        lambda: NOW,
-        goal,
-        context=harness.context,
-    )
+    client = MissionClient("planner", "world", lambda: NOW, goal, context=harness.context)
     harness.add(client.node)
     listener = harness.probe({"left/path": PathMessage, "right/goal_pose": PoseStamped})
     harness.spin_until(

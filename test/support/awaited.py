@@ -1,4 +1,4 @@
-"""Events of the operating system that tests wait for: a process ends, a file grows."""
+"""Processes and events of the operating system: a process ends, a file grows."""
 
 from __future__ import annotations
 
@@ -14,6 +14,23 @@ from pathlib import Path
 _IN_MODIFY, _IN_MOVED_TO, _IN_CREATE = 0x2, 0x80, 0x100
 _CHANGES = _IN_MODIFY | _IN_MOVED_TO | _IN_CREATE
 _IN_NONBLOCK, _IN_CLOEXEC = os.O_NONBLOCK, os.O_CLOEXEC
+
+
+def processes_with(variable: str, command: str = "") -> dict[int, str]:
+    """Return the command lines of living processes by their ids.
+
+    Of those whose environment has ``NAME=value`` and whose command line has the words between
+    zeros.
+    """
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
+            words = (folder / "cmdline").read_text()
+            ours = f"{variable}\0" in (folder / "environ").read_text()
+            if ours and state not in "ZX" and command in words:
+                found[int(folder.name)] = words.replace("\0", " ")
+    return found
 
 
 def await_end(still: Callable[[], Iterable[int]], patience: float) -> list[int]:

@@ -12,7 +12,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
+from support.awaited import processes_with
 from support.planner_flight import Place, goal_at, values_of
 from support.ros_harness import Harness
 
@@ -46,18 +46,12 @@ class NodeProcess:
 
     Parameters
     ----------
-    folder
-        Its working folder, and that of the file.
-    domain
-        Its ROS domain.
-    node
-        Its name, of the executable and of the node.
-    parameters
-        What it is given, as words of the command line.
-    namespace, arguments, prepare
-        Of the node; further ROS arguments; what the process does before it begins.
-    environment
-        What differs from the environment of the test.
+    folder, domain
+        Where it works and writes the file; its ROS domain.
+    node, arguments
+        Its name, of the executable and of the node; its ROS arguments.
+    prepare, environment
+        What the process does before it begins; what differs from the environment of the test.
     """
 
     def __init__(
@@ -65,26 +59,20 @@ class NodeProcess:
         folder: Path,
         domain: int,
         node: str,
-        parameters: dict[str, str],
-        namespace: str = "",
-        arguments: Sequence[str] = (),
-        prepare: Callable[[], None] | None = None,
-        environment: dict[str, str] | None = None,
+        arguments: Sequence[str],
+        prepare: Callable[[], None] | None,
+        environment: dict[str, str],
     ) -> None:
-        self.name = f"{namespace}/{node}"
-        lives = len(list(folder.glob(f"{namespace.strip('/')}_{node}*.txt")))
-        self.errors = folder / f"{namespace.strip('/')}_{node}{lives or ''}.txt"
-        words = [f"{key}:={value}" for key, value in parameters.items()]
-        given = [*arguments, *(each for word in words for each in ("-p", word))]
-        if namespace:
-            given += ["-r", f"__ns:={namespace}"]
-        differing = {**os.environ, **(environment or {})}
+        self.name = f"/{node}"
+        lives = len(list(folder.glob(f"{node}*.txt")))
+        self.errors = folder / f"{node}{lives or ''}.txt"
+        differing = {**os.environ, **environment}
         path = f"{ROOT}{os.pathsep}{differing.get('PYTHONPATH', '')}"
         # The executable takes the first Python on PATH where none is installed beside it.
         programs = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         with self.errors.open("wb") as errors:
             self.process = subprocess.Popen(
-                [str(ROOT / "scripts" / node), *(["--ros-args", *given] if given else [])],
+                [str(ROOT / "scripts" / node), *(["--ros-args", *arguments] if arguments else [])],
                 cwd=folder,
                 env={
                     **differing,
@@ -148,10 +136,19 @@ class NodesApart:
 
     # -- processes ----------------------------------------------------------------------------
 
-    def start(self, node: str, **parameters: Any) -> NodeProcess:
-        """Start an executable; double underscores in names of parameters stand for dots."""
-        words = {key.replace("__", "."): str(value) for key, value in parameters.items()}
-        process = NodeProcess(self.folder, self.domain, node, words, environment=self.environment)
+    def start(
+        self,
+        node: str,
+        *,
+        arguments: Sequence[str] = (),
+        prepare: Callable[[], None] | None = None,
+        **parameters: Any,
+    ) -> NodeProcess:
+        """Start an executable with parameters and further ROS arguments, prepared by a function."""
+        words = [*arguments]
+        for name, value in parameters.items():
+            words += ["-p", f"{name}:={value}"]
+        process = NodeProcess(self.folder, self.domain, node, words, prepare, self.environment)
         self.running[node] = process
         self.all.append(process)
         if node in STATUS_OF:
@@ -174,14 +171,7 @@ class NodesApart:
 
     def left(self) -> list[str]:
         """Return the command lines of processes of these nodes that still run."""
-        mark = f"ROS_LOG_DIR={self.folder / 'log'}\0"
-        found = []
-        for process in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):
-                dead = (process / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
-                if not dead and mark in (process / "environ").read_text():
-                    found.append((process / "cmdline").read_text().replace("\0", " "))
-        return found
+        return list(processes_with(f"ROS_LOG_DIR={self.folder / 'log'}").values())
 
     def close(self) -> None:
         """End whatever still runs."""
@@ -235,11 +225,8 @@ class NodesApart:
 
     def diagnosed(self, name: str) -> dict[str, str]:
         """Return the values of the last diagnosis of a name, with its message."""
-        for array in reversed(self.probe.messages["/diagnostics"]):
-            for status in array.status:
-                if status.name == name:
-                    return {**values_of(status), "message": status.message}
-        return {}
+        found = self.probe.diagnoses(name)
+        return {**values_of(found[-1]), "message": found[-1].message} if found else {}
 
     # -- goals --------------------------------------------------------------------------------
 
