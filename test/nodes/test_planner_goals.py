@@ -45,8 +45,6 @@ from spacerobot_ros.planning.execution.goal_file import (
 )
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 
-pytestmark = pytest.mark.usefixtures("one_plant")
-
 
 def test_a_goal_is_met_within_tolerance(harness: Harness) -> None:
     flight = Flight(harness, {"position_tolerance": 2e-3, "attitude_tolerance": 3e-4})

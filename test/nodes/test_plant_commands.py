@@ -14,7 +14,6 @@ from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from support import crossing
 from support.control_loop import JOINTS, Loop
 from support.oracles import PinocchioOracle
 from support.planner_flight import values_of
@@ -502,44 +501,15 @@ def test_a_status_is_published_before_the_states_that_it_is_true_of(harness: Har
     assert states == ["plant/status", "plant/status", "odom", "plant/status", "odom"]
 
 
-def test_clearances_are_published_with_events_of_contacts(harness: Harness) -> None:
-    topics = {"clearance": DiagnosticStatus, "events": DiagnosticStatus}
-    parameters = {
-        "robot": "",
-        "robot_description": crossing.URDF,
-        "initial_joint_positions": [-0.06, -0.12],
-        "clearance_period": 2 * TICK,
-    }
-    rig = Rig(harness, parameters, topics=topics)
-    shapes = [[-0.06, -0.12]]
-    for _ in range(7):
-        state = rig.step([0.02 / TICK, 0.04 / TICK], ["y", "x"])
-        shapes.append([state.position[state.name.index(name)] for name in ("y", "x")])
-    truth = crossing.distance(np.array(shapes))
-    assert (truth[::2] <= 0).tolist() == [False, True, True, False]
-    rig.wait("clearance", 4)
-    found = [values_of(m) for m in rig.probe.messages["clearance"]]
-    assert [float(each["time"]) for each in found] == pytest.approx(
-        [0, 2 * TICK, 4 * TICK, 6 * TICK]
-    )
-    np.testing.assert_allclose([float(each["distance"]) for each in found], truth[::2], atol=1e-6)
-    assert {(each["first"], each["second"]) for each in found} == {("left", "right")}
-    levels = [m.level for m in rig.probe.messages["clearance"]]
-    assert levels == [b"\0", b"\2", b"\2", b"\0"]
-    events = [values_of(m) for m in rig.probe.messages["events"]]
-    contacts = {e["event"]: float(e["time"]) for e in events if e["event"].startswith("contact")}
-    assert contacts == pytest.approx({"contact": 2 * TICK, "contact_ended": 6 * TICK})
-
-
 CRATE = """<robot name="crate"><link name="world"/><link name="crate"><collision><geometry>
   <box size="0.2 0.3 0.4"/></geometry></collision></link><joint name="held" type="fixed">
   <parent link="world"/><child link="crate"/><origin xyz="0.1 0 0"/></joint></robot>"""
 
 
-def test_a_contact_ends_with_its_obstacle(harness: Harness) -> None:
+def test_a_contact_is_published_and_ends_with_its_obstacle(harness: Harness) -> None:
     """The robot has no pair of links that may touch: without the crate nothing is measured."""
-    parameters = {"clearance_period": 2 * TICK}
-    rig = Rig(harness, parameters, topics={"plant/status": DiagnosticStatus})
+    topics = dict.fromkeys(("plant/status", "clearance", "events"), DiagnosticStatus)
+    rig = Rig(harness, {"clearance_period": 2 * TICK}, topics=topics)
     obstacles = rig.probe.create_publisher(String, "obstacles", LATCHED)
     harness.connect()
 
@@ -551,6 +521,10 @@ def test_a_contact_ends_with_its_obstacle(harness: Harness) -> None:
     for _ in range(4):
         rig.step([0.01, 0.02, -0.01])
     harness.spin_until(lambda: "crate" in contacts(), "a contact")
+    near = rig.probe.last("clearance")
+    assert (near.level, values_of(near)["second"]) == (DiagnosticStatus.ERROR, "crate")
+    events = [values_of(event) for event in rig.probe.messages["events"]]
+    assert {each["second"] for each in events if each["event"] == "contact"} == {"crate"}
     obstacles.publish(String(data=""))
     harness.spin_until(lambda: not contacts(), "its end")
 

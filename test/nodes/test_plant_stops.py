@@ -26,8 +26,6 @@ from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.simulation.time_modes import RealTime
 
-pytestmark = pytest.mark.usefixtures("one_plant")
-
 REAL_TIME = {"time_mode": "realtime", "real_time_factor": 10.0, "command_timeout": 0.5}
 BACKGROUND = {"plan_in_background": True}
 OTHER = ([-0.03, 0.0, 0.01], [0.0, 0.0, 0.0])

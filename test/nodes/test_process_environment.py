@@ -72,36 +72,29 @@ def with_free(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
 
 
 @pytest.mark.parametrize(
-    ("free", "transport"),
-    [(None, "UDPv4"), (0, "UDPv4"), (2**20, "UDPv4"), (2**21, ""), (2**30, "")],
+    ("free", "own", "transport"),
+    [
+        *((free, "", "UDPv4") for free in (None, 0, 2**20)),
+        *((free, "", "") for free in (2**21, 2**30)),
+        pytest.param(2**30, "not writable", "UDPv4", id="not writable"),
+        pytest.param(0, "LARGE_DATA", "LARGE_DATA", id="a choice of the user"),
+    ],
 )
 def test_without_shared_memory_messages_go_through_sockets(
     free: int | None,
+    own: str,
     transport: str,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with_free(monkeypatch, free)
+    if own == "not writable":
+        monkeypatch.setattr("os.access", lambda *_: False)
+    elif own:
+        monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", own)
     process.use_loopback_discovery()
     assert os.environ["FASTDDS_BUILTIN_TRANSPORTS"] == transport
-    assert ("messages go through sockets" in caplog.text) == bool(transport)
-
-
-def test_memory_that_cannot_be_written_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    with_free(monkeypatch, 2**30)
-    monkeypatch.setattr("os.access", lambda *_: False)
-    process.use_loopback_discovery()
-    assert os.environ["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
-
-
-def test_a_choice_of_the_user_stays(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    with_free(monkeypatch, 0)
-    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "LARGE_DATA")
-    process.use_loopback_discovery()
-    assert os.environ["FASTDDS_BUILTIN_TRANSPORTS"] == "LARGE_DATA"
-    assert not caplog.text
+    assert ("messages go through sockets" in caplog.text) == (transport == "UDPv4")
 
 
 @pytest.mark.parametrize(("free", "warned"), [(None, False), (0, True), (2**20, False)])

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -17,7 +14,6 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from mcap.reader import make_reader
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_system_default
@@ -28,6 +24,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from support.made_bags import joint_states
+from support.nodes_apart import NodesApart
 from support.planner_flight import values_of
 from support.recorded_stack import (
     LATCHED_TOPICS,
@@ -287,51 +284,31 @@ def test_a_recorder_that_is_to_refuse_a_bag_that_is_there_does(
     assert bag.read_bytes() == b"the record of the crash"
 
 
-def test_a_bag_that_goes_is_reported_within_a_second(
-    harness: Harness, ros_domain: int, tmp_path: Path
-) -> None:
-    kinds = {"/diagnostics": DiagnosticArray, "/events": DiagnosticStatus}
-    probe = harness.probe(kinds)
+def test_a_bag_that_goes_is_reported_within_a_second(apart: NodesApart, tmp_path: Path) -> None:
     bag = tmp_path / "folder" / "flight.mcap"
-    with subprocess.Popen(
-        [
-            *(sys.executable, "-m", "spacerobot_ros.nodes.recorder", "--ros-args"),
-            *("-p", f"bag:={bag}", "-p", "flush_period:=60.0"),
-        ],
-        cwd=Path(__file__).parents[2],
-        env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain)},
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            change = probe.create_client(ChangeState, "recorder/change_state")
-            while not probe.messages["/events"]:  # Until these have met: paused, and on again.
-                for label in ("deactivate", "activate"):
-                    request = ChangeState.Request(transition=Transition(label=label))
-                    assert harness.call(change, request).success
-            bag.unlink()
-            bag.parent.rmdir()
-            gone = time.monotonic()
-            harness.spin_until(lambda: probe.messages["/diagnostics"], "it is reported")
-            seconds = time.monotonic() - gone
-            harness.spin_until(
-                lambda: any(
-                    values_of(event)["event"] == "recording_failed"
-                    for event in probe.messages["/events"]
-                ),
-                "the event",
-            )
-        finally:
-            process.send_signal(signal.SIGINT)
-            errors = process.communicate(timeout=20)[1]
-    (status,) = probe.last("/diagnostics").status
+    recorder = apart.start("recorder", bag=bag, flush_period=60.0)
+    heard = apart.probe.messages
+    while not heard["events"]:  # Until these have met: paused, and on again.
+        for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+            assert apart.change("recorder", transition)
+    bag.unlink()
+    bag.parent.rmdir()
+    gone = time.monotonic()
+    apart.wait(lambda: heard["/diagnostics"], "it is reported")
+    seconds = time.monotonic() - gone
+    apart.wait(
+        lambda: any(values_of(event)["event"] == "recording_failed" for event in heard["events"]),
+        "the event",
+    )
+    recorder.signal(signal.SIGINT)
+    assert recorder.end() == 1
+    (status,) = apart.probe.last("/diagnostics").status
     assert status.level == DiagnosticStatus.ERROR
     assert "was lost during recording: it was removed or moved" in status.message
     assert seconds < 1.0
-    assert process.returncode == 1
-    assert "was lost during recording" in errors
-    assert "messages are recorded" not in errors
-    assert "Traceback" not in errors
+    assert "was lost during recording" in recorder.said
+    assert "messages are recorded" not in recorder.said
+    assert "Traceback" not in recorder.said
 
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT

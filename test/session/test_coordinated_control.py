@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag import Bag, read_bag
+from spacerobot_ros.bag.reader import columns
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import RunResult, run_scenario
 
@@ -52,9 +53,8 @@ class Flight:
         bag = read_bag(result.summary["bag"])
         odom, joints = bag["/odom"], bag["/joint_states"]
         assert next(joints.messages())[1].name == ["shoulder", "elbow"]
-        quaternion = np.column_stack([odom.field(f"pose.pose.orientation.{x}") for x in "xyzw"])
-        rotvec = Rotation.from_quat(quaternion).as_rotvec()
-        place = np.column_stack([odom.field(f"pose.pose.position.{x}") for x in "xyz"])
+        poses = odom.table(columns("odom", "pose.pose"))
+        place, rotvec = poses[:, :3], Rotation.from_quat(poses[:, 3:]).as_rotvec()
         # A planar flight stays in its plane.
         assert np.abs(rotvec[:, :2]).max() < 1e-12
         assert np.abs(place[:, 2]).max() < 1e-12

@@ -14,6 +14,7 @@ from support.slow import some_fast
 
 from spacerobot_ros import fly
 from spacerobot_ros.bag import Bag, read_bag
+from spacerobot_ros.bag.reader import columns
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.flight.flight import Flight
@@ -36,7 +37,7 @@ def test_five_degrees_about_each_axis(tmp_path: Path) -> None:
     assert summary["corrections"] == 0
     assert summary["attitude_error_rad"] <= 0.0012
     odom = read_bag(tmp_path / "arm.mcap")["/odom"]
-    attitudes = np.column_stack([odom.field(f"pose.pose.orientation.{c}") for c in "xyzw"])
+    attitudes = odom.table(columns("odom", "pose.pose"))[:, 3:]
     goal = Rotation.from_rotvec(np.radians([5.0, 5.0, 5.0]))
     left = np.degrees(np.abs((Rotation.from_quat(attitudes).inv() * goal).as_rotvec()))
     # A cycle is six edges of 4 s, and 2 s to the first corner and back: 28 s at 20 Hz.
@@ -172,9 +173,7 @@ def test_both_poses_are_reached_by_pulses(excluded: str, tmp_path: Path) -> None
     wrench = bag["/base_wrench_realised"]
     force_B = np.column_stack([wrench.field(f"wrench.force.{x}") for x in "xyz"])
     odom = bag["/odom"]
-    turns = Rotation.from_quat(
-        np.column_stack([odom.field(f"pose.pose.orientation.{x}") for x in "xyzw"])
-    )
+    turns = Rotation.from_quat(odom.table(columns("odom", "pose.pose"))[:, 3:])
     impulse = 0.01 * turns.apply(force_B).sum(axis=0)
     # The last attitude of a tick instead of that of its middle.
     np.testing.assert_allclose(impulse, momentum[-1, :3], atol=0.05)
