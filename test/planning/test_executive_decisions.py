@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -117,8 +115,6 @@ def test_a_tracking_error_is_planned_for_at_once_or_from_rest(held: bool) -> Non
     for _ in range(400):
         loop.tick()
         loop.held.release()
-        if loop.statuses[-1].state.decided:
-            break
     again = PlanReason.REPLAN if held else PlanReason.TRACKING_ERROR
     assert loop.plan_reasons == [PlanReason.NEW_GOAL, again]
     status = loop.statuses[-1]
@@ -146,10 +142,10 @@ def test_tracking_errors_are_corrected_as_often_as_allowed() -> None:
 
 
 def test_a_goal_is_planned_for_without_the_joints_that_are_stuck() -> None:
-    loop = executing(held=True, ticks=400, stuck_ticks=5)
-    quick_without_joints(loop)
-    stuck(loop)
+    loop = stuck(long_flight())
     q = loop.plant.q.copy()
+    (event,) = [event for event in loop.events if event.kind is EventKind.STUCK_JOINT]
+    assert (event.level, event.goal_id, dict(event.about)) == (1, "goal-1", {"joints": "slider_1"})
     until(loop, Phase.PLANNING)
     assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.STUCK_JOINTS]
     task = loop.held.tasks[-1]
@@ -209,11 +205,8 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     assert not any(loop.speeds[-60:])
     assert loop.statuses[-1] is status
     assert not loop.executive.plant_stopped("The plant is latched still.")
-    loop.propose_goal(OTHER)
-    for _ in range(250):
-        loop.held.release()
-        loop.tick()
-    assert (loop.states[-1], loop.statuses[-1].goal_id) == ("reached", "goal-2")
+    status = loop.decide(OTHER)
+    assert (status.state, status.goal_id) == (PlannerState.REACHED, "goal-2")
 
 
 def test_braking_for_an_aborted_goal_ends_where_the_plant_stops() -> None:
@@ -246,9 +239,7 @@ def test_a_plant_that_rested_before_joints_were_taken_for_stuck_tells_why(
     rests_after: int, aborted: bool
 ) -> None:
     """What it did while the plan without these joints was made is that plan's fault."""
-    loop = stuck(executing(held=True, ticks=400, stuck_ticks=5))
-    quick_without_joints(loop)
-    until(loop, Phase.PLANNING)
+    loop = until(stuck(long_flight()), Phase.PLANNING)
     planned_from = loop.measured.stamp_ns - TICK_NS
     last, rests = planned_from - TICK_NS, planned_from + rests_after
     assert loop.executive.plant_stopped("It is too old.", last, rests) == aborted
@@ -260,9 +251,13 @@ def test_a_time_without_a_plan_is_no_end_of_a_schedule(seconds: float) -> None:
     loop.tick(60)
     loop.propose_goal(NEAR)
     loop.tick(20)
+    before = loop.measured.stamp_ns / 1e9 - TICK
     jump(seconds)(loop)
     assert not any(loop.speeds[-1:])
-    assert any("has jumped" in notice for notice in loop.notices)
+    words = (
+        f"has jumped from {before:.9g} s to {before + TICK + seconds:.9g} s; no motion is planned"
+    )
+    assert any(words in notice for notice in loop.notices), loop.notices
     # The rest is planned again, which is no correction.
     status = loop.until(PlannerState.REACHED, PlannerState.FAILED)
     assert (status.state, status.corrections) == (PlannerState.REACHED, 0)
@@ -370,10 +365,7 @@ def test_times_and_corrections_are_those_of_the_goal() -> None:
 
 
 def test_what_is_cut_off_a_schedule_is_no_time_of_the_manoeuvre() -> None:
-    loop = executing(held=True, ticks=400, stuck_ticks=5)
-    quick_without_joints(loop)
-    stuck(loop)
-    until(loop, Phase.PLANNING)
+    loop = until(stuck(long_flight()), Phase.PLANNING)
     loop.held.release()
     until(loop, Phase.EXECUTING)
     first, second = loop.starts[-2:]
@@ -435,6 +427,8 @@ def test_each_change_of_a_goal_is_one_event() -> None:
     loop = resting()
     stub_of(loop).overshoot = 0.1
     assert loop.decide(NEAR).corrections == 1
+    assert loop.statuses[0].message == "Executing a stub gait of 0.4 s."
+    assert loop.events[1].message == "The plan is a stub gait of 0.4 s."
     planned = [("plan_started", "goal-1"), ("plan_ready", "goal-1")]
     assert loop.event_kinds == [
         *planned,
@@ -460,12 +454,7 @@ def test_no_joint_is_stuck_at_a_plant_where_no_command_is_in_force() -> None:
     stuck(loop)
 
 
-def test_stuck_joints_are_an_event_that_names_them() -> None:
-    loop = long_flight()
-    quick_without_joints(loop)
-    stuck(loop)
-    (event,) = [event for event in loop.events if event.kind is EventKind.STUCK_JOINT]
-    assert (event.level, event.goal_id, dict(event.about)) == (1, "goal-1", {"joints": "slider_1"})
+# -- whatever happens -------------------------------------------------------------------------
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "planner_state_machine.md"
@@ -479,26 +468,6 @@ TRANSITIONS = [
 """The transitions that the page lists."""
 
 
-# -- every transition, by what happens --------------------------------------------------------
-
-
-def tick(loop: Loop) -> None:
-    loop.tick()
-
-
-def release(loop: Loop) -> None:
-    loop.held.release()
-    loop.tick()
-
-
-def abort(loop: Loop) -> None:
-    loop.abort()
-
-
-def stop(loop: Loop) -> None:
-    loop.stop()
-
-
 def twist(loop: Loop) -> None:
     command = TwistCommand("mass_2", np.array([0.3, 0.01, -0.4]), np.ones(3), "base")
     with suppress(PlanningError):
@@ -508,6 +477,17 @@ def twist(loop: Loop) -> None:
 def stopped_plant(loop: Loop) -> None:
     loop.executive.plant_stopped("The plant is latched.")
     loop.take()
+
+
+def late(loop: Loop) -> None:
+    loop.tick(base=False)
+    loop.late()
+
+
+def broken(loop: Loop) -> None:
+    loop.measured.broken = True
+    loop.tick()
+    loop.measured.broken = False
 
 
 def obstacles(*, near: bool) -> Act:
@@ -535,14 +515,6 @@ def check_chain(loop: Loop) -> None:
     assert loop.executive.phase is phase
 
 
-def test_the_state_machine_needs_no_ros() -> None:
-    load = "import sys, spacerobot_ros.planning.execution.executive; print('rclpy' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", load], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
-
-
-# -- whatever happens -------------------------------------------------------------------------
-
 ACTIONS: dict[str, Callable[[Loop], object]] = {
     "near": lambda loop: loop.propose_goal(NEAR),
     "other": lambda loop: loop.propose_goal(OTHER),
@@ -550,7 +522,7 @@ ACTIONS: dict[str, Callable[[Loop], object]] = {
     "far": lambda loop: loop.propose_goal(FAR),
     "abort": lambda loop: loop.abort(),
     "stop": lambda loop: loop.stop(),
-    "twist": lambda loop: twist(loop),
+    "twist": twist,
     "latch": stopped_plant,
     "told of reset": reset_plant,
     "later": jump(50.0),
@@ -559,8 +531,8 @@ ACTIONS: dict[str, Callable[[Loop], object]] = {
     "ticks": lambda loop: loop.tick(7),
     "many": lambda loop: loop.tick(50),
     "blind": lambda loop: loop.tick(2, base=False),
-    "late": lambda loop: late(loop),
-    "broken": lambda loop: broken(loop),
+    "late": late,
+    "broken": broken,
     "release": lambda loop: loop.held.release(),
     "reset": lambda loop: loop.plant.reset(),
     "jam": lambda loop: loop.plant.hold(np.array([True, False, False])),
@@ -574,17 +546,6 @@ ACTIONS: dict[str, Callable[[Loop], object]] = {
     "obstacles far": obstacles(near=False),
     "strict": lambda loop: loop.set(position_tolerance=1e-9, max_corrections=1),
 }
-
-
-def late(loop: Loop) -> None:
-    loop.tick(base=False)
-    loop.late()
-
-
-def broken(loop: Loop) -> None:
-    loop.measured.broken = True
-    loop.tick()
-    loop.measured.broken = False
 
 
 @settings(max_examples=75, deadline=None)
@@ -614,17 +575,8 @@ def test_no_sequence_of_events_leads_astray(
     method.refusing = method.partial = False
     method.overshoot = method.wrong_path = 0.0
     loop.set(position_tolerance=1e-3)
-    loop.propose_goal(OTHER)
-    for _ in range(250):
-        loop.held.release()
-        loop.tick()
-        if loop.states[-1:] == ["reached"]:
-            break
-    assert loop.states[-1:] == ["reached"]
+    assert loop.decide(OTHER).state is PlannerState.REACHED
     check_chain(loop)
-
-
-# -- the page in the documents ----------------------------------------------------------------
 
 
 class PieceStub(StubMethod):
@@ -638,8 +590,7 @@ def test_the_time_until_the_end_of_a_goal_is_that_of_this_piece_and_of_those_to_
     loop = Loop(method=PieceStub(ticks=8))
     goal = loop.propose_goal(NEAR)
     assert loop.executive.progress(goal)[1] is None
-    while loop.executive.phase is not Phase.EXECUTING:
-        loop.tick()
+    until(loop, Phase.EXECUTING)
     _, first = loop.executive.progress(goal)
     assert first is not None
     assert first - 7.5 == pytest.approx(8 * TICK, abs=TICK + 1e-9)
@@ -647,6 +598,9 @@ def test_the_time_until_the_end_of_a_goal_is_that_of_this_piece_and_of_those_to_
         loop.tick()
         _, left = loop.executive.progress(goal)
         assert left == pytest.approx(first - ticks * TICK)
+
+
+# -- the page in the documents ----------------------------------------------------------------
 
 
 def test_the_table_of_the_documentation_has_each_transition_once() -> None:

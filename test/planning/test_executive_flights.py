@@ -5,19 +5,19 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod
+from support.planner_phases import until
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
-from spacerobot_ros.planning.execution.status import PlannerState
+from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.resources import share_directory
 
@@ -178,27 +178,14 @@ def test_a_goal_that_waits_for_a_state_can_be_aborted() -> None:
 # -- planned in the background ----------------------------------------------------------------
 
 
-def held(**parameters: Any) -> Loop:
-    return Loop({"abort_time": 0.5, **parameters}, held=True)
-
-
-def wait_for_plan(loop: Loop) -> None:
-    """Tick until a plan is being made."""
-    for _ in range(100):
-        if loop.held.is_busy:
-            return
-        loop.tick()
-    raise AssertionError("nothing is planned")
-
-
 def test_a_new_goal_in_flight_is_planned_from_rest() -> None:
-    loop = held()
+    loop = Loop({"abort_time": 0.5}, held=True)
     loop.propose_goal(NEAR)
     loop.tick()
     loop.held.release()
     loop.tick(15)
     loop.propose_goal(TURNED)
-    wait_for_plan(loop)
+    until(loop, Phase.PLANNING)
     resting = len(loop.commands)
     loop.tick(20)
     assert not any(loop.speeds[resting:])
@@ -212,7 +199,7 @@ def test_a_new_goal_in_flight_is_planned_from_rest() -> None:
 
 
 def test_an_abort_cancels_what_is_being_planned() -> None:
-    loop = held()
+    loop = Loop({"abort_time": 0.5}, held=True)
     loop.propose_goal(NEAR)
     loop.tick(3)
     assert loop.abort() == "The joints rest."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from support.planner_loop import (
     goal_at,
     robot_of,
 )
-from support.planner_phases import FAR, OTHER, stub_of
+from support.planner_phases import FAR, OTHER, stub_of, stuck
 
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
@@ -88,6 +89,15 @@ def test_a_plan_takes_over_at_its_tick_from_the_state_of_the_plant_then() -> Non
     assert loop.error_to(OTHER)[0] < 1e-3
     assert status.manoeuvre_time_s == pytest.approx(40 * TICK)
     assert loop.states == ["executing", "executing", "reached"]
+    assert loop.event_kinds[-4:] == [
+        ("plan_started", "goal-2"),
+        ("plan_ready", "goal-2"),
+        ("goal_accepted", "goal-2"),
+        ("plan_taken_over", "goal-2"),
+    ]
+    taken = loop.events[-1]
+    assert taken.time_s == second.stamp_ns / 1e9
+    assert taken.about["reason"] == "new goal in motion"
 
 
 def test_nothing_but_parameters_decides_when_a_plan_takes_over() -> None:
@@ -192,16 +202,10 @@ def test_of_many_goals_only_the_newest_is_planned_for(held: bool) -> None:
         loop.tick(2)
         loop.held.release()
         loop.tick(k % 2)
-    newest = loop.propose_goal(OTHER)
-    for _ in range(200):
-        loop.tick()
-        loop.held.release()
-    assert loop.statuses[-1].state is PlannerState.REACHED
-    assert loop.statuses[-1].goal_id == newest
-    assert [goal for kind, goal in loop.event_kinds if kind == "goal_accepted"] == [
-        "goal-1",
-        newest,
-    ]
+    newest = loop.decide(OTHER)
+    assert (newest.state, newest.goal_id) == (PlannerState.REACHED, "goal-10")
+    accepted = [goal for kind, goal in loop.event_kinds if kind == "goal_accepted"]
+    assert accepted == ["goal-1", "goal-10"]
     assert len(loop.starts) == 2
     assert loop.error_to(OTHER)[0] < 1e-3
 
@@ -233,20 +237,18 @@ def test_the_present_goal_once_more_goes_on_under_its_new_id(tmp_path: Path) -> 
 
 
 def test_what_is_planned_for_another_goal_is_aborted_with_all_goals(tmp_path: Path) -> None:
-    for ticks in (1, 4):
+    for planned in (False, True):
         loop = flying(held=True)
         loop.goal_file = GoalFile(str(tmp_path / "goal.json"))
         loop.propose_goal(OTHER)
         loop.tick()
-        if ticks > 1:
+        if planned:
             loop.held.release()
             loop.tick()
             assert phase_of(loop) is Phase.TAKING_OVER
         assert loop.abort() == "The joints brake along the planned path within 0.5 s."
-        assert (loop.statuses[-1].state, loop.statuses[-1].goal_id) == (
-            PlannerState.ABORTED,
-            "goal-2",
-        )
+        status = loop.statuses[-1]
+        assert (status.state, status.goal_id) == (PlannerState.ABORTED, "goal-2")
         loop.held.release()
         loop.tick(40)
         assert phase_of(loop) is Phase.IDLE
@@ -260,11 +262,7 @@ def test_joints_that_stick_before_the_take_over_have_the_new_goal_planned_from_r
     loop.propose_goal(OTHER)
     loop.tick()
     assert phase_of(loop) is Phase.TAKING_OVER
-    loop.plant.hold(np.array([True, False, False]))
-    for _ in range(40):
-        loop.tick()
-        if phase_of(loop) is not Phase.TAKING_OVER:
-            break
+    stuck(loop)
     loop.plant.hold(np.zeros(3, dtype=np.bool_))
     assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
     assert stub_of(loop).requests[-1].motion is None
@@ -289,12 +287,9 @@ def test_a_gap_in_the_states_over_the_take_over_tick_delays_nothing_that_follows
 def test_where_no_plan_can_take_over_the_joints_brake(parameters: dict[str, Any]) -> None:
     for held in (False, True):
         loop = flying(held=held, **parameters)
-        loop.propose_goal(OTHER)
-        for _ in range(30):
-            loop.tick()
-            loop.held.release()
+        status = loop.decide(OTHER)
+        assert (status.state, status.goal_id) == (PlannerState.REACHED, "goal-2")
         assert stub_of(loop).requests[-1].motion is None
-        assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
 
 
 def test_methods_that_plan_from_rest_are_not_asked_in_motion() -> None:
@@ -304,25 +299,6 @@ def test_methods_that_plan_from_rest_are_not_asked_in_motion() -> None:
     loop.propose_goal(OTHER)
     loop.until(PlannerState.REACHED)
     assert [request.motion for request in stub_of(loop).requests] == [None, None]
-
-
-# -- events -----------------------------------------------------------------------------------
-
-
-def test_a_take_over_is_one_event() -> None:
-    loop = flying()
-    loop.outputs.clear()
-    loop.propose_goal(OTHER)
-    loop.until(PlannerState.REACHED)
-    assert loop.event_kinds == [
-        ("plan_started", "goal-2"),
-        ("plan_ready", "goal-2"),
-        ("goal_accepted", "goal-2"),
-        ("plan_taken_over", "goal-2"),
-    ]
-    taken = loop.events[-1]
-    assert taken.time_s == loop.starts[-1].stamp_ns / 1e9
-    assert taken.about["reason"] == "new goal in motion"
 
 
 # -- the remaining motion, again --------------------------------------------------------------
@@ -412,13 +388,16 @@ def test_noise_of_joints_is_not_taken_for_another_shape() -> None:
 
 
 def test_goals_are_the_same_where_every_number_is() -> None:
-    assert goal_at(TURNED).equals(goal_at(TURNED))
-    assert not goal_at(TURNED).equals(goal_at(HERE))
-    shaped = goal_at(TURNED)
-    object.__setattr__(shaped, "joint_positions", np.zeros(3))
-    assert not goal_at(TURNED).equals(shaped)
-    assert not shaped.equals(goal_at(TURNED))
-    assert shaped.equals(shaped)
+    goal = goal_at(TURNED)
+    shaped = replace(goal, joint_positions=np.zeros(3))
+    for one, other, same in (
+        (goal, goal_at(TURNED), True),
+        (goal, goal_at(HERE), False),
+        (goal, shaped, False),
+        (shaped, goal, False),
+        (shaped, replace(shaped), True),
+    ):
+        assert one.equals(other) is same
 
 
 def test_the_remaining_motion_is_planned_again_where_plans_are_made_beside_the_flight() -> None:

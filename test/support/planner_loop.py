@@ -305,19 +305,23 @@ class Loop:
             self.shapes.append(self.plant.q.copy())
             self.poses.append(self.plant.pose.copy())
 
-    def until(self, *states: PlannerState, ticks: int = 4000) -> PlannerStatus:
+    def until(self, *states: PlannerState) -> PlannerStatus:
         """Tick until the latest status is one of these; return it."""
-        for _ in range(ticks):
+        for _ in range(4000):
             if self.statuses and self.statuses[-1].state in states:
                 return self.statuses[-1]
             self.tick()
-        raise AssertionError(f"not {states} within {ticks} ticks but {self.statuses}")
+        raise AssertionError(f"not {states} but {self.statuses}")
 
     def decide(self, place: Place | Goal) -> PlannerStatus:
-        """Propose a goal and tick until it is decided; return the status that decides it."""
+        """Propose a goal and tick until it is decided; return the status that decides it.
+
+        Plans in the background are there a tick after they were begun.
+        """
         before = len(self.statuses)
         self.propose_goal(place)
         for _ in range(4000):
+            self.held.release()
             self.tick()
             decided = [s for s in self.statuses[before:] if s.state.decided]
             if decided:

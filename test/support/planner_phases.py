@@ -99,7 +99,10 @@ def jump(seconds: float) -> Act:
 
 
 def long_flight() -> Loop:
-    return executing(ticks=400, stuck_ticks=5)
+    """Fly long enough for a joint to be found stuck, and plan without it in the background."""
+    loop = executing(held=True, ticks=400, stuck_ticks=5)
+    quick_without_joints(loop)
+    return loop
 
 
 def quick_without_joints(loop: Loop) -> None:
