@@ -16,3 +16,9 @@ def _interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
 def chain() -> SpaceRobot:
     """Return the robot of paper 3."""
     return SpaceRobot.from_file(Path(__file__).parents[2] / "urdf" / "planar_chain.urdf")
+
+
+@pytest.fixture(scope="module")
+def arm() -> SpaceRobot:
+    """Return the robot of paper 2."""
+    return SpaceRobot.from_file(Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf")

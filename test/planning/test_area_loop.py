@@ -37,11 +37,6 @@ NOMINAL = np.radians([0.0, -45.0, 90.0])
 PERIOD = 0.25
 
 
-@pytest.fixture(scope="module")
-def arm() -> SpaceRobot:
-    return SpaceRobot.from_file(URDF)
-
-
 def planner(
     robot: SpaceRobot, attitude: float = 1e-3, period: float = PERIOD, **options: Any
 ) -> Planner:
@@ -223,22 +218,20 @@ def test_slow_edges_take_their_time_and_start_and_end_at_rest(arm: SpaceRobot) -
     np.testing.assert_allclose(schedule.positions[-1], NOMINAL, atol=1e-12)
 
 
-def test_a_joint_without_limits_takes_the_nearest_turn(arm: SpaceRobot) -> None:
-    text = URDF.read_text().replace(
-        'name="shoulder_yaw" type="revolute"', 'name="shoulder_yaw" type="continuous"'
-    )
-    robot = SpaceRobot.from_urdf(text.replace('lower="-3.0" upper="3.0" ', ""))
-    method = planner(robot, nominal=NOMINAL.tolist())
-    q = np.array([4 * np.pi + 1.0, 0.0, 1.0])
-    state = RobotState(np.zeros(3), np.array([0, 0, 0, 1.0]), q)
-    schedule = method.plan(state, goal_of(turned(5, 5, 5)))
+def test_a_joint_without_limits_takes_the_nearest_turn() -> None:
+    endless = changed('shoulder_yaw" type="revolute"', 'shoulder_yaw" type="continuous"')
+    method = planner(endless, nominal=NOMINAL.tolist())
+    schedule = method.plan(at([4 * np.pi + 1.0, 0.0, 1.0]), goal_of(turned(5, 5, 5)))
     np.testing.assert_allclose(schedule.positions[-1], NOMINAL + np.array([4 * np.pi, 0.0, 0.0]))
 
 
-def test_a_goal_that_is_met_already_moves_nothing(arm: SpaceRobot) -> None:
-    state = RobotState(np.zeros(3), turned(1, 2, 3).as_quat(), np.array([0.4, -1.2, 0.3]))
-    schedule = planner(arm).plan(state, goal_of(turned(1, 2, 3.01)))
-    assert (schedule.ticks, schedule.partial) == (0, False)
+def test_a_joint_with_limits_is_not_turned_round_to_a_nominal_shape(arm: SpaceRobot) -> None:
+    """It is more than half a turn away, and the other way round is beyond the limits."""
+    gait = planner(arm, 1e-2, nominal=[2.0, -0.8, 1.5], k=0.5)
+    schedule = gait.plan(at([-2.9, -0.8, 1.5]), goal_of(Rotation.from_rotvec([0.0, 0.0, 0.05])))
+    assert schedule.positions[:, 0].max() == pytest.approx(2.0, abs=0.5)
+    assert np.all(schedule.positions >= arm.lower - 1e-12)
+    assert np.all(schedule.positions <= arm.upper + 1e-12)
 
 
 @pytest.mark.parametrize(
@@ -255,8 +248,7 @@ def test_a_loop_near_a_limit_is_moved_and_not_cut_off(
 ) -> None:
     """Its edges are as long as the areas need; cut off, the base would turn less."""
     method = planner(arm, nominal=nominal)
-    state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array(nominal))
-    schedule = method.plan(state, goal_of(turned(1.0, -1.5, 2.0)))
+    schedule = method.plan(at(nominal), goal_of(turned(1.0, -1.5, 2.0)))
     edges = np.array(schedule.notes["edges"])
     assert edges[joint] / 2 > min(
         arm.upper[joint] - nominal[joint], nominal[joint] - arm.lower[joint]
@@ -272,92 +264,59 @@ def test_a_loop_near_a_limit_is_moved_and_not_cut_off(
 GOAL = Goal.checked([0, 0, 0], Rotation.from_rotvec([0.1, -0.2, 0.3]).as_quat())
 
 
-def changed(*replacements: tuple[str, str]) -> SpaceRobot:
-    """Return the three-joint arm with parts of its text replaced."""
+FLAT = '<axis xyz="0 0 1"/>', '<axis xyz="0 1 0"/>'
+STUCK = 'upper="2.8" velocity="0.5"', 'upper="2.8" velocity="0"'
+NARROW = 'lower="-2.8" upper="2.8"', 'lower="1.0" upper="1.00001"'
+# Straight up along the yaw axis, the arm's yaw moves no mass off its axis.
+STRAIGHT = (0.0, -np.pi / 2, 0.0)
+
+
+def changed(old: str = "", new: str = "") -> SpaceRobot:
+    """Return the three-joint arm with a part of its text replaced."""
     text = URDF.read_text()
-    for old, new in replacements:
-        assert old in text
-        text = text.replace(old, new)
-    return SpaceRobot.from_urdf(text)
+    assert old in text
+    return SpaceRobot.from_urdf(text.replace(old, new))
 
 
 def at(q: npt.ArrayLike, **momenta: Array) -> RobotState:
     return RobotState(np.zeros(3), np.array([0, 0, 0, 1.0]), np.asarray(q, dtype=float), **momenta)
 
 
-def test_two_joints_are_too_few() -> None:
+@pytest.mark.parametrize(
+    ("robot", "options", "shape", "sentence"),
+    [
+        (FLAT, {}, [0, 0, 0], "span 1 of the three axes"),
+        (STUCK, {}, NOMINAL, r"three moving joints; .* has 2 with a velocity"),
+        (NARROW, {}, [0, 0, 1], "leave joint 'elbow_pitch' no room"),
+        (
+            (),
+            {"nominal": STRAIGHT},
+            NOMINAL,
+            r"singular at the nominal shape \[0.0, -1.5708, 0.0\]",
+        ),
+        ((), {"most_cycles": 20}, NOMINAL, r"takes about \d+\S* cycles, more than most_cycles"),
+        # Small loops, more of them.
+        ((), {"most_cycles": 60, "largest_edge": 0.05}, NOMINAL, "more than most_cycles"),
+        ((), {"attitude": 0.0}, NOMINAL, "about inf cycles"),
+        ((), {"longest": 600.0}, NOMINAL, r"cycles of \S+ s, more than longest = 600 s"),
+        ((), {"longest": 2.0}, NOMINAL + 1, "more than longest = 2 s; the slowest joint is"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_at_once(
+    robot: tuple[str, ...], options: dict[str, Any], shape: npt.ArrayLike, sentence: str
+) -> None:
+    with pytest.raises(PlanningError, match=sentence):
+        planner(changed(*robot), **options).plan(at(shape), GOAL)
+
+
+def test_robots_of_two_joints_or_one_axis_do_not_suit() -> None:
     chain = SpaceRobot.from_file(robot_file("planar_chain"))
-    with pytest.raises(PlanningError, match=r"needs three joints .* 'planar_chain' has 2"):
-        planner(chain).plan(at([1, 1]), GOAL)
-
-
-def test_a_planar_robot_is_turned_about_one_axis_alone() -> None:
-    flat = changed(('<axis xyz="0 0 1"/>', '<axis xyz="0 1 0"/>'))
-    with pytest.raises(PlanningError, match="span 1 of the three axes"):
-        planner(flat).plan(at([0, 0, 0]), GOAL)
-    with pytest.raises(PlanningError, match="span 1 of the three axes"):
-        METHODS["area_loop"].require_suitable(flat)
-
-
-def test_a_singular_nominal_shape_is_named(arm: SpaceRobot) -> None:
-    # The arm straight up along the yaw axis: yaw then moves no mass off its axis.
-    straight = [0.0, -np.pi / 2, 0.0]
-    with pytest.raises(PlanningError, match=r"singular at the nominal shape \[0.0, -1.5708, 0.0\]"):
-        planner(arm, nominal=straight).plan(at(NOMINAL), GOAL)
-
-
-def test_joints_that_do_not_move_are_no_choice() -> None:
-    servo = 'lower="-2.8" upper="2.8" velocity="0.5"'
-    stuck = changed((servo, 'lower="-2.8" upper="2.8" velocity="0"'))
-    with pytest.raises(PlanningError, match=r"three moving joints; .* has 2 with a velocity"):
-        planner(stuck).plan(at(NOMINAL), GOAL)
-
-
-def test_limits_without_room_name_the_joint() -> None:
-    narrow = changed(('lower="-2.8" upper="2.8"', 'lower="1.0" upper="1.00001"'))
-    with pytest.raises(PlanningError, match="leave joint 'elbow_pitch' no room"):
-        planner(narrow).plan(at([0, 0, 1]), GOAL)
-
-
-def test_a_goal_that_takes_too_many_cycles_is_refused_at_once(
-    arm: SpaceRobot,
-) -> None:
-    planner(arm, most_cycles=60).plan(at(NOMINAL), GOAL)
-    with pytest.raises(PlanningError, match=r"takes about \d+\S* cycles, more than most_cycles"):
-        planner(arm, most_cycles=20).plan(at(NOMINAL), GOAL)
-    # Small loops, more of them.
-    with pytest.raises(PlanningError, match="more than most_cycles"):
-        planner(arm, most_cycles=60, largest_edge=0.05).plan(at(NOMINAL), GOAL)
-
-
-def test_a_base_that_comes_no_nearer_is_given_up(arm: SpaceRobot) -> None:
-    # A plant that does not turn at all: the same attitude is measured again and again.
-    method, stuck = (
-        planner(arm, most_cycles=60),
-        at(NOMINAL),
-    )
-    needed = float(str(method.plan(stuck, GOAL).notes["expected_cycles"]))
-    for _ in range(int(60 - needed)):
-        method.plan(stuck, GOAL, correction=True)
-    with pytest.raises(PlanningError, match=r"more than most_cycles = 60; \d+ have been flown"):
-        method.plan(stuck, GOAL, correction=True)
-    # Another goal begins from nothing.
-    again = Goal.checked(GOAL.position, GOAL.quaternion)
-    assert method.plan(at(NOMINAL), again).partial
-
-
-def test_no_tolerance_takes_for_ever(arm: SpaceRobot) -> None:
-    with pytest.raises(PlanningError, match="about inf cycles"):
-        planner(arm, 0.0).plan(at(NOMINAL), GOAL)
-
-
-def test_a_manoeuvre_that_takes_too_long_is_refused_with_the_time(
-    arm: SpaceRobot,
-) -> None:
-    with pytest.raises(PlanningError, match=r"cycles of \S+ s, more than longest = 600 s"):
-        planner(arm, longest=600.0).plan(at(NOMINAL), GOAL)
-    with pytest.raises(PlanningError, match="more than longest = 2 s; the slowest joint is"):
-        planner(arm, longest=2.0).plan(at(NOMINAL + 1), GOAL)
+    for robot, sentence in (
+        (chain, r"needs three joints .* 'planar_chain' has 2"),
+        (changed(*FLAT), "span 1 of the three axes"),
+    ):
+        with pytest.raises(PlanningError, match=sentence):
+            METHODS["area_loop"].require_suitable(robot)
 
 
 @pytest.mark.parametrize(
@@ -370,6 +329,26 @@ def test_a_final_shape_that_is_none_is_refused(
     goal = Goal.checked(GOAL.position, GOAL.quaternion, shape)
     with pytest.raises(PlanningError, match=reason):
         planner(arm).plan(at(NOMINAL), goal)
+
+
+def test_the_last_cycle_that_a_goal_may_take_is_flown(arm: SpaceRobot) -> None:
+    goal = goal_of(Rotation.from_rotvec([0.0, 1e-3, 0.0]))
+    method = planner(arm, 5e-4, most_cycles=1, k=1.0, nominal=NOMINAL.tolist())
+    schedule = method.plan(at(NOMINAL), goal)
+    assert (schedule.notes["cycles"], schedule.notes["expected_cycles"]) == (1.0, 1.0)
+
+
+def test_a_base_that_comes_no_nearer_is_given_up(arm: SpaceRobot) -> None:
+    # A plant that does not turn at all: the same attitude is measured again and again.
+    method, stuck = planner(arm, most_cycles=60), at(NOMINAL)
+    needed = float(str(method.plan(stuck, GOAL).notes["expected_cycles"]))
+    for _ in range(int(60 - needed)):
+        method.plan(stuck, GOAL, correction=True)
+    with pytest.raises(PlanningError, match=r"more than most_cycles = 60; \d+ have been flown"):
+        method.plan(stuck, GOAL, correction=True)
+    # Another goal begins from nothing.
+    again = Goal.checked(GOAL.position, GOAL.quaternion)
+    assert method.plan(at(NOMINAL), again).partial
 
 
 @pytest.mark.parametrize(
@@ -413,7 +392,7 @@ def test_loops_that_turn_the_wrong_way_are_given_up_however_small(
         method.plan(PlanRequest(at(NOMINAL), GOAL, Tolerance(1.0, 1e-3)))
 
 
-START = RobotState(np.zeros(3), np.array([0, 0, 0, 1.0]), np.array([0.3, -0.6, 1.2]))
+START = at([0.3, -0.6, 1.2])
 WALL = -1.0
 """Position of the second joint above which links come too near, rad, in these tests."""
 
@@ -436,8 +415,8 @@ def walled(
 
 def test_boxes_of_loops_keep_clear_and_are_the_best_that_do(arm: SpaceRobot) -> None:
     chooser = NominalShapeChooser(arm, 1.0)
-    free = chooser.with_clearance(START.q, 0.5, lambda shapes: True)
     kept = chooser.with_clearance(START.q, 0.5, beyond_the_wall)
+    free = chooser.with_clearance(START.q, 0.5, lambda shapes: True)
     assert free is not None
     assert kept is not None
     assert free.shape[1] > WALL, "the best one is beyond the wall only if it must be"
@@ -469,10 +448,8 @@ def test_smaller_boxes_are_looked_for_and_none_where_users_chose(arm: SpaceRobot
 
 def test_a_loop_without_room_goes_elsewhere_and_one_with_room_stays(arm: SpaceRobot) -> None:
     free = planner(arm).plan(START, GOAL)
-    start = RobotState(START.position, START.quaternion, np.array([0.3, -1.5, 1.2]))
-    moved = walled(arm).plan(PlanRequest(start, GOAL, Tolerance(1.0, 1e-3)))
-    shapes = moved.positions
-    assert beyond_the_wall(shapes)
+    moved = walled(arm).plan(PlanRequest(at([0.3, -1.5, 1.2]), GOAL, Tolerance(1.0, 1e-3)))
+    assert beyond_the_wall(moved.positions)
     nominal = np.array(moved.notes["nominal"])
     assert nominal[1] < WALL
     assert nominal[1] != pytest.approx(np.array(free.notes["nominal"])[1])
@@ -486,11 +463,10 @@ def test_a_loop_without_room_goes_elsewhere_and_one_with_room_stays(arm: SpaceRo
 
 def test_cycles_are_counted_with_the_loop_that_is_flown(arm: SpaceRobot) -> None:
     nominal = (0.3, WALL - 0.03, 1.2)
-    start = RobotState(START.position, START.quaternion, np.array(nominal))
-    request = PlanRequest(start, GOAL, Tolerance(1.0, 1e-3))
-    free = planner(arm, nominal=nominal, most_cycles=100000, longest=1e9).plan(start, GOAL)
-    method = walled(arm, nominal=nominal, most_cycles=1000000, longest=1e9)
-    shrunk = method.plan(request)
+    request = PlanRequest(at(nominal), GOAL, Tolerance(1.0, 1e-3))
+    many: dict[str, Any] = {"nominal": nominal, "longest": 1e9, "most_cycles": 1000000}
+    free = planner(arm, **many).method.plan(request)
+    shrunk = walled(arm, **many).plan(request)
     assert np.ptp(shrunk.positions[:, 1]) <= 0.06 + 1e-9
     S, small = (np.linalg.norm(each.notes["S"]) for each in (free, shrunk))
     assert small < 0.3 * S
@@ -500,12 +476,11 @@ def test_cycles_are_counted_with_the_loop_that_is_flown(arm: SpaceRobot) -> None
     while left > 1e-3:
         left -= min(0.15 * left, largest)
         count += 1
-    assert float(str(shrunk.notes["expected_cycles"])) == pytest.approx(count, abs=2)
-    most = int(float(str(shrunk.notes["expected_cycles"]))) - 1
-    limited = walled(arm, nominal=nominal, most_cycles=most, longest=1e9)
-    with pytest.raises(PlanningError) as refusal:
-        limited.plan(request)
     cycles = float(str(shrunk.notes["expected_cycles"]))
+    assert cycles == pytest.approx(count, abs=2)
+    most = int(cycles) - 1
+    with pytest.raises(PlanningError) as refusal:
+        walled(arm, **{**many, "most_cycles": most}).plan(request)
     assert str(refusal.value) == (
         f"The goal takes about {cycles:.4g} cycles, more than most_cycles = {most}; "
         "0 have been flown. In a loop twice as large, links 'a' and 'b' come within 0.004 m."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
 import re
@@ -9,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -24,37 +24,38 @@ from spacerobot_ros.nodes.common.ros_parameters import typed
 from spacerobot_ros.parameters import Parameter, configured, declared
 from spacerobot_ros.planning import METHODS, Goal, PoseError, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
 from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
-from spacerobot_ros.planning.methods.optimal.problem import (
-    MotionLimits,
-    OptimalOptions,
-    PathConstraints,
-    Trajectory,
-)
+from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
 from spacerobot_ros.resources import robot_file, share_directory
 
-
-def test_methods_say_what_they_control() -> None:
-    assert METHODS["square_path"].controls == {"attitude", "shape"}
-    assert METHODS["lie_bracket"].controls == {"position", "attitude"}
+PARTS: tuple[str, ...] = ("position", "attitude", "shape")
 
 
-def test_a_goal_is_judged_by_what_is_controlled() -> None:
+@pytest.mark.parametrize("part", PARTS)
+def test_each_part_of_a_goal_has_a_tolerance_of_its_own(part: str) -> None:
+    """It counts where it is controlled, and whether the other parts are or not."""
+    controlled = [set(each) for k in range(4) for each in itertools.combinations(PARTS, k)]
+    # Each tolerance is once the smallest, once in the middle, once the largest of the three.
+    for turn in range(3):
+        values = np.roll([1e-3, 4e-3, 16e-3], turn)
+        tolerance = Tolerance(**dict(zip(PARTS, values.tolist(), strict=True)))
+        for share, controls in itertools.product((0.99, 1.01), controlled):
+            by = share * getattr(tolerance, part)
+            error = {name: by * np.array([0.0, 0.0, name == part]) for name in PARTS}
+            remaining = PoseError(error["position"], error["attitude"], error["shape"])
+            parts: Any = frozenset(controls)
+            admitted = share < 1 or part not in controls
+            assert tolerance.admits(remaining, parts) is admitted, (tolerance, share, controls)
+
+
+def test_errors_of_a_goal_are_those_of_base_and_joints() -> None:
     goal = Goal.checked([1, 0, 0], quaternion_from_rotvec([0, 0, 0.2]), [0.5, -0.5])
     here = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
     error = PoseError.between(*here, goal, np.array([0.5, -0.4]))
-    assert error.distance == 1.0
-    assert error.angle == pytest.approx(0.2)
-    assert error.max_joint_error == pytest.approx(0.1)
-    for parts in itertools.chain.from_iterable(
-        itertools.combinations(("position", "attitude", "shape"), k) for k in range(4)
-    ):
-        controls: Any = frozenset(parts)
-        loose = {"position": 1.1, "attitude": 0.21, "shape": 0.11}
-        assert Tolerance(**loose).admits(error, controls)
-        for part in parts:
-            assert not Tolerance(**{**loose, part: 0.05}).admits(error, controls)
+    found = error.distance, error.angle, error.max_joint_error
+    assert found == pytest.approx((1.0, 0.2, 0.1))
     # Without a shape in the goal, or measured, no joint is wrong.
     assert PoseError.between(*here, goal).max_joint_error == 0.0
     unshaped = replace(goal, joint_positions=None)
@@ -62,20 +63,10 @@ def test_a_goal_is_judged_by_what_is_controlled() -> None:
     assert not Tolerance(0.5, 0.21).admits(error)
 
 
-@pytest.mark.parametrize("part", ["position", "attitude", "shape"])
-def test_each_part_of_a_goal_has_a_tolerance_of_its_own(part: str) -> None:
-    names = ["position", "attitude", "shape"]
-    # Each tolerance is once the smallest, once in the middle, once the largest of the three.
-    for turn in range(3):
-        values = np.roll([1e-3, 4e-3, 16e-3], turn)
-        tolerance = Tolerance(**dict(zip(names, values.tolist(), strict=True)))
-        for share, admitted in ((0.99, True), (1.01, False)):
-            by = share * getattr(tolerance, part)
-            error = {name: by * np.array([0.0, 0.0, name == part]) for name in names}
-            remaining = PoseError(error["position"], error["attitude"], error["shape"])
-            assert tolerance.admits(remaining, frozenset({"position", "attitude", "shape"})) is (
-                admitted
-            ), (tolerance, share)
+def test_tolerances_are_those_of_the_planner_where_none_are_given() -> None:
+    assert Tolerance(1.0, 1.0).shape == PlannerConfig().joint_tolerance == 1e-3
+    given = inspect.signature(plan).parameters["tolerance"].default
+    assert given == Tolerance(1e-6, 1e-6, 1e-6), "who calls the API wants what the method can do"
 
 
 @pytest.mark.parametrize(
@@ -122,7 +113,7 @@ NUMBERS = [
 ]
 
 
-@pytest.mark.parametrize("method", OPTIONED)
+@pytest.mark.parametrize("method", [*OPTIONED, "auto"])
 def test_an_option_that_no_method_has_is_refused(method: str) -> None:
     with pytest.raises(ParameterError, match=rf"^{method} has no option 'thrust'\.$"):
         plan(robot_of(ARM), method=method, thrust=1.0)
@@ -137,15 +128,6 @@ def test_numbers_out_of_range_are_refused(method: str, option: Parameter) -> Non
         options: dict[str, Any] = {option.name: value}
         with pytest.raises(ParameterError, match=f"'{option.name}' is .* it must be "):
             plan(robot_of(ARM), method=method, **options)
-
-
-def test_a_call_without_ros_checks_its_options_too() -> None:
-    with pytest.raises(
-        ParameterError, match=r"'starts' is 0; it must be a number from 1 to 10000\."
-    ):
-        plan("sliding_masses", starts=0)
-    with pytest.raises(ParameterError, match="auto has no option 'starts'"):
-        plan("sliding_masses", method="auto", starts=3)
 
 
 def test_a_start_has_a_position_for_every_joint_and_a_method_is_one_of_the_registry() -> None:
@@ -218,43 +200,24 @@ def test_values_by_name_become_texts(given: Any, expected: tuple[Any, ...]) -> N
     assert declaration.checked(expected) == expected
 
 
+OF_BOTH_FORMS = "must be a list of numbers, or of strings NAME:VALUE with joint names"
+OUT_OF_RANGE = r"finite numbers from 0 to 1e\+09"
+
+
 @pytest.mark.parametrize(
-    "given",
-    [["a:1", "2"], ["a:1", 2.0], "text", ["a:x"], {"a": "x"}, {"a": [1]}, ["a:1", "a:2"]],
+    ("name", "given", "message"),
+    [
+        ("joint_margin", "text", OF_BOTH_FORMS),
+        *[("joint_margin", ["a:1", x], OF_BOTH_FORMS) for x in ("2", 2.0, "a:2")],
+        *[("joint_margin", x, "a list of numbers") for x in ({"a": "x"}, {"a": [1]}, ["a:x"])],
+        *[("max_acceleration", {"a": x}, OUT_OF_RANGE) for x in (-1.0, 1e10, float("nan"))],
+        # Without names of joints numbers alone will do.
+        ("keep_out", {"a": 1.0}, r"it must be a list of numbers \(m or rad\)\.$"),
+    ],
 )
-def test_other_values_are_refused(given: Any) -> None:
-    with pytest.raises(ParameterError, match="must be a list of numbers"):
-        option("max_velocity").checked(given)
-
-
-def test_the_refusal_of_a_text_names_both_forms() -> None:
-    with pytest.raises(ParameterError, match="numbers, or of strings NAME:VALUE with joint names"):
-        option("joint_margin").checked("text")
-
-
-@pytest.mark.parametrize("value", [-1.0, 1e10, float("nan")])
-def test_numbers_by_name_keep_their_range(value: float) -> None:
-    with pytest.raises(ParameterError, match=r"finite numbers from 0 to 1e\+09"):
-        option("max_acceleration").checked({"a": value})
-
-
-def test_lists_without_names_of_joints_take_numbers_alone() -> None:
-    assert not option("keep_out").by_name
-    with pytest.raises(ParameterError, match=r"it must be a list of numbers \(m or rad\)\.$"):
-        option("keep_out").checked({"a": 1.0})
-
-
-def test_limits_are_given_by_name_and_others_stay() -> None:
-    slow = {"max_velocity": {THIRD: 0.125}, "max_acceleration": {SECOND: 0.0625, FIRST: 0.5}}
-    limits = MotionLimits.of(NAMED_ARM, configured(OptimalOptions, {**slow, "ramp_time": 0.25}))
-    first, second, _ = NAMED_ARM.velocity_limit
-    assert limits.velocity.tolist() == [first, second, 0.125]
-    assert limits.acceleration.tolist() == [0.5, 0.0625, 0.125 / 0.25]
-
-
-def test_a_faster_velocity_than_that_of_the_robot_is_not_taken() -> None:
-    limits = MotionLimits.of(NAMED_ARM, configured(OptimalOptions, {"max_velocity": {FIRST: 1e3}}))
-    assert limits.velocity.tolist() == NAMED_ARM.velocity_limit.tolist()
+def test_other_values_are_refused(name: str, given: Any, message: str) -> None:
+    with pytest.raises(ParameterError, match=message):
+        option(name).checked(given)
 
 
 def test_efforts_are_given_by_name_and_others_stay() -> None:
@@ -268,12 +231,9 @@ def test_efforts_are_given_by_name_and_others_stay() -> None:
 
 @pytest.mark.parametrize("name", ["max_velocity", "max_acceleration"])
 def test_an_unknown_joint_is_refused(name: str) -> None:
+    options = configured(OptimalOptions, {name: {f"{FIRST}x": 1.0}})
     with pytest.raises(ParameterError) as refusal:
-        MotionLimits.of(
-            NAMED_ARM,
-            configured(OptimalOptions, {name: {f"{FIRST}x": 1.0}}),
-            "planned",
-        )
+        MotionLimits.of(NAMED_ARM, options, "planned")
     assert str(refusal.value) == (
         f"planned.{name} names '{FIRST}x', which is not a joint of robot 'three_joint_arm'; its "
         f"joints are {FIRST}, {SECOND}, {THIRD}. Did you mean '{FIRST}'?"
@@ -291,17 +251,6 @@ def test_options_by_name_are_ros_parameters_of_texts() -> None:
 # -- limits of joints, constraints on paths, and initial guesses, as functions of numbers --------
 
 
-IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
-
-
-@pytest.fixture(scope="module")
-def arm() -> SpaceRobot:
-    return SpaceRobot.from_file(robot_file("three_joint_arm"))
-
-
-# -- limits -------------------------------------------------------------------------------------
-
-
 def test_limits_are_the_robots_narrowed_by_options(arm: SpaceRobot) -> None:
     own = arm.velocity_limit
     plain = MotionLimits.of(arm, OptimalOptions(ramp_time=0.25))
@@ -313,23 +262,18 @@ def test_limits_are_the_robots_narrowed_by_options(arm: SpaceRobot) -> None:
     found = MotionLimits.of(arm, options)
     assert found.velocity == pytest.approx(own * [0.5, 1.0, 1.0])
     assert found.acceleration.tolist() == [1.0, 2.0, 3.0]
+    # By name, the others stay.
+    slow = {"max_velocity": {THIRD: 0.125}, "max_acceleration": {SECOND: 0.0625, FIRST: 0.5}}
+    named = MotionLimits.of(arm, configured(OptimalOptions, {**slow, "ramp_time": 0.25}))
+    assert named.velocity.tolist() == [*own[:2], 0.125]
+    assert named.acceleration.tolist() == [0.5, 0.0625, 0.125 / 0.25]
     for wrong, words in (
         ({"max_velocity": (1.0,)}, "1 number; robot 'three_joint_arm' has 3 joints ("),
-        ({"max_velocity": (1.0, 0.0, 1.0)}, f"'{arm.joint_names[1]}' is limited to 0 per second"),
+        ({"max_velocity": (1.0, 0.0, 1.0)}, f"'{SECOND}' is limited to 0 per second"),
         ({"max_acceleration": (1.0, 0.0, 1.0)}, "and 0 per second squared; area_loop needs"),
     ):
         with pytest.raises(ParameterError, match=re.escape(words)):
             MotionLimits.of(arm, OptimalOptions(**wrong), "area_loop")
-
-
-# -- trajectories -------------------------------------------------------------------------------
-
-
-def parabola(steps: int, acceleration: float, first: float) -> Trajectory:
-    """Return constant acceleration of one joint in steps of half a second."""
-    time = 0.5 * np.arange(steps + 1.0)[:, np.newaxis]
-    shapes = first * time + acceleration * time**2 / 2
-    return Trajectory(0.5, shapes, first + acceleration * time, np.tile(IDENTITY, (steps + 1, 1)))
 
 
 # -- constraints on paths -----------------------------------------------------------------------
@@ -363,34 +307,17 @@ def test_constraints_that_make_no_sense_are_refused(
     arm: SpaceRobot, options: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ParameterError, match=re.escape(words)):
-        PathConstraints.of(arm, OptimalOptions(**options))
-
-
-def test_no_constraint_is_none(arm: SpaceRobot) -> None:
-    none = PathConstraints.of(arm, OptimalOptions())
-    assert none.symbolic(ca.SX.sym("q", 3), ca.SX.sym("x", 4), ca.SX.sym("d", 3)).shape[0] == 0
-    none.check(np.zeros((2, 3)), np.tile(IDENTITY, (2, 1)), 0.5)
-    guess = parabola(4, -3.0, 2.0)
-    assert none.slowed(guess) is guess
+        plan(arm, rotvec=[0, 0, 0.1], **options)
 
 
 # -- the pages of planning name classes, methods and options that exist --------------------------
 
 
 ROOT = Path(__file__).resolve().parents[2]
+THEORY = "area_loop", "controllability", "lie_bracket", "optimal", "singularities", "square_path"
 PAGES = [
     *(ROOT / "docs" / name for name in ("choosing.md", "planner_state_machine.md")),
-    *(
-        ROOT / "docs" / "theory" / f"{name}.md"
-        for name in (
-            "area_loop",
-            "controllability",
-            "lie_bracket",
-            "optimal",
-            "singularities",
-            "square_path",
-        )
-    ),
+    *(ROOT / "docs" / "theory" / f"{name}.md" for name in THEORY),
 ]
 
 

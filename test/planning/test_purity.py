@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.planner_loop import robot_of
+from support.slow import some_fast
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -31,12 +31,7 @@ from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 
 PERIOD, STEP = 0.1, 0.02
 SERVICER_SHAPE = (0.0, -1.2, 2.0, 0.0, 0.8, 0.0)
-FEW_STARTS = {
-    "cache": 0,
-    "starts": 1,
-    "answers": 1,
-    "intervals": 12,
-}
+FEW_STARTS = {"cache": 0, "starts": 1, "answers": 1, "intervals": 12}
 
 
 @dataclass(frozen=True)
@@ -70,10 +65,6 @@ CASES = {
 }
 
 
-def robot_named(name: str) -> SpaceRobot:
-    return SpaceRobot.from_file(Path(__file__).parents[2] / "urdf" / f"{name}.urdf")
-
-
 def options_of(case: Case) -> dict[str, Any]:
     """Return options that make planning quick."""
     area_loop = {}
@@ -86,17 +77,15 @@ def options_of(case: Case) -> dict[str, Any]:
     }
 
 
+def without_elbow(robot: SpaceRobot, method: str, options: dict[str, Any]) -> GaitMethod:
+    stuck = {"elbow_pitch": 2.0}
+    return RemainingJointsGait(robot, PERIOD, STEP, stuck=stuck, method=method, options=options)
+
+
 def built(case: Case, robot: SpaceRobot) -> GaitMethod:
-    if case.method != "remaining_joints":
-        return build_method(case.method, robot, PERIOD, STEP, options_of(case))
-    return RemainingJointsGait(
-        robot,
-        PERIOD,
-        STEP,
-        stuck={"elbow_pitch": 2.0},
-        method="area_loop",
-        options=options_of(case),
-    )
+    if case.method == "remaining_joints":
+        return without_elbow(robot, "area_loop", options_of(case))
+    return build_method(case.method, robot, PERIOD, STEP, options_of(case))
 
 
 def requests(case: Case) -> list[PlanRequest]:
@@ -126,21 +115,10 @@ def content(schedule: GaitSchedule) -> dict[str, Any]:
     return values
 
 
-_LONG = {
-    "area_loop",
-    "lie_bracket",
-    "area_loop of six joints",
-    "optimal with sliders",
-    "auto",
-    "remaining_joints",
-}
-_NAMES = [pytest.param(each, marks=pytest.mark.slow if each in _LONG else ()) for each in CASES]
-
-
-@pytest.mark.parametrize("name", _NAMES)
+@pytest.mark.parametrize("name", some_fast(list(CASES), "square_path", "optimal"))
 def test_equal_requests_have_equal_schedules_in_any_order(name: str) -> None:
     case = CASES[name]
-    robot, asked = robot_named(case.robot), requests(case)
+    robot, asked = robot_of(case.robot), requests(case)
     # The plan that goes on from the first one belongs to the first goal.
     method = built(case, robot)
     first = method.plan(asked[0])
@@ -158,7 +136,7 @@ def test_equal_requests_have_equal_schedules_in_any_order(name: str) -> None:
 @pytest.mark.parametrize("name", CASES)
 def test_a_schedule_says_what_it_controls_and_who_made_it(name: str) -> None:
     case = CASES[name]
-    method = built(case, robot_named(case.robot))
+    method = built(case, robot_of(case.robot))
     before = method.controls
     schedule = method.plan(requests(case)[0])
     assert schedule.controls == case.controls
@@ -168,12 +146,30 @@ def test_a_schedule_says_what_it_controls_and_who_made_it(name: str) -> None:
     assert method.controls == before
 
 
+@pytest.mark.parametrize("correction", [False, True])
+@pytest.mark.parametrize("name", CASES)
+def test_a_goal_that_is_met_takes_no_time(name: str, correction: bool) -> None:
+    case = CASES[name]
+    first = requests(case)[0]
+    state = first.state
+    attitude = Rotation.from_quat(state.quaternion)
+    if case.method == "area_loop":  # Within the tolerance will do.
+        attitude = attitude * Rotation.from_rotvec([0.0, 0.0, 1e-4])
+    goal = Goal.checked(state.position, attitude.as_quat())
+    method = built(case, robot_of(case.robot))
+    schedule = method.plan(replace(first, goal=goal, correction=correction))
+    assert (schedule.ticks, schedule.duration, schedule.partial) == (0, 0.0, False)
+    np.testing.assert_allclose(schedule.positions, [state.q], atol=1e-14)
+    assert schedule.velocities.shape == (0, len(state.q))
+    np.testing.assert_allclose(schedule.path.position, [state.position], atol=1e-14)
+
+
 # -- pieces of one goal -----------------------------------------------------------------------
 
 
 def test_a_goal_keeps_its_nominal_shape_while_the_other_joints_rest() -> None:
     case = CASES["area_loop of six joints"]
-    method = built(case, robot_named(case.robot))
+    method = built(case, robot_of(case.robot))
     request = requests(case)[0]
     first = method.plan(request)
     # As noise has it: the next plan begins a little elsewhere.
@@ -187,7 +183,7 @@ def test_a_goal_keeps_its_nominal_shape_while_the_other_joints_rest() -> None:
 
 def test_what_was_planned_with_all_joints_is_not_gone_on_with_without_some() -> None:
     case = CASES["area_loop of six joints"]
-    robot = robot_named(case.robot)
+    robot = robot_of(case.robot)
     request = requests(case)[0]
     of_all = built(case, robot).plan(request)
     without = built(CASES["remaining_joints"], robot)
@@ -201,7 +197,7 @@ def test_what_was_planned_with_all_joints_is_not_gone_on_with_without_some() -> 
 @pytest.mark.parametrize("name", CASES)
 def test_a_cancelled_plan_is_not_made(name: str) -> None:
     case = CASES[name]
-    method = built(case, robot_named(case.robot))
+    method = built(case, robot_of(case.robot))
     cancellation = Cancellation()
     cancellation.cancel()
     with pytest.raises(PlanningCancelled, match=r"^Planning was cancelled\.$"):
@@ -226,27 +222,15 @@ class Watched(Cancellation):
         return super().requested
 
 
-@pytest.mark.parametrize(
-    "wrapped",
-    [
-        lambda robot, options: build_method("optimal", robot, PERIOD, STEP, options),
-        lambda robot, options: RemainingJointsGait(
-            robot,
-            PERIOD,
-            STEP,
-            stuck={"elbow_pitch": 2.0},
-            method="optimal",
-            options=options,
-        ),
-    ],
-    ids=["optimal", "optimal with remaining joints"],
-)
-def test_a_search_is_cancelled_from_another_thread(
-    wrapped: Callable[[SpaceRobot, dict[str, Any]], GaitMethod],
-) -> None:
-    robot = robot_named("servicer")
+@pytest.mark.parametrize("remaining", [False, True], ids=["optimal", "with remaining joints"])
+def test_a_search_is_cancelled_from_another_thread(remaining: bool) -> None:
+    robot = robot_of("servicer")
     long = {"cache": 0, "intervals": 200, "starts": 1000, "answers": 1000}
-    method = wrapped(robot, {"optimal": method_options("optimal", long)})
+    options = {"optimal": method_options("optimal", long)}
+    if remaining:
+        method = without_elbow(robot, "optimal", options)
+    else:
+        method = build_method("optimal", robot, PERIOD, STEP, options)
     case = replace(CASES["area_loop of six joints"], turns=((0.3, 0.2, -0.3),) * 2)
     cancellation, ended = Watched(), list[BaseException]()
 
