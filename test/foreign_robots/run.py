@@ -21,7 +21,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+from support.hand_motion import attitude_after
 from support.oracles import PinocchioOracle
+from support.planners import Planner
 
 from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
@@ -30,7 +32,6 @@ from spacerobot_ros.planning import (
     GaitMethod,
     GaitSchedule,
     Goal,
-    PlanRequest,
     RobotState,
     Tolerance,
     build_method,
@@ -184,20 +185,11 @@ def integrated(oracle: PinocchioOracle, state: RobotState, schedule: GaitSchedul
 
     The attitude depends on the path of the shape alone, not on how fast it is travelled.
     """
-    attitude, side = Rotation.from_quat(state.quaternion), np.sqrt(3) / 6
+    start, end = Rotation.from_quat(state.quaternion), schedule.positions[-1]
     path = schedule.positions[corners(schedule.positions)]
-    for q, way in zip(path, np.diff(path, axis=0) / 2, strict=False):
-        if not way.any():
-            continue
-        # A commutator-free integrator of fourth order, in two steps.
-        for at in (q, q + way):
-            one, two = (oracle.base_twist(at + way * (0.5 + s), way)[3:] for s in (-side, side))
-            first = (0.25 + side) * one + (0.25 - side) * two
-            second = (0.25 - side) * one + (0.25 + side) * two
-            attitude = attitude * Rotation.from_rotvec(first) * Rotation.from_rotvec(second)
-    start = Rotation.from_quat(state.quaternion).apply(oracle.center_of_mass(state.q))
-    end = schedule.positions[-1]
-    position = state.position + start - attitude.apply(oracle.center_of_mass(end))
+    attitude = attitude_after(oracle, path, start, parts=2)
+    center = state.position + start.apply(oracle.center_of_mass(state.q))
+    position = center - attitude.apply(oracle.center_of_mass(end))
     return RobotState(position, attitude.as_quat(), end)
 
 
@@ -239,42 +231,32 @@ class Trials:
 
     def outcome(self, task: Task) -> Outcome:
         """Plan one goal, and go on where a schedule is partial."""
-        method, began = self._method(position=task.kind == "position"), cpu_seconds()
-        done = Outcome(task.number, task.kind, task.size, "met")
-        state, previous = task.state, None
+        planner = Planner(self._method(position=task.kind == "position"), TOLERANCE)
+        began, state = cpu_seconds(), task.state
         pieces: list[GaitSchedule] = []
+        refusal: PlanningError | None = None
         try:
-            while previous is None or previous.partial:
-                request = PlanRequest(
-                    state, task.goal, TOLERANCE, correction=bool(pieces), previous=previous
-                )
-                previous = method.plan(request)
-                pieces.append(previous)
-                if previous.partial:
-                    path = previous.path
-                    state = RobotState(
-                        path.position[-1], path.quaternion[-1], previous.positions[-1]
-                    )
-        except UnreachableError as refusal:
-            return self._refused(done, refusal.proof.value, refusal, began)
-        except NotFoundError as refusal:
-            return self._refused(done, "not found", refusal, began)
-        except PlanningError as refusal:
-            return self._refused(done, "refused", refusal, began)
-        cpu = cpu_seconds() - began
-        duration = sum(piece.duration for piece in pieces)
-        error = self._checked(task, pieces)
-        return replace(
-            done,
-            result="met" if error <= 1.0 else "missed",
-            method=pieces[0].method,
-            duration=duration,
-            cpu=cpu,
-            error=error,
-        )
-
-    def _refused(self, done: Outcome, why: str, refusal: Exception, began: float) -> Outcome:
-        return replace(done, result=why, sentence=str(refusal), cpu=cpu_seconds() - began)
+            while not pieces or pieces[-1].partial:
+                pieces.append(planner.plan(state, task.goal, correction=bool(pieces)))
+                path, q = pieces[-1].path, pieces[-1].positions[-1]
+                state = RobotState(path.position[-1], path.quaternion[-1], q)
+        except PlanningError as reason:
+            refusal = reason
+        done = Outcome(task.number, task.kind, task.size, "met", cpu=cpu_seconds() - began)
+        match refusal:
+            case None:
+                error = self._checked(task, pieces)
+                result = "met" if error <= 1.0 else "missed"
+                duration = sum(piece.duration for piece in pieces)
+                method = pieces[0].method
+                return replace(done, result=result, method=method, duration=duration, error=error)
+            case UnreachableError():
+                result = refusal.proof.value
+            case NotFoundError():
+                result = "not found"
+            case _:
+                result = "refused"
+        return replace(done, result=result, sentence=str(refusal))
 
     def _checked(self, task: Task, pieces: Sequence[GaitSchedule]) -> float:
         """Return the worst error at the end, in tolerances; infinite where a limit is exceeded."""
@@ -301,7 +283,6 @@ def kept(name: str) -> list[Outcome]:
 
 
 def keep(name: str, outcome: Outcome) -> None:
-    """Keep what became of a goal."""
     with (KEPT / f"{name}.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(asdict(outcome)) + "\n")
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from planning.flown import STEP, fly, plant_at
 from scipy.spatial.transform import Rotation
+from support.planner_loop import robot_of
 from support.planners import Planner, planner_of
 
 from spacerobot_ros.errors import PlanningError
@@ -31,7 +31,6 @@ from spacerobot_ros.planning import (
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.methods.auto import AutoGait
 
-FOLDER = Path(__file__).parents[2] / "urdf"
 PERIOD = 0.25
 TOLERANCE = Tolerance(0.02, 0.02)
 
@@ -41,10 +40,6 @@ START = {
     "three_joint_arm": np.radians([0, -45, 90]),
     "planar_chain": np.array([2.0, 1.5]),
 }
-
-
-def robot_named(name: str) -> SpaceRobot:
-    return SpaceRobot.from_file(FOLDER / f"{name}.urdf")
 
 
 def auto(robot: SpaceRobot, tolerance: Tolerance = TOLERANCE, **area_loop: Any) -> Planner:
@@ -76,7 +71,7 @@ def goal_of(rotvec: list[float], position: tuple[float, float, float] = (0, 0, 0
 def test_of_the_methods_that_suit_the_one_with_the_shortest_manoeuvre_is_taken(
     name: str, others: list[str], controls: set[str]
 ) -> None:
-    robot, goal = robot_named(name), goal_of([0.0, 0.0, 0.2])
+    robot, goal = robot_of(name), goal_of([0.0, 0.0, 0.2])
     method = auto(robot)
     schedule = method.plan(at(START[name]), goal)
     assert schedule.method == "optimal"
@@ -100,7 +95,7 @@ def test_of_the_methods_that_suit_the_one_with_the_shortest_manoeuvre_is_taken(
 
 
 def test_options_are_those_of_the_chosen_method() -> None:
-    robot, state = robot_named("planar_chain"), at(START["planar_chain"])
+    robot, state = robot_of("planar_chain"), at(START["planar_chain"])
     request = PlanRequest(state, goal_of([0.0, 0.0, 0.2]), TOLERANCE)
     # Where these make it slower than another method, that one is taken.
     for duration, chosen in ((5.0, "optimal"), (30.0, "square_path")):
@@ -113,7 +108,7 @@ def test_options_are_those_of_the_chosen_method() -> None:
 
 
 def test_where_optimal_refuses_the_papers_method_flies_the_goal() -> None:
-    robot = robot_named("three_joint_arm")
+    robot = robot_of("three_joint_arm")
     options = {
         "optimal": method_options("optimal", {"starts": 1, "iterations": 1}),
         "area_loop": method_options("area_loop", {"k": 0.5}),
@@ -132,7 +127,7 @@ def test_where_optimal_refuses_the_papers_method_flies_the_goal() -> None:
 
 
 def test_a_method_whose_options_do_not_suit_the_robot_is_left_out() -> None:
-    urdf = (FOLDER / "planar_chain.urdf").read_text("utf-8")
+    urdf = robot_of("planar_chain").description.urdf
     unlimited = re.sub(r' velocity="[^"]*"', ' velocity="0"', urdf, count=1)
     robot = SpaceRobot.from_urdf(unlimited)
     with pytest.raises(PlanningError, match=r"optimal: Joint 'pin_1' has a velocity limit of 0"):
@@ -163,27 +158,16 @@ class Made(GaitMethod):
         return self.schedule_of(goal, q, path, {}, partial=partial, remaining=self.left)
 
 
-def made(
-    name: str,
-    *,
-    objection: str = "",
-    refusal: str = "",
-    controls: frozenset[Any] = GaitMethod.controls,
-    ticks: int = 1,
-    off: float = 0.0,
-    left: float = 0.0,
-) -> type[Made]:
+def made(name: str, objection: str = "", **members: Any) -> type[Made]:
     def refuse(robot: SpaceRobot) -> None:
         if objection:
             raise PlanningError(objection)
 
-    members: dict[str, Any] = {"name": name, "refusal": refusal, "controls": controls}
-    members |= {"ticks": ticks, "off": off, "left": left}
-    return type(name, (Made,), {**members, "require_suitable": staticmethod(refuse)})
+    return type(name, (Made,), {"name": name, "require_suitable": staticmethod(refuse), **members})
 
 
 def choice_of(*methods: type[Made]) -> tuple[Planner, list[str]]:
-    robot, built = robot_named("planar_chain"), list[str]()
+    robot, built = robot_of("planar_chain"), list[str]()
 
     candidates = {entry.name: entry for entry in methods}
 
@@ -312,6 +296,6 @@ def test_only_methods_that_start_in_motion_are_asked_for_moving_joints() -> None
 
 
 def test_every_method_of_the_registry_is_built_with_its_defaults() -> None:
-    robot = robot_named("three_joint_arm")
+    robot = robot_of("three_joint_arm")
     for name, entry in METHODS.items():
         assert type(build_method(name, robot, PERIOD, STEP, {})) is entry

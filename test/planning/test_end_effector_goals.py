@@ -2,76 +2,50 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from planning.test_resolved_rate import ARM, ATTITUDE, PLACE, hand, poses, request_of
 from scipy.spatial.transform import Rotation
-from support.hand_motion import end_of_motion
 from support.planner_loop import robot_of
+from support.planners import assert_within
 
 from spacerobot_ros.errors import GoalError, NotFoundError, PlanningError, Proof, UnreachableError
-from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, build_method, plan
+from spacerobot_ros.planning import Goal, RobotState, build_method, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, PoseError, Tolerance
-from spacerobot_ros.planning.core.method import PlanRequest
-from spacerobot_ros.planning.methods.optimal.end_effectors import (
-    EndEffectorRows,
-)
+from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.registry import method_options
 
 Array = npt.NDArray[np.float64]
-
-FOLDER = Path(__file__).parents[2] / "urdf"
 QUICK: dict[str, Any] = {
     **{"cache": 0, "answers": 1, "intervals": 30},
     **{"control_period": 0.1, "clearance": 0.0},
 }
-PLACE, ATTITUDE = np.array([0.4, -0.3, 0.2]), Rotation.from_rotvec([0.3, -0.5, 0.4])
-ARM = np.array([0.4, -0.9, 1.1])
-
-
-def urdf_of(robot: str) -> str:
-    return (FOLDER / f"{robot}.urdf").read_text("utf-8")
 
 
 def at_rest(q: npt.ArrayLike) -> RobotState:
     return RobotState(PLACE, ATTITUDE.as_quat(), np.asarray(q, dtype=float))
 
 
-def ends(robot: str, schedule: GaitSchedule, *links: str) -> dict[str, tuple[Array, Rotation]]:
-    return end_of_motion(
-        *(urdf_of(robot), schedule.joint_names, schedule.positions, list(links), PLACE, ATTITUDE)
-    )
-
-
 def beside(robot: str, start: Array, end: Array, link: str) -> tuple[Array, Rotation]:
     """Return where a link is after the straight way to a shape: a goal that can be reached."""
     way = start + np.linspace(0.0, 1.0, 40)[:, np.newaxis] * (end - start)
-    names = robot_of(robot).joint_names
-    return end_of_motion(urdf_of(robot), names, way, [link], PLACE, ATTITUDE)[link]
-
-
-def assert_within_limits(robot: SpaceRobot, schedule: GaitSchedule) -> None:
-    q = schedule.positions
-    rest = np.zeros((1, robot.n))
-    rates = np.vstack([rest, np.diff(q, axis=0) / schedule.control_period, rest])
-    changes = np.diff(rates, axis=0) / schedule.control_period
-    assert np.all(np.abs(rates) <= robot.velocity_limit * (1 + 1e-8))
-    assert np.all(np.abs(changes) <= robot.velocity_limit / 0.5 * (1 + 1e-8))
-    assert np.all((q >= robot.lower - 1e-8) & (q <= robot.upper + 1e-8))
+    return poses(robot, way, link)[link]
 
 
 @pytest.mark.slow
 def test_a_position_is_reached_with_the_base_free() -> None:
     r, _ = beside("three_joint_arm", ARM, np.array([-0.7, -0.2, 1.9]), "end_effector")
     schedule = plan("three_joint_arm", end_effector_position=r, start=at_rest(ARM), **QUICK)
-    reached, _ = ends("three_joint_arm", schedule, "end_effector")["end_effector"]
+    reached, _ = hand(schedule.positions)
     np.testing.assert_allclose(reached, r, atol=1e-6)
-    assert_within_limits(robot_of("three_joint_arm"), schedule)
+    robot = robot_of("three_joint_arm")
+    assert_within(schedule, robot.velocity_limit, robot.velocity_limit / 0.5)
+    q = schedule.positions
+    assert np.all((q >= robot.lower - 1e-8) & (q <= robot.upper + 1e-8))
     assert schedule.controls == {"shape", "end_effectors"}
     # The note says so, too.
     noted = schedule.notes["final_pose_of_end_effector"]
@@ -94,7 +68,7 @@ def test_the_attitude_of_the_base_is_reached_with_a_position() -> None:
         start=at_rest(SEVEN),
         **QUICK,
     )
-    found = ends("seven_joint_arm", schedule, "link_7", "base_link")
+    found = poses("seven_joint_arm", schedule.positions, "link_7", "base_link")
     np.testing.assert_allclose(found["link_7"][0], r, atol=1e-6)
     assert (found["base_link"][1].inv() * Rotation.from_rotvec(turned)).magnitude() < 1e-6
     assert "attitude" in schedule.controls
@@ -113,7 +87,7 @@ def test_two_hands_are_reached_at_once() -> None:
         start=at_rest(q),
         **QUICK,
     )
-    found = ends("dual_arm", schedule, "left_link_7", "right_link_7")
+    found = poses("dual_arm", schedule.positions, "left_link_7", "right_link_7")
     np.testing.assert_allclose(found["left_link_7"][0], left[0], atol=1e-6)
     assert (found["left_link_7"][1].inv() * left[1]).magnitude() < 1e-6
     np.testing.assert_allclose(found["right_link_7"][0], right[0], atol=1e-6)
@@ -125,7 +99,9 @@ def test_planar_robots_reach_positions_in_their_plane_and_no_other() -> None:
     q, end = np.array([0.4, -0.9]), np.array([1.1, -0.2])
     r, R = beside("planar_chain", q, end, link)
     schedule = plan("planar_chain", end_effector_position={link: r}, start=at_rest(q), **QUICK)
-    np.testing.assert_allclose(ends("planar_chain", schedule, link)[link][0], r, atol=1e-6)
+    np.testing.assert_allclose(
+        poses("planar_chain", schedule.positions, link)[link][0], r, atol=1e-6
+    )
     off = r + 0.05 * ATTITUDE.apply([0.0, 0.0, 1.0])
     with pytest.raises(UnreachableError, match="in one plane") as refusal:
         plan("planar_chain", end_effector_position={link: off}, start=at_rest(q), **QUICK)
@@ -150,7 +126,7 @@ def test_joint_positions_that_go_with_the_goal_are_reached_and_others_refused() 
         start=at_rest(ARM),
         **{**QUICK, "intervals": 40, "answers": 2},
     )
-    reached, R_reached = ends("three_joint_arm", schedule, "end_effector")["end_effector"]
+    reached, R_reached = hand(schedule.positions)
     np.testing.assert_allclose(reached, r, atol=1e-6)
     assert (R_reached.inv() * R).magnitude() < 1e-6
     np.testing.assert_allclose(schedule.positions[-1], end, atol=1e-9)
@@ -165,12 +141,8 @@ def test_joint_positions_that_go_with_the_goal_are_reached_and_others_refused() 
 
 
 def test_a_start_at_the_goal_is_no_motion() -> None:
-    robot = robot_of("three_joint_arm")
-    names = robot.joint_names
-    here = end_of_motion(
-        urdf_of("three_joint_arm"), names, ARM[np.newaxis], ["end_effector"], PLACE, ATTITUDE
-    )["end_effector"]
-    schedule = plan("three_joint_arm", end_effector_position=here[0], start=at_rest(ARM), **QUICK)
+    here, _ = hand(ARM[np.newaxis])
+    schedule = plan("three_joint_arm", end_effector_position=here, start=at_rest(ARM), **QUICK)
     assert schedule.ticks == 0
 
 
@@ -236,7 +208,7 @@ def test_a_pose_of_more_coordinates_than_the_joints_move_is_reached_where_it_can
     schedule = plan(
         name, end_effector_pose=[*r, *R.as_quat()], start=at_rest(ARM), **given, **QUICK
     )
-    found = ends(name, schedule, hand, "base_link")
+    found = poses(name, schedule.positions, hand, "base_link")
     np.testing.assert_allclose(found[hand][0], r, atol=1e-6)
     assert (found[hand][1].inv() * R).magnitude() < 1e-6
     if base is not None:
@@ -257,11 +229,7 @@ def test_a_default_end_effector_is_named_where_there_is_none() -> None:
 @pytest.mark.parametrize("method", ["area_loop", "auto"])
 def test_methods_of_loops_leave_the_goal_to_optimal(method: str) -> None:
     r, _ = beside("three_joint_arm", ARM, ARM + np.array([0.3, 0.2, -0.2]), "end_effector")
-    request = PlanRequest(
-        at_rest(ARM),
-        Goal.of_end_effectors([EndEffectorGoal("end_effector", r)]),
-        Tolerance(1e-6, 1e-6),
-    )
+    request = request_of("end_effector", r)
     options = {"optimal": method_options("optimal", {"cache": 0, "answers": 1, "intervals": 30})}
     planner = build_method(method, robot_of("three_joint_arm"), 0.1, 0.01, options)
     if method == "auto":
@@ -301,19 +269,13 @@ def test_derivatives_of_the_rows_are_their_differences() -> None:
     X, q = Rotation.from_rotvec(rng.normal(size=3)), ARM + 0.3
     value, by_rotation, by_shape = rows.evaluate(X.as_quat()[np.newaxis], q[np.newaxis], p)
     assert value.shape == (1, 9)
-    step = 1e-6
-    for k in range(3):
-        d = np.eye(3)[k] * step
-        after, before = (
-            rows.evaluate((X * Rotation.from_rotvec(s * d)).as_quat()[np.newaxis], q[np.newaxis], p)
-            for s in (1, -1)
-        )
-        np.testing.assert_allclose(
-            (after[0][0] - before[0][0]) / (2 * step), by_rotation[0][:, k], atol=1e-7
-        )
-        after, before = (
-            rows.evaluate(X.as_quat()[np.newaxis], (q + s * d)[np.newaxis], p) for s in (1, -1)
-        )
-        np.testing.assert_allclose(
-            (after[0][0] - before[0][0]) / (2 * step), by_shape[0][:, k], atol=1e-7
-        )
+    step, unit = 1e-6, np.eye(3)
+
+    def at(turn: Array, move: Array) -> Array:
+        turned = (X * Rotation.from_rotvec(turn)).as_quat()
+        return rows.evaluate(turned[np.newaxis], (q + move)[np.newaxis], p)[0][0]
+
+    rotated = [(at(step * e, 0 * e) - at(-step * e, 0 * e)) / (2 * step) for e in unit]
+    moved = [(at(0 * e, step * e) - at(0 * e, -step * e)) / (2 * step) for e in unit]
+    np.testing.assert_allclose(np.transpose(rotated), by_rotation[0], atol=1e-7)
+    np.testing.assert_allclose(np.transpose(moved), by_shape[0], atol=1e-7)

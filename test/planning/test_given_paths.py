@@ -11,19 +11,19 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planning.test_resolved_rate import ARM, ATTITUDE, PERIOD, PLACE, poses
+from planning.test_resolved_rate import ARM, ATTITUDE, HAND, PERIOD, PLACE, hand, method_of
 from scipy.spatial.transform import Rotation, Slerp
 from support.planner_loop import robot_of
+from support.planners import assert_within
 
 from spacerobot_ros.errors import GoalError, PlanningError
-from spacerobot_ros.planning import Goal, RobotState, Tolerance, build_method, plan
+from spacerobot_ros.planning import Goal, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.goal import MAX_PATH_POSES, EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
-from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.planning.methods.resolved_rate import PathProgress
 
 Array = npt.NDArray[np.float64]
@@ -192,7 +192,6 @@ def test_rates_are_derivatives_and_corners_are_rounded(tolerance: float) -> None
 # -- given paths of an end-effector with the base free, held against Pinocchio's momentum --------
 
 
-HAND = "end_effector"
 WAY = np.array([[0.05, 0.0, 0.02], [0.12, -0.1, 0.03], [0.02, -0.06, 0.1]])
 """From the start of the arm, m: the corner at the second is sharp."""
 SHORT = np.array([[1.0, 1.0, 1.0], [1.0, 1.0, 1.1]])
@@ -202,12 +201,7 @@ NEAR = Tolerance(1e-6, 1e-6)
 
 @pytest.fixture(scope="module")
 def start() -> Array:
-    return poses("three_joint_arm", ARM[np.newaxis], HAND)[HAND][0]
-
-
-def method_of(name: str = "resolved_rate", **options: Any) -> Any:
-    chosen = {"resolved_rate": method_options("resolved_rate", options)}
-    return build_method(name, robot_of("three_joint_arm"), PERIOD, 0.01, chosen)
+    return hand(ARM[np.newaxis])[0]
 
 
 @pytest.fixture(scope="module")
@@ -233,20 +227,18 @@ def test_the_hand_keeps_to_the_lines_within_the_tolerance(
         shapes = flown.positions[: tick + 1]
         if tick:  # In the middle of a held command.
             shapes = np.vstack([shapes[:-1], shapes[-2:].mean(axis=0)])
-        places.append(poses("three_joint_arm", shapes, HAND)[HAND][0])
+        places.append(hand(shapes)[0])
         off.append(distance_from(lines, places[-1]))
     assert 0.002 < max(off) < 0.02
     near = [np.linalg.norm(np.array(places) - each, axis=1).min() for each in lines]
     assert max(near) < 0.03
-    end = poses("three_joint_arm", flown.positions, HAND)[HAND][0]
+    end = hand(flown.positions)[0]
     np.testing.assert_allclose(end, start + WAY[-1], atol=1e-8)
 
 
 def test_the_limits_of_the_joints_are_kept_on_the_way(flown: GaitSchedule) -> None:
     limit = robot_of("three_joint_arm").velocity_limit
-    rates = np.vstack([np.zeros((1, 3)), flown.velocities, np.zeros((1, 3))])
-    assert np.all(np.abs(rates) <= limit * (1 + 1e-8))
-    assert np.all(np.abs(np.diff(rates, axis=0)) / PERIOD <= limit / 0.5 * (1 + 1e-8))
+    assert_within(flown, limit, limit / 0.5)
     assert flown.method == "resolved_rate"
     assert float(str(flown.notes["least"])) <= float(str(flown.notes["at_start"]))
 
@@ -257,9 +249,8 @@ def test_the_hand_rests_at_a_sharp_corner_and_goes_on(start: Array, flown: GaitS
     inner = np.arange(3, len(speeds) - 3)
     slowest = int(inner[np.argmin(speeds[inner])])
     there = [
-        np.linalg.norm(poses("three_joint_arm", flown.positions[: k + 1], HAND)[HAND][0] - corner)
+        np.linalg.norm(hand(flown.positions[: k + 1])[0] - (start + WAY[1]))
         for k in (slowest, slowest + 1)
-        for corner in [start + WAY[1]]
     ]
     assert min(there) < 1e-8
 
@@ -393,7 +384,7 @@ def test_a_path_is_followed_until_shortly_before_a_limit(start: Array) -> None:
     assert isinstance(progress, PathProgress)
     done, whole = float(progress.travelled_lengths[-1]), float(progress.route.lengths_at_poses[-1])
     assert progress.route.lengths_at_poses[1] < done < whole
-    end = poses("three_joint_arm", schedule.positions, HAND)[HAND][0]
+    end = hand(schedule.positions)[0]
     wanted = progress.route.remaining_after(done).positions[0]
     np.testing.assert_allclose(end, wanted, atol=1e-6)
     # From there the rest is refused with the same reason: the goal is given up.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 from threading import Condition
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -205,50 +206,35 @@ def test_a_jump_of_what_is_measured_tells_nothing_of_masses(name: str, step: lis
 # -- how long a goal was flown to, from what its planner has reported ----------------------------
 
 
-def said(time: float, state: str, goal_id: str = "") -> tuple[float, PlannerStatus]:
-    return time, PlannerStatus(PlannerState(state), goal_id=goal_id)
+FLOWN = (
+    "0 idle, 1 executing a, 4 reached a, 5 planning b, 7 executing b, 8 planning b, 9 executing b"
+)
 
 
-def test_it_counts_from_the_first_schedule_for_the_last_goal() -> None:
-    flown = [
-        said(0.0, "idle"),
-        said(1.0, "executing", "a"),
-        said(4.0, "reached", "a"),
-        said(5.0, "planning", "b"),
-        said(7.0, "executing", "b"),
-        said(8.0, "planning", "b"),
-        said(9.0, "executing", "b"),
-    ]
-    assert time_to_end(flown, 12.5) == 5.5
-    refused = said(10.0, "refused", "c")
-    assert time_to_end([*flown, refused], 12.5) == 5.5, "which is another goal's"
-    assert time_to_end([*flown, refused, said(11.0, "aborted", "b")], 12.5) == 4.0
-
-
-def test_a_goal_that_was_refused_in_between_ends_nothing() -> None:
-    flown = [
-        said(1.0, "executing", "a"),
-        said(3.0, "planning", "b"),
-        said(3.5, "refused", "b"),
-        said(6.0, "planning", "a"),
-        said(7.0, "executing", "a"),
-        said(9.0, "aborted", "a"),
-    ]
-    assert time_to_end(flown, 12.0) == 8.0
-
-
-def test_it_goes_on_where_a_planner_was_started_again() -> None:
-    flown = [
-        said(0.25, "executing", "a"),
-        said(40.5, "planning", "a"),
-        said(46.5, "executing", "a"),
-        said(49.0, "aborted", "a"),
-    ]
-    assert time_to_end(flown, 60.0) == 48.75
-
-
-def test_without_a_schedule_there_is_none() -> None:
-    assert time_to_end([said(0.0, "idle"), said(1.0, "refused", "a")], 5.0) is None
+@pytest.mark.parametrize(
+    ("reported", "now", "time"),
+    [
+        (FLOWN, 12.5, 5.5),
+        # Another goal's refusal ends nothing.
+        (f"{FLOWN}, 10 refused c", 12.5, 5.5),
+        (f"{FLOWN}, 10 refused c, 11 aborted b", 12.5, 4.0),
+        (
+            "1 executing a, 3 planning b, 3.5 refused b, 6 planning a, 7 executing a, 9 aborted a",
+            *(12.0, 8.0),
+        ),
+        # The planner was started again.
+        ("0.25 executing a, 40.5 planning a, 46.5 executing a, 49 aborted a", 60.0, 48.75),
+        ("0 idle, 1 refused a", 5.0, None),
+    ],
+)
+def test_it_counts_from_the_first_schedule_for_the_last_goal(
+    reported: str, now: float, time: float | None
+) -> None:
+    said = []
+    for each in reported.split(", "):
+        at, state, *goal = each.split()
+        said.append((float(at), PlannerStatus(PlannerState(state), goal_id="".join(goal))))
+    assert time_to_end(said, now) == time
 
 
 # -- what a search reports of itself on the way, and what the command line shows of it -----------
@@ -283,10 +269,15 @@ class Terminal(io.StringIO):
 def test_a_search_reports_every_start_and_the_best_so_far() -> None:
     seen: list[SearchProgress] = []
     with report_progress(seen.append):
-        gait = plan(
-            "sliding_masses", position=(0.2, -0.1, 0.05), rotvec=(0.1, 0.0, 0.1), starts=3,
-            answers=3, agreeing=0, intervals=16, control_period=0.1, cache=0,
-        )  # fmt: skip
+        few: dict[str, Any] = {
+            "starts": 3,
+            "answers": 3,
+            "agreeing": 0,
+            "intervals": 16,
+            "cache": 0,
+        }
+        few |= {"position": (0.2, -0.1, 0.05), "rotvec": (0.1, 0.0, 0.1)}
+        gait = plan("sliding_masses", control_period=0.1, **few)
     starts = [each.starts for each in seen]
     assert starts[:4] == [0, 1, 2, 3]
     assert starts == sorted(starts)

@@ -11,7 +11,8 @@ import pytest
 from planning.test_optimal import ARM_START, QUICK
 from planning.test_reach import some_shape, urdf_of
 from scipy.spatial.transform import Rotation
-from support.oracles.pinocchio_oracle import PinocchioOracle
+from support.hand_motion import attitude_after
+from support.oracles import PinocchioOracle
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
@@ -93,45 +94,52 @@ def test_the_bounds_are_no_empty_claims(name: str) -> None:
     assert turns[0] > 0.4 * bounds.turn[0]
 
 
-def test_a_wheel_in_the_middle_turns_the_base_by_its_share_of_the_inertia() -> None:
-    robot = of_two("revolute", "0 0 0", "0 0 1")
-    bounds = ConnectionBounds.of(robot, WHOLE)
+@pytest.mark.parametrize(
+    ("joint", "turn", "center"),
+    [
+        # A wheel in the middle has its share of the inertia.
+        (("revolute", "0 0 0", "0 0 1"), 0.5 / 3.5, 0.0),
+        # The reduced mass of a slider is 1.5 kg, its lever 0.4 m; the way along the slot is none.
+        (("prismatic", "0.3 0.4 0", "1 0 0"), 1.5 * 0.4 / 3.5, 0.25),
+        # The energy of the slider, 1.5 kg, is the smaller bound of a long lever.
+        (("prismatic", "0 40 0", "1 0 0"), np.sqrt(1.5 / (3.5 + 3.0)), 0.25),
+        # Beside its axis: 0.5 + 1.5 * 0.2^2 of the link, 1.5 * 0.2 * 0.3 of the base's lever.
+        (
+            ("revolute", "0.3 0 0", "0 0 1", "0.2 0 0"),
+            (0.5 + 1.5 * 0.04 + 1.5 * 0.06) / 3.5,
+            0.25 * 0.2,
+        ),
+    ],
+    ids=["wheel", "slider", "slider far off", "link beside its axis"],
+)
+def test_a_joint_turns_the_base_by_its_share_of_inertia_and_lever(
+    joint: tuple[str, ...], turn: float, center: float
+) -> None:
+    bounds = ConnectionBounds.of(of_two(*joint), WHOLE)
     assert bounds.inertia == pytest.approx(3.5)
-    np.testing.assert_allclose(bounds.turn, [0.5 / 3.5])
-    np.testing.assert_allclose(bounds.center, [0.0])
+    np.testing.assert_allclose(bounds.turn, [turn])
+    np.testing.assert_allclose(bounds.center, [center])
 
 
-def test_a_slider_turns_the_base_by_its_lever() -> None:
-    # The reduced mass is 1.5 kg, the lever 0.4 m; the way along the slot is no lever.
-    bounds = ConnectionBounds.of(of_two("prismatic", "0.3 0.4 0", "1 0 0"), WHOLE)
-    np.testing.assert_allclose(bounds.turn, [1.5 * 0.4 / 3.5])
-    np.testing.assert_allclose(bounds.center, [0.25])
-    # The energy of the slider, 1.5 kg, is the smaller bound of a long lever.
-    bounds = ConnectionBounds.of(of_two("prismatic", "0 40 0", "1 0 0"), WHOLE)
-    np.testing.assert_allclose(bounds.turn, [np.sqrt(1.5 / (3.5 + 3.0))])
-
-
-def test_a_link_beside_its_axis_has_the_lever_of_both_masses() -> None:
-    # h = 0.5 + 1.5 * 0.2^2 of the link itself, and 1.5 * 0.2 * 0.3 of the base's lever.
-    bounds = ConnectionBounds.of(of_two("revolute", "0.3 0 0", "0 0 1", com="0.2 0 0"), WHOLE)
-    np.testing.assert_allclose(bounds.turn, [(0.5 + 1.5 * 0.04 + 1.5 * 0.06) / 3.5])
-    np.testing.assert_allclose(bounds.center, [0.25 * 0.2])
+def of_three(first: tuple[str, str], second: tuple[str, str]) -> SpaceRobot:
+    """Return a chain of three equal links with joints of these types and elements."""
+    links = "".join(LINK.format(name, "0.1 0 0", 2, 0.5) for name in ("base", "one", "two"))
+    joints = "".join(
+        f'<joint name="to_{child}" type="{kind}"><parent link="{parent}"/>'
+        f'<child link="{child}"/>{elements}</joint>'
+        for parent, child, (kind, elements) in (("base", "one", first), ("one", "two", second))
+    )
+    return SpaceRobot.from_urdf(f'<robot name="three">{links}{joints}</robot>')
 
 
 def test_a_joint_moves_all_that_follow_it() -> None:
-    urdf = (
-        '<robot name="three">'
-        + "".join(LINK.format(name, "0.1 0 0", 2, 0.5) for name in ("base", "one", "two"))
-        + '<joint name="first" type="revolute"><parent link="base"/><child link="one"/>'
-        '<origin xyz="0.4 0 0"/><axis xyz="0 0 1"/>'
-        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
-        '<joint name="second" type="revolute"><parent link="one"/><child link="two"/>'
-        '<origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>{}'
-        '<limit lower="-3" upper="3" velocity="2" effort="1"/></joint></robot>'
-    )
+    turn = '<axis xyz="0 0 1"/><limit lower="{0}" upper="{1}" velocity="{1}" effort="1"/>'
+    first = "revolute", f'<origin xyz="0.4 0 0"/>{turn.format(-1, 1)}'
+    second = f'<origin xyz="0.5 0 0"/>{turn.format(-3, 2)}'
+    mimic = '<mimic joint="to_one" multiplier="-2"/>'
     axis = np.array([[0.0, 0.0, 1.0]])
-    free = ConnectionBounds.of(SpaceRobot.from_urdf(urdf.format("")), axis)
-    robot = SpaceRobot.from_urdf(urdf.format('<mimic joint="first" multiplier="-2"/>'))
+    free = ConnectionBounds.of(of_three(first, ("revolute", second)), axis)
+    robot = of_three(first, ("revolute", second + mimic))
     bounds = ConnectionBounds.of(robot, axis)
     np.testing.assert_allclose(bounds.turn, [free.turn[0] + 2 * free.turn[1]])
     turns = [abs(robot.connection(np.array([q]))[5, 0]) for q in np.linspace(-1, 1, 9)]
@@ -139,23 +147,14 @@ def test_a_joint_moves_all_that_follow_it() -> None:
 
 
 def test_the_way_of_a_slider_without_limits_is_not_known() -> None:
-    urdf = (
-        '<robot name="free">'
-        + "".join(LINK.format(name, "0.1 0 0", 2, 0.5) for name in ("base", "one", "two"))
-        + '<joint name="turn" type="continuous"><parent link="base"/><child link="one"/>'
-        '<axis xyz="0 0 1"/></joint>'
-        '<joint name="slide" type="prismatic"><parent link="one"/><child link="two"/>'
-        '<axis xyz="1 0 0"/><limit lower="-1e400" upper="1e400" velocity="2" effort="1"/></joint>'
-        "</robot>"
-    )
-    bounds = ConnectionBounds.of(SpaceRobot.from_urdf(urdf), WHOLE)
+    endless = '<axis xyz="1 0 0"/><limit lower="-1e400" upper="1e400" velocity="2" effort="1"/>'
+    robot = of_three(("continuous", '<axis xyz="0 0 1"/>'), ("prismatic", endless))
+    bounds = ConnectionBounds.of(robot, WHOLE)
     assert bounds.turn[0] == np.inf
     assert np.isfinite(bounds.turn[1])
     goal = Rotation.from_rotvec([0, 0, 1.0]).as_quat()
     boundary = BoundaryConditions(np.zeros(2), goal, np.zeros(2))
-    found = bound_of(
-        SpaceRobot.from_urdf(urdf), boundary, velocity=np.ones(2), acceleration=np.ones(2)
-    )
+    found = bound_of(robot, boundary, velocity=np.ones(2), acceleration=np.ones(2))
     assert found.seconds == 0.0
 
 
@@ -205,13 +204,8 @@ def test_no_motion_is_faster_than_the_bound(kind: str, seed: int) -> None:
     share = np.minimum(1.0, (upper - lower) / np.abs(way))
     rates, way = rates * share, way * share
     start = (lower + upper - way) / 2
-    q, attitude = start, Rotation.identity()
-    for rate in rates:
-        step, side = rate * PERIOD, np.sqrt(3) / 6
-        one, two = (oracle.base_twist(q + (0.5 + s) * step, step)[3:] for s in (-side, side))
-        for first, second in ((0.25 + side, 0.25 - side), (0.25 - side, 0.25 + side)):
-            attitude = attitude * Rotation.from_rotvec(first * one + second * two)
-        q = q + step
+    shapes = start + PERIOD * np.vstack([np.zeros(robot.n), np.cumsum(rates, axis=0)])
+    attitude, q = attitude_after(oracle, shapes), shapes[-1]
     turn = attitude.as_quat()
     limits = {"velocity": velocity, "acceleration": acceleration}
     free = BoundaryConditions(start, turn, q)

@@ -14,7 +14,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
+from support.hand_motion import attitude_after
+from support.oracles import PinocchioOracle
 from support.planner_phases import resting
+from support.urdf_text import numbers
 
 from spacerobot_ros.collision import CollisionGeometry
 from spacerobot_ros.collision.nearest import Approach
@@ -67,57 +70,32 @@ ELSEWHERE = RobotState(
 """A start whose base is not at the origin of the world."""
 
 
-@pytest.fixture(scope="module")
-def arm() -> SpaceRobot:
-    return SpaceRobot.from_file(robot_file("three_joint_arm"))
-
-
-def _numbers(values: Array) -> str:
-    return " ".join(repr(float(x)) for x in values)
-
-
 def distances_to(
     pose: Pose, obstacle: Any, robot: SpaceRobot, schedule: GaitSchedule, state: RobotState
 ) -> list[float]:
     """Return the distances (N + 1) of the nearest link to a solid at the ticks, m, by coal.
 
-    The poses of the base are those at which the centre of mass rests.
+    The poses of the base are those of Pinocchio, at which the centre of mass rests.
     """
-    attitudes = robot_attitudes(robot, schedule, state)
-    r_WC = state.position + Rotation.from_quat(state.quaternion).apply(
-        robot.center_of_mass(state.q)
-    )
-    there = coal.Transform3s(pose.R, pose.r)
-    found = []
-    for q, R_WB in zip(schedule.positions, attitudes, strict=True):
-        r_WB = r_WC - R_WB.apply(robot.center_of_mass(q))
-        R_all, r_all = (np.array(each) for each in robot.function("link_poses", compile=False)(q))
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    oracle.set_configuration(state.q, state.quaternion, state.position)
+    center, R_WB = oracle.center_of_mass_W(), Rotation.from_quat(state.quaternion)
+    made = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere}
+    there, found, before = coal.Transform3s(pose.R, pose.r), [], state.q
+    for q in schedule.positions:
+        R_WB, before = attitude_after(oracle, np.array([before, q]), R_WB), q
+        oracle.set_configuration(q, R_WB.as_quat())
+        oracle.set_configuration(q, R_WB.as_quat(), center - oracle.center_of_mass_W())
         least = np.inf
         for link in robot.description.links:
-            k = robot.link_names.index(link.name)
-            R_BL, r_BL = R_all[:, 3 * k : 3 * k + 3], r_all[:, k]
+            R, r = oracle.frame_W(link.name)
             for shape in link.collisions or link.shapes:
-                made = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere}
-                solid = made[shape.kind](*shape.size)
-                R = R_WB.as_matrix() @ R_BL @ shape.pose.R
-                r = r_WB + R_WB.apply(R_BL @ shape.pose.r + r_BL)
-                here, result = coal.Transform3s(R, r), coal.DistanceResult()
+                here = coal.Transform3s(R @ shape.pose.R, r + R @ shape.pose.r)
+                solid, result = made[shape.kind](*shape.size), coal.DistanceResult()
                 request = coal.DistanceRequest()
                 least = min(least, coal.distance(solid, here, obstacle, there, request, result))
         found.append(least)
     return found
-
-
-def robot_attitudes(robot: SpaceRobot, schedule: GaitSchedule, state: RobotState) -> list[Rotation]:
-    """Return the attitudes at the ticks, by steps of the connection."""
-    R, found, parts = Rotation.from_quat(state.quaternion), [], 10
-    for before, after in zip(schedule.positions, schedule.positions[1:], strict=False):
-        found.append(R)
-        step = (after - before) / parts
-        for k in range(parts):
-            middle = before + (k + 0.5) * step
-            R = R * Rotation.from_rotvec(-robot.connection(middle)[3:] @ step)
-    return [*found, R]
 
 
 def ball_at(place: npt.ArrayLike, radius: float) -> RobotDescription:
@@ -126,7 +104,7 @@ def ball_at(place: npt.ArrayLike, radius: float) -> RobotDescription:
     return parse_world(
         f'<robot name="w"><link name="w"/><link name="rock">{ball}</link>'
         '<joint name="j" type="fixed"><parent link="w"/><child link="rock"/>'
-        f'<origin xyz="{_numbers(np.array(place))}"/></joint></robot>'
+        f'<origin xyz="{numbers(place)}"/></joint></robot>'
     )
 
 
@@ -135,8 +113,8 @@ def test_optimal_goes_round_a_rock(arm: SpaceRobot) -> None:
     place = ELSEWHERE.position + attitude.apply([1.8, -0.2, 0.1])
     rock = Pose(np.eye(3), place), coal.Sphere(0.12)
     goal = attitude * Rotation.from_rotvec([0, 0, 0.2])
-    quick: dict[str, Any] = {"rotvec": goal.as_rotvec(), "start": ELSEWHERE, **QUICK}
-    quick["intervals"] = 20
+    quick: dict[str, Any] = {"rotvec": goal.as_rotvec(), "start": ELSEWHERE}
+    quick |= {**QUICK, "intervals": 20}
     plain = plan(arm, **quick)
     assert -0.06 < min(distances_to(*rock, arm, plain, ELSEWHERE)) < 0
     clear = plan(arm, world=ball_at(place, 0.12), **quick)
@@ -159,12 +137,10 @@ def test_the_pose_of_a_goal_in_an_obstacle_is_refused_before_a_search(arm: Space
 def test_a_clearance_of_zero_is_a_centimetre_among_obstacles(arm: SpaceRobot) -> None:
     described = with_world(arm.description, load_world(STRUT))
     assert Clearance.wanted(arm.description, 0.0) is None
-    wanted = Clearance.wanted(described, 0.0)
-    assert wanted is not None
-    assert wanted.distance == 0.01
-    given = Clearance.wanted(described, 0.2)
-    assert given is not None
-    assert given.distance == 0.2
+    for asked, kept in ((0.0, 0.01), (0.2, 0.2)):
+        wanted = Clearance.wanted(described, asked)
+        assert wanted is not None
+        assert wanted.distance == kept
 
 
 def test_the_world_of_a_scenario_is_that_of_plant_and_planner(tmp_path: Path) -> None:
@@ -201,12 +177,9 @@ def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool)
     robot, config = loop.plant.robot, PlannerConfig(clearance=0.0)
     described = with_world(robot.description, ball_at(np.zeros(3), 0.3)) if obstacles else None
     worker = PlanningWorker(robot, config, loop.method, described=described)
-    if described is None:
-        assert worker.clearance is None
-    else:
-        assert worker.clearance is not None
-        assert worker.clearance.has_obstacles
-        assert worker.clearance.distance == 0.01
+    clearance = worker.clearance
+    assert (clearance is not None) == obstacles
+    assert clearance is None or (clearance.has_obstacles, clearance.distance) == (True, 0.01)
 
 
 # -- rows of distances along an interval: the points that they are taken at, and their -----------
@@ -468,14 +441,10 @@ def test_squares_in_collision_are_refused_with_the_pair() -> None:
 
 def test_joints_that_follow_keep_clear_where_others_are_stuck(arm: SpaceRobot) -> None:
     clearance = Clearance(arm.description, 0.01)
+    options = {"optimal": method_options("optimal", {**QUICK, "base_attitude": 0})}
+    stuck = {arm.joint_names[0]: 0.0}
     method = RemainingJointsGait(
-        arm,
-        0.05,
-        0.01,
-        stuck={arm.joint_names[0]: 0.0},
-        method="optimal",
-        options={"optimal": method_options("optimal", {**QUICK, "base_attitude": 0})},
-        clearance=clearance,
+        arm, 0.05, 0.01, stuck=stuck, method="optimal", options=options, clearance=clearance
     )
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.2]))
     goal = Goal(np.zeros(3), state.quaternion, np.array([0.0, 0.0, -1.2]))

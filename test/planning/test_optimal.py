@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from functools import cache
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
-from planning.flown import STEP, plant_at
+from planning.flown import STEP, measured, plant_at
 from planning.sliding_robots import paper_robot, random_sliding_robot
 from scipy.spatial.transform import Rotation
+from support.hand_motion import attitude_after
 from support.oracles import PinocchioOracle
 from support.planar_manoeuvres import closed_forms
 from support.planner_loop import robot_of
-from support.planners import planner_of
+from support.planners import assert_within, planner_of
 from support.urdf_text import link
 
 from spacerobot_ros.errors import PlanningError
@@ -53,8 +52,6 @@ from spacerobot_ros.planning.methods.optimal.transcription import Stages
 from spacerobot_ros.resources import robot_file
 
 Array = npt.NDArray[np.float64]
-
-FOLDER = Path(__file__).parents[2] / "urdf"
 PERIOD = 0.1
 QUICK: dict[str, Any] = {
     "cache": 0,
@@ -71,27 +68,8 @@ PEAK_DISPLACEMENT = np.array([2.419, 1.688, 1.648])
 """Of the controls that paper 1 prints; the second displacement is rounded up to hold its zf."""
 
 
-def assert_within(
-    schedule: GaitSchedule, velocity: npt.ArrayLike, acceleration: npt.ArrayLike
-) -> None:
-    """Finite differences of the shapes at the ticks, from rest to rest, keep the limits."""
-    rest = np.zeros((1, schedule.positions.shape[1]))
-    rates = np.vstack([rest, np.diff(schedule.positions, axis=0) / schedule.control_period, rest])
-    changes = np.abs(np.diff(rates, axis=0)) / schedule.control_period
-    assert np.all(np.abs(rates).max(axis=0) <= np.asarray(velocity) * (1 + 1e-8))
-    assert np.all(changes.max(axis=0) <= np.asarray(acceleration) * (1 + 1e-8))
-
-
-def momentum_attitude(oracle: PinocchioOracle, schedule: GaitSchedule) -> Rotation:
-    """Return R_WB at the end by Pinocchio's momentum: omega = -A(q) qdot, two stages of order 4."""
-    R, h = Rotation.identity(), schedule.control_period
-    reach = np.sqrt(3) / 6
-    for q, q_next in zip(schedule.positions[:-1], schedule.positions[1:], strict=True):
-        move = q_next - q
-        one, two = (-oracle.connection(q + s * move)[3:] @ move for s in (0.5 - reach, 0.5 + reach))
-        R = R * Rotation.from_rotvec((one + two) / 2 + reach / 2 * np.cross(one, two))
-    assert h == PERIOD
-    return R
+def oracle_of(robot: SpaceRobot) -> PinocchioOracle:
+    return PinocchioOracle(robot.description.urdf, robot.joint_names)
 
 
 def test_sliders_of_paper_1_arrive_in_forty_seconds_within_the_published_peaks() -> None:
@@ -137,13 +115,19 @@ def test_any_sliders_meet_position_and_attitude(sliders: int) -> None:
 
 
 @pytest.mark.slow
-def test_an_arm_turns_its_base_about_three_axes() -> None:
-    turn = Rotation.from_rotvec([0.2, -0.3, 0.25])
-    urdf = FOLDER / "three_joint_arm.urdf"
-    robot = SpaceRobot.from_file(urdf)
-    schedule = plan(urdf, rotvec=turn.as_rotvec(), start=ARM_START, **QUICK)
-    oracle = PinocchioOracle(urdf.read_text(), robot.joint_names)
-    reached = momentum_attitude(oracle, schedule)
+@pytest.mark.parametrize(
+    ("name", "rotvec", "start"),
+    [
+        ("three_joint_arm", [0.2, -0.3, 0.25], ARM_START),
+        ("servicer", np.radians(60) * np.ones(3) / np.sqrt(3), [0.0, -1.2, 2.0, 0.0, 0.8, 0.0]),
+    ],
+)
+def test_an_arm_turns_its_base_about_three_axes(
+    name: str, rotvec: npt.ArrayLike, start: npt.ArrayLike
+) -> None:
+    robot, turn = robot_of(name), Rotation.from_rotvec(rotvec)
+    schedule = plan(robot, rotvec=rotvec, start=start, **QUICK)
+    reached = attitude_after(oracle_of(robot), schedule.positions)
     assert (reached.inv() * turn).magnitude() <= 1e-6
     assert_within(schedule, robot.velocity_limit, robot.velocity_limit / 0.5)
     assert np.all(schedule.positions >= robot.lower - 1e-9)
@@ -165,19 +149,12 @@ def test_a_chain_turns_in_its_plane_and_ends_in_a_shape(final: list[float] | Non
     assert abs((turn - wanted + np.pi) % (2 * np.pi) - np.pi) <= 1e-5
 
 
-def test_position_and_attitude_of_an_arm_that_can_reach_both() -> None:
+def test_position_and_attitude_of_an_arm_that_can_reach_both(arm: SpaceRobot) -> None:
     """A goal made of a final shape: the centre of mass says where the base is there."""
-    robot = SpaceRobot.from_file(FOLDER / "three_joint_arm.urdf")
     turn, last = Rotation.from_rotvec([0.2, -0.1, 0.3]), np.array([0.5, -1.0, 1.2])
-    position = robot.center_of_mass(ARM_START) - turn.apply(robot.center_of_mass(last))
-    schedule = plan(
-        robot,
-        position=position,
-        rotvec=turn.as_rotvec(),
-        start=ARM_START,
-        base_position=1,
-        **QUICK,
-    )
+    position = arm.center_of_mass(ARM_START) - turn.apply(arm.center_of_mass(last))
+    asked: dict[str, Any] = {"start": ARM_START, "base_position": 1, **QUICK}
+    schedule = plan(arm, position=position, rotvec=turn.as_rotvec(), **asked)
     np.testing.assert_allclose(schedule.path.position[-1], position, atol=1e-9)
     assert (Rotation.from_quat(schedule.path.quaternion[-1]).inv() * turn).magnitude() <= 1e-9
     assert not np.allclose(schedule.positions[-1], ARM_START, atol=0.05)
@@ -187,11 +164,9 @@ def test_position_and_attitude_of_an_arm_that_can_reach_both() -> None:
 def test_a_rotation_by_many_loops_is_planned_in_halves() -> None:
     """A loop of booms rotates their satellite by little: no single search finds so many."""
     turn = Rotation.from_rotvec([1.2, -2.1, 1.3])
-    urdf = FOLDER / "solar_booms.urdf"
-    robot = SpaceRobot.from_file(urdf)
-    schedule = plan(urdf, rotvec=turn.as_rotvec(), control_period=PERIOD, cache=0)
-    oracle = PinocchioOracle(urdf.read_text(), robot.joint_names)
-    reached = momentum_attitude(oracle, schedule)
+    robot = robot_of("solar_booms")
+    schedule = plan(robot, rotvec=turn.as_rotvec(), control_period=PERIOD, cache=0)
+    reached = attitude_after(oracle_of(robot), schedule.positions)
     assert (reached.inv() * turn).magnitude() <= 1e-6
     assert_within(schedule, robot.velocity_limit, robot.velocity_limit / 0.5)
     assert np.abs(schedule.positions).max() <= robot.upper.max() + 1e-9
@@ -213,17 +188,15 @@ def test_least_effort_takes_the_time_it_is_given_and_less_acceleration() -> None
 
 
 @pytest.mark.slow
-def test_corrections_meet_the_goal_where_masses_are_not_as_believed() -> None:
+def test_corrections_meet_the_goal_where_masses_are_not_as_believed(arm: SpaceRobot) -> None:
     """Masses and inertias 5 % off: within three times 0.05 deg after at most two corrections."""
-    text = (FOLDER / "three_joint_arm.urdf").read_text()
     believed = SpaceRobot.from_urdf(
-        text.replace('mass value="200"', 'mass value="210"')
+        ARM.replace('mass value="200"', 'mass value="210"')
         .replace('mass value="15"', 'mass value="14.25"')
         .replace('mass value="10"', 'mass value="10.5"')
     )
-    assert believed.total_mass != SpaceRobot.from_urdf(text).total_mass
+    assert believed.total_mass != arm.total_mass
     turn = Rotation.from_rotvec([0.2, -0.3, 0.25])
-    oracle = PinocchioOracle(text, believed.joint_names)
     options = {key: QUICK[key] for key in ("cache", "answers", "intervals")}
     method = planner_of("optimal", believed, PERIOD, Tolerance(1e-3, 1e-3), **options)
     attitude, q, left = Rotation.identity(), ARM_START, []
@@ -231,24 +204,11 @@ def test_corrections_meet_the_goal_where_masses_are_not_as_believed() -> None:
         state = RobotState(np.zeros(3), attitude.as_quat(), q)
         goal = Goal.checked(np.zeros(3), turn.as_quat())
         schedule = method.plan(state, goal, correction=number > 0)
-        attitude = attitude * momentum_attitude(oracle, schedule)
+        attitude = attitude_after(oracle_of(arm), schedule.positions, attitude)
         q = schedule.positions[-1]
         left.append((attitude.inv() * turn).magnitude())
     assert left[0] > 5e-3
     assert left[2] < 3 * np.radians(0.05)
-
-
-@pytest.mark.slow
-def test_a_six_joint_arm_turns_its_spacecraft_by_sixty_degrees() -> None:
-    urdf = FOLDER / "servicer.urdf"
-    robot = SpaceRobot.from_file(urdf)
-    turn = Rotation.from_rotvec(np.radians(60) * np.array([1.0, 1.0, 1.0]) / np.sqrt(3))
-    start = [0.0, -1.2, 2.0, 0.0, 0.8, 0.0]
-    schedule = plan(robot, rotvec=turn.as_rotvec(), start=start, **QUICK)
-    oracle = PinocchioOracle(urdf.read_text(), robot.joint_names)
-    reached = momentum_attitude(oracle, schedule)
-    assert (reached.inv() * turn).magnitude() <= 1e-6
-    assert_within(schedule, robot.velocity_limit, robot.velocity_limit / 0.5)
 
 
 # -- manoeuvres of a few control periods, and robots of one joint or two -------------------------
@@ -270,8 +230,8 @@ def hinged(*axes: str, height: float = 0.1) -> str:
     return f'<robot name="hinged">{"".join(parts)}</robot>'
 
 
-CHAIN = (FOLDER / "planar_chain.urdf").read_text(encoding="utf-8")
-ARM = (FOLDER / "three_joint_arm.urdf").read_text(encoding="utf-8")
+CHAIN = robot_file("planar_chain").read_text("utf-8")
+ARM = robot_file("three_joint_arm").read_text("utf-8")
 ONE, TWO = hinged("0 0 1", height=0.0), hinged("0 0 1", "0 1 0")
 
 
@@ -294,7 +254,7 @@ def test_small_goals_take_few_control_periods(
     start = np.linspace(0.4, -0.3, robot.n)
     schedule = plan(robot, rotvec=turn, start=start, joint_positions=final, **ASKED)
     assert 2 <= schedule.ticks <= most
-    reached = momentum_attitude(PinocchioOracle(urdf, robot.joint_names), schedule)
+    reached = attitude_after(oracle_of(robot), schedule.positions)
     # Pinocchio's chords are of order four, and long.
     assert (reached.inv() * Rotation.from_rotvec(turn)).magnitude() <= 1e-7
     assert_within(schedule, robot.velocity_limit, robot.velocity_limit / 0.5)
@@ -344,16 +304,8 @@ def test_what_one_joint_cannot_reach_is_refused_at_once(monkeypatch: pytest.Monk
 
 
 # -- solutions of the optimal control problem, before they become held commands ------------------
-
-
-URDF = FOLDER / "three_joint_arm.urdf"
 TURN = Rotation.from_rotvec([0.1, -0.2, 0.15])
 INTERVALS = 20
-
-
-@pytest.fixture(scope="module")
-def arm() -> SpaceRobot:
-    return SpaceRobot.from_file(URDF)
 
 
 def solved(
@@ -376,7 +328,7 @@ def solved(
 
 
 def test_a_solution_from_moving_joints_turns_the_base_as_momentum_says(arm: SpaceRobot) -> None:
-    """By Pinocchio's momentum along the shapes of the parabolas, two stages of order four."""
+    """By Pinocchio's momentum along the shapes of the parabolas."""
     velocity = np.array([0.2, -0.3, 0.1])
     solution = solved(arm, velocity)
     np.testing.assert_allclose(solution.velocities[0], velocity, atol=1e-12)
@@ -385,12 +337,7 @@ def test_a_solution_from_moving_joints_turns_the_base_as_momentum_says(arm: Spac
     fine = solution.at_ticks(10 * INTERVALS)
     begins = (fine[1] - fine[0]) / (solution.duration / (10 * INTERVALS))
     np.testing.assert_allclose(begins, velocity, atol=0.03)
-    oracle = PinocchioOracle(URDF.read_text(), arm.joint_names)
-    attitude = Rotation.identity()
-    for q, q_next in pairwise(fine):
-        middle, move = (q + q_next) / 2, q_next - q
-        attitude = attitude * Rotation.from_rotvec(-oracle.connection(middle)[3:] @ move)
-    assert (attitude.inv() * TURN).magnitude() <= 2e-3
+    assert (attitude_after(oracle_of(arm), fine).inv() * TURN).magnitude() <= 2e-3
 
 
 @pytest.mark.slow
@@ -425,18 +372,19 @@ def test_derivatives_and_curvature_repeat_few_operations(arm: SpaceRobot) -> Non
 
 TICK = 0.05
 TOLERANCE = Tolerance(1e-6, 1e-6, 1e-6)
+FEW = {"starts": 2, "intervals": 20, "iterations": 16}
 SPEED, ACCELERATION = np.array([0.4, 0.5]), np.array([0.9, 1.1])
 
 
 @cache
-def planar(method: str = "optimal", **options: float) -> GaitMethod:
+def planar(method: str = "optimal", urdf: str = CHAIN, **options: int) -> GaitMethod:
     limits = {"max_velocity": (0.4, 0.5), "max_acceleration": (0.9, 1.1), "cache": 0, "answers": 1}
     chosen = {"optimal": method_options("optimal", {**limits, **options})}
-    return build_method(method, robot_of("planar_chain"), TICK, STEP, chosen)
+    return build_method(method, SpaceRobot.from_urdf(urdf), TICK, STEP, chosen)
 
 
-def turned(angle: float, shape: Array | None = None) -> Goal:
-    return Goal.checked(np.zeros(3), Rotation.from_rotvec([0, 0, angle]).as_quat(), shape)
+def turned(angle: float) -> Goal:
+    return Goal.from_rotvec(np.zeros(3), [0, 0, angle])
 
 
 def at_rest() -> RobotState:
@@ -454,8 +402,7 @@ def halfway(schedule: GaitSchedule) -> tuple[int, RobotState, InitialMotion]:
     k = schedule.ticks // 2
     for rates in schedule.velocities[:k]:
         plant.step(rates)
-    state = RobotState(plant.pose[:3].copy(), plant.pose[3:].copy(), plant.q.copy())
-    return k, state, InitialMotion(schedule.velocities[k - 1], schedule.positions[k:])
+    return k, measured(plant), InitialMotion(schedule.velocities[k - 1], schedule.positions[k:])
 
 
 def flown_angle(state: RobotState, schedule: GaitSchedule) -> float:
@@ -504,7 +451,7 @@ def test_it_begins_as_fast_as_the_joints_move_and_not_faster_than_they_may() -> 
 def test_joints_brake_first_where_no_plan_in_motion_is_found() -> None:
     """So few steps of the solver are enough from rest alone."""
     _, state, motion = halfway(first())
-    method = planar(starts=2, intervals=20, iterations=16)
+    method = planar(**FEW)
     schedule = method.plan(PlanRequest(state, turned(-0.1), TOLERANCE, motion=motion))
     braking = round(float(str(schedule.notes["braking_time"])) / TICK)
     assert braking >= np.abs(motion.velocity / ACCELERATION).max() / TICK
@@ -521,13 +468,10 @@ def test_a_joint_beside_its_limit_brakes_before_it() -> None:
     left = np.abs(motion.velocity) - steps * np.arange(1, 11)[:, np.newaxis]
     travel = TICK * np.maximum(left, 0.0).sum(axis=0)
     lower = state.q[0] - 1.02 * travel[0]
-    text = robot_file("planar_chain").read_text().replace("continuous", "revolute")
+    text = CHAIN.replace("continuous", "revolute")
     for limit in (lower, -3.0):
         text = text.replace("<limit velocity", f'<limit lower="{limit}" upper="3" velocity', 1)
-    few = {"starts": 2, "intervals": 20, "iterations": 16, "answers": 1, "cache": 0}
-    limits = {"max_velocity": SPEED.tolist(), "max_acceleration": ACCELERATION.tolist()}
-    chosen = {"optimal": method_options("optimal", {**limits, **few})}
-    method = build_method("optimal", SpaceRobot.from_urdf(text), TICK, STEP, chosen)
+    method = planar(urdf=text, **FEW)
     schedule = method.plan(PlanRequest(state, turned(-0.1), TOLERANCE, motion=motion))
     assert "braking_time" in schedule.notes
     require_smooth(motion.velocity, schedule)

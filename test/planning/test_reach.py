@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning.sliding_robots import random_sliding_robot
 from scipy.spatial.transform import Rotation
+from support.hand_motion import attitude_after
 from support.oracles import PinocchioOracle
 from support.planar_trees import random_tree
 from support.random_robots import random_chain_urdf, random_robot_urdf
@@ -62,18 +63,11 @@ def moved(
     oracle: PinocchioOracle, robot: SpaceRobot, state: RobotState, rng: np.random.Generator
 ) -> tuple[Rotation, Array, Array]:
     """Return attitude, position and shape after a random motion, by Pinocchio's momentum."""
-    attitude, q = Rotation.from_quat(state.quaternion), state.q
-    for _ in range(2):
-        final = some_shape(robot, rng)
-        way, side = (final - q) / 16, np.sqrt(3) / 6
-        for k in range(16):
-            # A commutator-free integrator of fourth order.
-            one, two = (oracle.base_twist(q + (k + 0.5 + s) * way, way)[3:] for s in (-side, side))
-            for first, second in ((0.25 + side, 0.25 - side), (0.25 - side, 0.25 + side)):
-                attitude = attitude * Rotation.from_rotvec(first * one + second * two)
-        q = final
-    start = Rotation.from_quat(state.quaternion).apply(oracle.center_of_mass(state.q))
-    return attitude, state.position + start - attitude.apply(oracle.center_of_mass(q)), q
+    shapes = np.array([state.q, some_shape(robot, rng), some_shape(robot, rng)])
+    start = Rotation.from_quat(state.quaternion)
+    attitude = attitude_after(oracle, shapes, start, parts=16)
+    center = state.position + start.apply(oracle.center_of_mass(state.q))
+    return attitude, center - attitude.apply(oracle.center_of_mass(shapes[-1])), shapes[-1]
 
 
 def refusal(robot: SpaceRobot, state: RobotState, goal: Goal, **options: Any) -> str:
@@ -163,23 +157,51 @@ def test_of_sliders_the_bound_is_exact(seed: int) -> None:
         assert reach.distance_outside(corner + 0.01 * direction) == pytest.approx(0.01, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("robot", "asked", "proof", "sentence"),
+    [
+        ("sliding_masses", {"position": (0.4, 0, 0)}, "LIMITS", "bring the base no closer to it"),
+        ("sliding_masses", {"position": (9, 0, 0)}, "LIMITS", "out of reach"),
+        (
+            "sliding_masses",
+            {"position": (0.1, 0, 0), "joint_positions": (0, 0, 0)},
+            "MOMENTUM",
+            "put the base 0.1 m from the goal position.*centre of mass stays",
+        ),
+        (
+            "planar_chain",
+            {"rotvec": (0, 0.1, 1)},
+            "RANK",
+            r"away from any rotation about the axis \[0.0, 0.0, 1.0\]",
+        ),
+        (
+            "three_joint_arm",
+            {"joint_positions": (9, 0, 0)},
+            "LIMITS",
+            "violates joint limits: joint 'shoulder_yaw'",
+        ),
+        (
+            "three_joint_arm",
+            {"position": (2, 0, 0), "base_position": 1},
+            "LIMITS",
+            "the goal position is out of reach.*no closer to it than",
+        ),
+    ],
+)
+def test_goals_out_of_reach_are_refused_with_the_kind_of_proof(
+    robot: str, asked: dict[str, Any], proof: str, sentence: str
+) -> None:
+    with pytest.raises(UnreachableError, match="(?i)" + sentence) as refusal:
+        plan(robot, **asked)
+    assert refusal.value.proof is Proof[proof]
+
+
 def test_a_proof_and_a_search_in_vain_are_two_things() -> None:
-    arm: dict[str, Any] = {"robot": "three_joint_arm", "base_position": 1}
-    with pytest.raises(UnreachableError, match="no closer to it than") as far:
-        plan(**arm, position=(2.0, 0.0, 0.0))
-    assert far.value.proof is Proof.LIMITS
     # Within the ball round the shoulder, but the upper arm does not go through the spacecraft.
     with pytest.raises(NotFoundError, match=r"was found from 8 starts.*may help"):
-        plan(**arm, position=(0.08, -0.04, 0.02))
-    with pytest.raises(UnreachableError, match="violates joint limits") as shape:
-        plan("three_joint_arm", joint_positions=(9.0, 0.0, 0.0))
-    assert shape.value.proof is Proof.LIMITS
-    with pytest.raises(UnreachableError, match="away from any rotation") as tilt:
-        plan("planar_chain", rotvec=(0.0, 0.1, 1.0))
-    assert tilt.value.proof is Proof.RANK
-    with pytest.raises(UnreachableError, match="centre of mass stays") as resting:
-        plan("sliding_masses", position=(0.1, 0, 0), joint_positions=(0, 0, 0))
-    assert resting.value.proof is Proof.MOMENTUM
+        plan("three_joint_arm", base_position=1, position=(0.08, -0.04, 0.02))
+    with pytest.raises(PlanningError, match="has 2 joints"):
+        plan("planar_chain", joint_positions=[0.0])
     budgets: list[tuple[dict[str, Any], str]] = [({}, "longest"), ({"duration": 2.0}, "duration")]
     for given_time, option in budgets:
         with pytest.raises(NotFoundError, match=rf"from . start.*a longer optimal\.{option}, or"):
@@ -236,10 +258,8 @@ def test_the_shape_of_one_joint_that_turns_its_base_decides_the_attitude() -> No
     robot = SpaceRobot.from_urdf(random_tree(np.random.default_rng(3), 2).urdf)
     state = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(1))
     oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
-    attitude, final = Rotation.identity(), np.array([0.7])
-    for k in range(200):
-        turn = oracle.base_twist((k + 0.5) / 200 * final, final / 200)[3:]
-        attitude = attitude * Rotation.from_rotvec(turn)
+    final = np.array([0.7])
+    attitude = attitude_after(oracle, np.array([state.q, final]), parts=50)
     quick: dict[str, Any] = {"start": state, "cache": 0, "starts": 2, "answers": 1}
     goal = Goal.checked(np.zeros(3), attitude.as_quat(), final)
     schedule = plan(robot, goal, tolerance=Tolerance(1.0, 1e-3, 1e-3), **quick)

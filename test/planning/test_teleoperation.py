@@ -8,17 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
+from support.oracles.integrated import IDENTITY
 from support.planner_loop import NEAR, TICK, Array, Loop, PlantState, robot_of
 from support.planner_phases import executing, stub_of
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.core.clearance import Clearance
-from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import Notice, Phase, PlannerState
 from spacerobot_ros.planning.execution.teleoperation import TwistCommand, TwistFollower, TwistFrame
 from spacerobot_ros.planning.execution.worker import PlanningWorker
-from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateOptions
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 
@@ -28,7 +27,6 @@ START = InitialState(
     Rotation.from_rotvec([0.3, -0.5, 0.4]).as_quat(),
     np.array([0.4, -0.9, 1.1]),
 )
-PLANAR = InitialState(joint_positions=np.array([0.9, 0.7]))
 LINEAR, ANGULAR = np.array([0.02, -0.03, 0.025]), np.array([0.01, 0.02, -0.015])
 
 
@@ -45,16 +43,22 @@ def send(loop: Loop, frame: TwistFrame = "world", link: str = HAND, **twist: Any
     loop.executive.propose_twist(TwistCommand(link, np.array(linear), np.array(angular), frame))
 
 
-def twist_of(loop: Loop, tick: int, link: str = HAND) -> tuple[Array, Rotation]:
-    """Return the twist (6,) of a link in W by Pinocchio, and R_WE, in the middle of a tick."""
+def twist_at(
+    loop: Loop, q: Array, rates: Array, pose: Array = IDENTITY, link: str = HAND
+) -> tuple[Array, Rotation]:
+    """Return the twist (6,) of a link in W by Pinocchio, and R_WE, at joint rates and a pose."""
     robot = loop.plant.robot
     oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
-    q, rates = (loop.shapes[tick] + loop.shapes[tick + 1]) / 2, loop.commands[tick]
-    pose = (loop.poses[tick] + loop.poses[tick + 1]) / 2
     u = oracle.joint_velocities(rates)
     u[:6] = -oracle.connection(q) @ rates
     oracle.set_configuration(q, pose[3:], pose[:3])
     return oracle.frame_jacobian_W(link) @ u, Rotation.from_matrix(oracle.frame_W(link)[0])
+
+
+def twist_of(loop: Loop, tick: int, link: str = HAND) -> tuple[Array, Rotation]:
+    """Return the same in the middle of a tick."""
+    q, pose = ((at[tick] + at[tick + 1]) / 2 for at in (loop.shapes, loop.poses))
+    return twist_at(loop, q, loop.commands[tick], pose, link)
 
 
 def fly(loop: Loop, ticks: int, **options: Any) -> None:
@@ -156,28 +160,24 @@ def test_rates_change_within_the_limits_and_the_joints_brake_when_twists_stop() 
 
 def test_the_hand_stops_before_the_singularity_of_paper_4_and_comes_back() -> None:
     # Stretched, the arm has no rate that moves the hand on outwards.
-    loop = loop_of("planar_manipulator", PLANAR)
-    robot = robot_of("planar_manipulator")
+    loop = loop_of("planar_manipulator", InitialState(joint_positions=np.array([0.9, 0.7])))
     outward = np.array([0.08, 0.02, 0.0])
-    for _ in range(400):
-        send(loop, linear=outward, angular=np.zeros(3))
-        loop.tick()
+
+    def determinant(shape: Array) -> float:
+        J = loop.plant.robot.generalised_jacobian(HAND, shape)[:2]
+        return abs(float(np.linalg.det(J)))
+
+    fly(loop, 400, linear=outward, angular=np.zeros(3))
     assert np.abs(loop.commands[-1]).max() < 2e-3
     said = loop.statuses[-1].message
     assert "'end_effector' is near a dynamic singularity: it moves by " in said
     assert said.endswith("The twist is followed as far as possible.")
-    J = robot.generalised_jacobian(HAND, loop.shapes[-1])[:2]
-    assert abs(np.linalg.det(J)) < 0.1 * abs(
-        np.linalg.det(robot.generalised_jacobian(HAND, loop.shapes[0])[:2])
-    )
+    assert determinant(loop.shapes[-1]) < 0.1 * determinant(loop.shapes[0])
     moves = np.array(loop.commands)
     assert np.abs(np.diff(moves, axis=0)).max() <= 0.8 * TICK + 1e-12
-    for _ in range(60):
-        send(loop, linear=-outward, angular=np.zeros(3))
-        loop.tick()
+    fly(loop, 60, linear=-outward, angular=np.zeros(3))
     assert loop.statuses[-1].message == "'end_effector' follows twists."
-    J = robot.generalised_jacobian(HAND, loop.shapes[-1])[:2]
-    assert abs(np.linalg.det(J)) > 0.1
+    assert determinant(loop.shapes[-1]) > 0.1
 
 
 def test_a_limit_is_over_when_it_has_not_come_for_the_timeout_of_twists(
@@ -204,17 +204,9 @@ def test_a_limit_is_over_when_it_has_not_come_for_the_timeout_of_twists(
 def test_joints_stop_at_their_limits() -> None:
     initial = InitialState(joint_positions=np.array([0.3, 2.5]))
     loop = loop_of("planar_manipulator", initial, clearance=0.0)
-    robot = robot_of("planar_manipulator")
-    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
-    rates = np.array([0.0, 0.3])
     for _ in range(60):
-        q = loop.shapes[-1]
-        u = oracle.joint_velocities(rates)
-        u[:6] = -oracle.connection(q) @ rates
-        oracle.set_configuration(q, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-        towards = (oracle.frame_jacobian_W(HAND) @ u)[:3]
-        send(loop, "base", linear=towards, angular=np.zeros(3))
-        loop.tick()
+        towards, _ = twist_at(loop, loop.shapes[-1], np.array([0.0, 0.3]))
+        fly(loop, 1, frame="base", linear=towards[:3], angular=np.zeros(3))
     shapes = np.array(loop.shapes)
     assert shapes[:, 1].max() <= 2.8 + 1e-9
     assert shapes[:, 1].max() > 2.75
@@ -227,27 +219,19 @@ def test_joints_stop_at_their_limits() -> None:
 def test_links_do_not_come_too_near() -> None:
     robot = robot_of("three_joint_arm")
     clearance = Clearance(robot.description, 0.05)
-    options = ResolvedRateOptions()
-    q = np.array([0.0, -0.9, 2.2])
-    follower = TwistFollower(robot, HAND, options, TICK, clearance)
-    free = TwistFollower(robot, HAND, options, TICK)
-    pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     base = TwistCommand(HAND, np.array([-0.3, 0.0, -0.1]), np.zeros(3), "base")
-    nearest = np.inf
-    rates, said = np.zeros(3), set()
-    for _ in range(150):
-        rates, reason = follower.rates(base, pose, q, rates)
-        said.add(reason.split(" ")[0])
-        q = q + TICK * rates
-        nearest = min(nearest, clearance.geometry.nearest_along(q[np.newaxis])[0][0])
-    assert nearest >= 0.05 - 2e-6
-    q, rates = np.array([0.0, -0.9, 2.2]), np.zeros(3)
-    least = np.inf
-    for _ in range(150):
-        rates, _ = free.rates(base, pose, q, rates)
-        q = q + TICK * rates
-        least = min(least, clearance.geometry.nearest_along(q[np.newaxis])[0][0])
-    assert least < 0.04
+
+    def nearest(kept: Clearance | None) -> float:
+        follower = TwistFollower(robot, HAND, ResolvedRateOptions(), TICK, kept)
+        q, rates, least = np.array([0.0, -0.9, 2.2]), np.zeros(3), np.inf
+        for _ in range(150):
+            rates, _ = follower.rates(base, IDENTITY, q, rates)
+            q = q + TICK * rates
+            least = min(least, clearance.geometry.nearest_along(q[np.newaxis])[0][0])
+        return float(least)
+
+    assert nearest(clearance) >= 0.05 - 2e-6
+    assert nearest(None) < 0.04
 
 
 @pytest.mark.parametrize(
@@ -304,10 +288,10 @@ def test_a_goal_comes_first_and_twists_have_to_pause_before_they_count_again() -
         if loop.states[-1] == "reached":
             break
         assert refusal(loop, **options) == pursued
-    assert loop.states[-1] == "reached"
-    assert refusal(loop, **options) == "Twists are ignored until no twist has arrived for 0.4 s."
+    ignored = "Twists are ignored until no twist has arrived for 0.4 s."
+    assert refusal(loop, **options) == ignored
     loop.tick(7)
-    assert refusal(loop, **options) == "Twists are ignored until no twist has arrived for 0.4 s."
+    assert refusal(loop, **options) == ignored
     loop.tick(9)
     send(loop, **options)
     assert loop.executive.phase is Phase.TELEOPERATING
@@ -433,24 +417,3 @@ def test_an_abort_leaves_the_braking_to_the_controller() -> None:
     loop.tick(5)
     assert loop.abort() == "The joint controller has 2.5 s to bring them to rest."
     assert loop.executive.phase is Phase.BRAKING
-
-
-OWN = OptimalGait.Options().effort_limits
-
-
-@pytest.mark.parametrize(
-    ("output", "links", "effort_limits"),
-    [
-        ("commands", ("end_effector",), OWN),
-        ("reference", (), 1),
-        ("trajectory", ("end_effector",), OWN),
-    ],
-)
-def test_only_plans_for_a_controller_keep_a_reserve_of_efforts(
-    output: str, links: tuple[str, ...], effort_limits: int
-) -> None:
-    config = PlannerConfig(output=output)
-    assert config.goal_links == links
-    optimal = config.method_options.get("optimal", OptimalGait.Options())
-    assert optimal.effort_limits == effort_limits
-    assert OWN != 1

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
-from support.effort_flights import robot_of as averaged_robot
 from support.oracles import PinocchioOracle
 from support.planner_loop import TICK, StubMethod, goal_at, robot_of
 
@@ -23,7 +21,6 @@ from spacerobot_ros.planning.execution.path_deviation import PathCheck
 from spacerobot_ros.planning.execution.state_average import StateAverage
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
-from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import EffortPlant, InitialState
 
 Array = npt.NDArray[np.float64]
@@ -303,7 +300,7 @@ def test_a_plan_in_flight_begins_where_the_momenta_bring_the_base_meanwhile() ->
 # -- where a robot is from several measurements, and what momenta they show ----------------------
 
 
-URDF = (share_directory() / "urdf" / "three_joint_arm.urdf").read_text("utf-8")
+ARM = robot_of("three_joint_arm")
 Q = np.array([0.2, -0.4, 0.9])
 REST = np.zeros(3)
 STILL = np.zeros(6)
@@ -315,11 +312,11 @@ def pose(position: float = 0.0, turn: Rotation | None = None) -> np.ndarray:
 
 
 def test_the_mean_of_noisy_states_is_nearer_by_the_root_of_their_number() -> None:
-    rng, robot = np.random.default_rng(0), averaged_robot(URDF)
+    rng = np.random.default_rng(0)
     true = Rotation.from_rotvec([2.0, -1.5, 1.0])
     single, averaged = [], []
     for _ in range(60):
-        average = StateAverage(robot, 25)
+        average = StateAverage(ARM, 25)
         for _ in range(25):
             assert not average.complete
             turned = true * Rotation.from_rotvec(rng.normal(0.0, 1e-3, 3))
@@ -339,7 +336,7 @@ def test_the_mean_of_noisy_states_is_nearer_by_the_root_of_their_number() -> Non
 
 
 def test_the_mean_of_two_attitudes_is_half_way() -> None:
-    average = StateAverage(averaged_robot(URDF), 2)
+    average = StateAverage(ARM, 2)
     first = Rotation.from_rotvec([2.0, -1.5, 1.0])
     for angle in (0.0, 0.02):
         turned = first * Rotation.from_rotvec([0.0, angle, 0.0])
@@ -351,11 +348,10 @@ def test_the_mean_of_two_attitudes_is_half_way() -> None:
 
 
 def test_momenta_are_those_measured_last_at_rest() -> None:
-    robot = averaged_robot(URDF)
-    average = StateAverage(robot)
+    average = StateAverage(ARM)
     twist = np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01])
     average.add(pose(), twist, Q, REST)
-    oracle = PinocchioOracle(URDF, robot.joint_names)
+    oracle = PinocchioOracle(ARM.description.urdf, ARM.joint_names)
     oracle.set_configuration(Q, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
     oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(REST))
     p, L, _ = oracle.momentum_W()
@@ -370,8 +366,7 @@ def test_momenta_are_those_measured_last_at_rest() -> None:
 
 
 def test_before_a_robot_was_at_rest_its_momenta_are_those_in_motion() -> None:
-    robot = averaged_robot(URDF)
-    average = StateAverage(robot)
+    average = StateAverage(ARM)
     average.add(pose(), np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01]), Q, REST)
     assert np.abs(average.state().angular_momentum).max() > 0.01
     # It is put elsewhere, where its momenta are others, and its joints move.
@@ -381,7 +376,7 @@ def test_before_a_robot_was_at_rest_its_momenta_are_those_in_motion() -> None:
     initial = InitialState(
         joint_positions=Q, joint_velocities=-Q, linear_momentum=p, angular_momentum=L
     )
-    plant = EffortPlant(robot, 0.01, initial)
+    plant = EffortPlant(ARM, 0.01, initial)
     assert plant.qdot.any()
     average.add(plant.pose, plant.twist, plant.q, plant.qdot)
     state = average.state()
@@ -390,8 +385,7 @@ def test_before_a_robot_was_at_rest_its_momenta_are_those_in_motion() -> None:
 
 
 def test_rates_within_the_tolerance_are_rest_and_larger_ones_are_not() -> None:
-    robot = averaged_robot(URDF)
-    average = StateAverage(robot, 2, rest_tolerance=0.01)
+    average = StateAverage(ARM, 2, rest_tolerance=0.01)
     average.add(pose(), STILL + 0.012, Q, REST + 0.012)
     average.add(pose(), STILL + 0.006, Q, REST - 0.006)
     assert not average.state().linear_momentum.any(), "0.009 on the average"
@@ -404,7 +398,7 @@ def test_rates_within_the_tolerance_are_rest_and_larger_ones_are_not() -> None:
 def test_what_is_not_finite_is_refused(part: int) -> None:
     parts = [pose(), STILL.copy(), Q.copy(), REST.copy()]
     parts[part][1] = np.nan
-    average = StateAverage(averaged_robot(URDF), 2)
+    average = StateAverage(ARM, 2)
     average.add(pose(), STILL, Q, REST)
     average.add(*parts)
     with pytest.raises(PlanningError, match="not finite"):
@@ -414,31 +408,28 @@ def test_what_is_not_finite_is_refused(part: int) -> None:
 # -- aims of plans for end-effectors, stamps and bounds of a path, and the time that was ---------
 
 
-ARM = robot_of("three_joint_arm")
 SHAPE = np.array([0.2, -0.6, 1.3])
 END = Rotation.from_rotvec([0.2, 0.0, 0.4])
 PLACE = np.array([1.0, 2.0, 3.0])
 BEGIN_NS = 7_000_000_000
 
 
-def checked_path(ticks: int = 20, goal: Goal | None = None, **config: Any) -> PathCheck:
+def checked_path(goal: Goal) -> PathCheck:
     """Return the check of a path to :data:`PLACE` with a pose every two ticks."""
-    time = np.linspace(0.0, TICK * ticks, ticks // 2 + 1)
-    places = np.linspace(0.0, 1.0, len(time))[:, np.newaxis] * PLACE
-    path = BasePath(time, places, np.tile(END.as_quat(), (len(time), 1)))
-    shapes = np.tile(SHAPE, (ticks + 1, 1))
+    time = TICK * np.arange(0.0, 21.0, 2.0)
+    places = np.linspace(0.0, 1.0, 11)[:, np.newaxis] * PLACE
+    path = BasePath(time, places, np.tile(END.as_quat(), (11, 1)))
+    shapes = np.tile(SHAPE, (21, 1))
     shapes[:2] += 0.2
-    goal = goal or Goal(PLACE, END.as_quat())
     schedule = GaitSchedule("stub", ARM.joint_names, TICK, shapes, path, goal)
-    return PathCheck(ARM, schedule, BEGIN_NS, PlannerConfig(**config), average=1)
+    return PathCheck(ARM, schedule, BEGIN_NS, PlannerConfig(), average=1)
 
 
-def hand_of_arm() -> tuple[str, np.ndarray, Rotation]:
+def hand_of_arm() -> tuple[str, Array, Rotation]:
     """Return the last link, its position in the world and its attitude at the end of the path."""
-    link = ARM.description.links[-1].name
-    shape = dict(zip(ARM.joint_names, SHAPE.tolist(), strict=True))
-    pose = ARM.description.with_locked(shape).frames[link][1]
-    return link, PLACE + END.as_matrix() @ pose.r, END * Rotation.from_matrix(pose.R)
+    link = ARM.link_names[-1]
+    R, r = ARM.link_pose(link, SHAPE)
+    return link, PLACE + END.apply(r), END * Rotation.from_matrix(R)
 
 
 WITHIN = Tolerance(0.5, 0.1)
@@ -463,7 +454,7 @@ def test_the_aim_for_an_end_effector_leaves_a_share_of_each_tolerance(
     aim_at = r_WE + np.array([0.3, -0.4, 0.0]) * share
     hand = EndEffectorGoal(link, aim_at, wanted.as_quat() if turned else None)
     goal = Goal(PLACE, END.as_quat(), None, (hand,), frozenset())
-    check = checked_path(goal=goal)
+    check = checked_path(goal)
     assert check.due(BEGIN_NS)
     moved = check.shift_goal(goal, WITHIN, frozenset({"end_effectors"}), late=late)
     if left is None or (not turned and share < 0.6):

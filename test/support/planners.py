@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
 from spacerobot_ros.errors import PlanningError
@@ -60,3 +62,14 @@ def refusal_in(plan: Callable[[], object]) -> str:
     assert text.endswith(".")
     assert "\n" not in text
     return text
+
+
+def assert_within(
+    schedule: GaitSchedule, velocity: npt.ArrayLike, acceleration: npt.ArrayLike
+) -> None:
+    """Check by differences of the shapes that a schedule from rest to rest keeps limits (n,)."""
+    rest = np.zeros((1, schedule.positions.shape[1]))
+    rates = np.vstack([rest, np.diff(schedule.positions, axis=0) / schedule.control_period, rest])
+    changes = np.abs(np.diff(rates, axis=0)) / schedule.control_period
+    assert np.all(np.abs(rates).max(axis=0) <= np.asarray(velocity) * (1 + 1e-8))
+    assert np.all(changes.max(axis=0) <= np.asarray(acceleration) * (1 + 1e-8))
