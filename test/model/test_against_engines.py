@@ -317,15 +317,6 @@ def test_efforts_of_a_motion_at_zero_momentum(case: Case, engine: Oracle) -> Non
     assert_agrees(robot.joint_efforts(motion.q, 2 * qdot, 4 * qddot), 4 * tau, 1e-12)
 
 
-def test_compiled_numbers(compiled_code: Path) -> None:
-    case = random_case(0)
-    robot = SpaceRobot(case.robot.description)
-    assert robot.function("forward_dynamics").class_name() == "External"
-    oracle = case.engines[PinocchioOracle.__name__]
-    expected = oracle.forward_dynamics(case.motion, case.wrench_B, case.tau)
-    assert_agrees(replace(case, robot=robot).dynamics(), expected)
-
-
 def test_the_linearised_equations_lead_away_from_a_motion_as_pinocchio_does(case: Case) -> None:
     """A motion that is disturbed in every part, integrated by Pinocchio beside the undisturbed."""
     oracle, m, n = case.engines[PinocchioOracle.__name__], case.motion, case.robot.n

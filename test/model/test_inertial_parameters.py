@@ -38,11 +38,6 @@ from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 
 
-@pytest.fixture(autouse=True)
-def _interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-
-
 def drawn(robot: RobotDescription, rng: np.random.Generator) -> InertialParameters:
     """Return other masses, centres and inertias, products of inertia among them."""
     nominal = InertialParameters.of(robot)

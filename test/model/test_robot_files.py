@@ -17,6 +17,7 @@ from spacerobot_ros.session.own_robot import urdf_remarks
 
 INERTIAL = """<inertial><mass value="{mass}"/>
     <inertia ixx="{ixx}" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>"""
+HEADING = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
 LIMIT = '<limit lower="-1" upper="1" velocity="0.5" effort="3"/>'
 
 
@@ -24,7 +25,7 @@ def urdf(
     mass: str = "9", ixx: str = "1", visual: str = "", limit: str = LIMIT, attribute: str = ""
 ) -> str:
     """Return a hull that carries an arm."""
-    return f"""<?xml version="1.0"?>
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
 <robot name="probe"{attribute}>
   <link name="hull">{INERTIAL.format(mass=mass, ixx="1")}{visual}</link>
   <link name="arm">{INERTIAL.format(mass="2", ixx=ixx)}</link>
@@ -42,8 +43,7 @@ def file_with(tmp_path: Path, text: str, name: str = "probe.urdf") -> Path:
 
 @pytest.mark.parametrize("name", ["probe.urdf.xacro", "probe.xacro"])
 def test_a_xacro_file_is_expanded(tmp_path: Path, name: str) -> None:
-    heading = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
-    text = urdf(mass="${3 * unit}", attribute=heading)
+    text = urdf(mass="${3 * unit}", attribute=HEADING)
     text = text.replace("  <link", '  <xacro:property name="unit" value="14"/>\n  <link', 1)
     found = load_robot(file_with(tmp_path, text, name))
     assert found.bodies[0].inertia.mass == 42.0
@@ -54,8 +54,7 @@ def test_a_xacro_file_takes_its_arguments(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """By the command, and from the environment, where nodes and workers find them."""
-    heading = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
-    text = urdf(mass="$(arg mass)", attribute=heading)
+    text = urdf(mass="$(arg mass)", attribute=HEADING)
     argument = '  <xacro:arg name="mass" default="7"/>\n  <link'
     path = file_with(tmp_path, text.replace("  <link", argument, 1), "probe.xacro")
     assert load_robot(path).bodies[0].inertia.mass == 7.0
@@ -75,13 +74,9 @@ def test_a_xacro_file_takes_its_arguments(
 
 
 def test_a_xacro_file_that_cannot_be_expanded_is_refused(tmp_path: Path) -> None:
-    heading = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
-    path = file_with(tmp_path, urdf(mass="${no_such}", attribute=heading), "probe.xacro")
+    path = file_with(tmp_path, urdf(mass="${no_such}", attribute=HEADING), "probe.xacro")
     with pytest.raises(RobotDescriptionError, match=r"cannot be expanded: .*no_such"):
         load_robot(path)
-
-
-HEADING = ' xmlns:xacro="http://www.ros.org/wiki/xacro"'
 
 
 def test_xacro_in_a_urdf_file_and_in_a_text_is_not_expanded(tmp_path: Path) -> None:
@@ -95,20 +90,19 @@ def test_xacro_in_a_urdf_file_and_in_a_text_is_not_expanded(tmp_path: Path) -> N
 def test_a_xacro_file_takes_macros_properties_lists_and_files_of_its_package(
     tmp_path: Path,
 ) -> None:
-    folder, config = tmp_path / "urdf", tmp_path / "config"
-    folder.mkdir()
-    config.mkdir()
-    (tmp_path / "package.xml").write_text("<package/>")
-    (config / "masses.yaml").write_text("hull: {mass: 40.0}\nextra: [1.0, 2.0]\n")
-    (folder / "parts.xacro").write_text(
+    file_with(tmp_path, "<package/>", "package.xml")
+    file_with(tmp_path, "hull: {mass: 40.0}\nextra: [1.0, 2.0]\n", "config/masses.yaml")
+    parts = (
         f'<robot{HEADING}><xacro:macro name="read" params="file:=masses">'
         '<xacro:property name="m" scope="parent"'
         " value=\"${xacro.load_yaml('../config/' + file + '.yaml')}\"/></xacro:macro></robot>"
     )
+    file_with(tmp_path, parts, "urdf/parts.xacro")
     text = urdf(mass="${m.hull.mass + max(m['extra']) * (1 if pi > 3 else 0)}", attribute=HEADING)
     head = '<xacro:include filename="parts.xacro"/><xacro:read/>'
     text = text.replace("  <link", f"{head}\n  <link", 1)
-    assert load_robot(file_with(folder, text, "probe.xacro")).bodies[0].inertia.mass == 42.0
+    path = file_with(tmp_path, text, "urdf/probe.xacro")
+    assert load_robot(path).bodies[0].inertia.mass == 42.0
 
 
 @pytest.mark.parametrize(
@@ -119,8 +113,7 @@ def test_a_package_is_found_by_its_name_from_its_own_files_and_those_beside_it(
 ) -> None:
     """Folders of checkouts have names of their own; nothing is installed."""
     for name, where in (("probe_arm", "src/checkout"), ("probe_parts", "src/probe_arm")):
-        (tmp_path / where / "urdf").mkdir(parents=True)
-        (tmp_path / where / "package.xml").write_text(f"<package><name>{name}</name></package>")
+        file_with(tmp_path, f"<package><name>{name}</name></package>", f"{where}/package.xml")
     parts = f'<robot{HEADING}><xacro:property name="m" value="42"/></robot>'
     file_with(tmp_path / folder, parts, "urdf/probe.gazebo")
     file_with(tmp_path / folder, "solid hull", "meshes/hull.stl")
@@ -245,6 +238,15 @@ BROKEN = {
         urdf(ixx="-1"),
         r"of link 'arm' has a negative principal moment; .*signs",
     ),
+    "a negative inertia by its products": (
+        changed(SOME_INERTIA, SOME_INERTIA.replace('ixy="0"', 'ixy="1.5"'), 1),
+        r"inertia of link 'hull' has a negative principal moment",
+    ),
+    "an inertia that is no number": (urdf(ixx="nan"), r"<inertia> of link 'arm' is not finite"),
+    "a centre that is no number": (
+        changed('<mass value="2"/>', '<origin xyz="0 0 nan"/><mass value="2"/>'),
+        r"<origin> of link 'arm' is not finite",
+    ),
     "an impossible inertia": (
         urdf(ixx="3"),
         r"inertia of link 'arm' is not physical: .* 1, 1 and 3 kg m\^2, .* Check units",
@@ -283,6 +285,10 @@ BROKEN = {
         limited('lower="-1" upper="1" velocity="-2" effort="3"'),
         r"The limit 'velocity' of joint 'elbow' is negative \(-2\.0\)",
     ),
+    "a negative effort": (
+        limited('lower="-1" upper="1" velocity="1" effort="-1"'),
+        r"limit 'effort' of joint 'elbow' is negative",
+    ),
     "an axis of zero length": (
         changed('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>'),
         r"The axis of joint 'elbow' is zero; give it a direction",
@@ -290,6 +296,14 @@ BROKEN = {
     "an axis that is no number": (
         changed('<axis xyz="0 0 1"/>', '<axis xyz="0 nan 1"/>'),
         r"A number in the <axis> of joint 'elbow' is not finite: 0 nan 1",
+    ),
+    "a place that is no number": (
+        changed("<axis", '<origin xyz="0 nan 0"/><axis'),
+        r"<origin> of joint 'elbow' is not finite",
+    ),
+    "a turn that is no number": (
+        changed("<axis", '<origin rpy="0 nan 0"/><axis'),
+        r"<origin> of joint 'elbow' is not finite",
     ),
     "commas in an origin": (
         changed("<axis", '<origin xyz="1, 2, 3"/><axis'),
@@ -312,6 +326,10 @@ BROKEN = {
         r"the joint 'elbow' has no <parent>; write <parent link=\"\.\.\.\"/>",
     ),
     "a misspelt link": (changed('link="arm"', 'link="amr"'), r"is 'amr'.*mean 'arm'\?"),
+    "an unknown parent": (
+        changed('parent link="hull"', 'parent link="hall"'),
+        r"parent of joint 'elbow' is 'hall', but there is no such link",
+    ),
     "a link without a name": (
         changed('<link name="arm">', "<link>"),
         r"the link number 2 has no name; write <link name=\"\.\.\.\">",
@@ -393,18 +411,29 @@ def test_other_encodings_are_asked_for_as_utf_8(tmp_path: Path) -> None:
     path.write_bytes(urdf().replace("probe", "Süd").encode("latin-1"))
     with pytest.raises(RobotDescriptionError, match=r"not UTF-8 text .*\. Save it as UTF-8"):
         load_robot(path)
+    with pytest.raises(RobotDescriptionError, match=r"nowhere\.urdf cannot be read"):
+        load_robot(tmp_path / "nowhere.urdf")
     path.write_bytes(b"\xef\xbb\xbf" + urdf().replace("probe", "Süd").encode())
     assert load_robot(path).name == "Süd"
+    assert parse_robot(urdf().replace("probe", "Süd")).name == "Süd"
 
 
-def test_what_other_programs_have_written_is_passed_over(tmp_path: Path) -> None:
+def test_what_other_programs_have_written_is_passed_over(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     """Collision shapes, transmissions, plugins and safety controllers are nothing to a flight."""
     collision = "<collision><geometry><plane radius='1' length='2'/></geometry></collision>"
     text = urdf(visual=collision, limit=LIMIT + '<safety_controller k_velocity="x"/>')
-    text = text.replace("</robot>", "<gazebo><a b='c'/></gazebo><transmission/></robot>")
-    found = load_robot(file_with(tmp_path, text))
+    control = (
+        '<ros2_control name="arm" type="system"><hardware><plugin>a/b</plugin></hardware>'
+        '<joint name="elbow"><command_interface name="effort"/></joint></ros2_control>'
+    )
+    others = f'<gazebo reference="arm"><a b="c"/></gazebo><transmission/>{control}</robot>'
+    found = load_robot(file_with(tmp_path, text.replace("</robot>", others)))
     assert (found.name, found.joint_names, found.total_mass) == ("probe", ("elbow",), 11.0)
     assert "plane" in found.urdf
+    captured = capfd.readouterr()
+    assert captured.out + captured.err == ""
 
 
 def test_limits_that_motions_do_not_keep_are_named_once(

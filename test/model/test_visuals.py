@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import sys
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -399,11 +398,6 @@ def test_a_coarser_mesh_keeps_form_and_size(most: int) -> None:
         assert coarse is fine
 
 
-@cache
-def example() -> RobotDescription:
-    return load_robot(robot_file("surveyor"))
-
-
 def test_the_meshes_of_the_example_are_those_of_its_script() -> None:
     folder = share_directory() / "meshes" / "surveyor"
     made = surveyor_script.files()
@@ -416,9 +410,11 @@ def test_the_meshes_of_the_example_are_those_of_its_script() -> None:
 @pytest.mark.parametrize(
     "link", ["base_link", "left_panel", "right_panel", "shoulder", "upper_arm", "forearm", "camera"]
 )
-def test_masses_of_the_example_are_those_of_its_meshes(link: str) -> None:
+def test_masses_of_the_example_are_those_of_its_meshes(
+    surveyor: RobotDescription, link: str
+) -> None:
     """Trimesh integrates over the closed surfaces by another formulation than the script's."""
-    found = next(each for each in example().links if each.name == link)
+    found = next(each for each in surveyor.links if each.name == link)
     mesh = shape_mesh(found.shapes[0])
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert solid.is_watertight
