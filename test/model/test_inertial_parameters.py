@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -262,24 +261,45 @@ def test_what_cannot_be_locked_is_named() -> None:
 # -- parameters of a held body from momenta of point masses, with noise, in a plane, and ---------
 
 
-MASSES = np.array([3.0, 1.5, 0.7, 2.2, 0.4])
-POINTS = np.array(
-    [[0.3, -0.1, 0.2], [0.5, 0.4, -0.3], [-0.2, 0.6, 0.1], [0.1, -0.5, 0.6], [0.9, 0.2, -0.4]]
+@dataclass(frozen=True)
+class Body:
+    """Point masses (K,), kg, at points (K, 3) in the frame of the body, m."""
+
+    masses: Array
+    points: Array
+
+    def inertia_about(self, place: Array) -> Array:
+        arms = self.points - place
+        parts = zip(self.masses, arms, strict=True)
+        return np.asarray(sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in parts))
+
+    @property
+    def parameters(self) -> Array:
+        about = self.inertia_about(np.zeros(3))
+        six = [about[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+        return np.array([self.masses.sum(), *(self.masses @ self.points), *six])
+
+    def momenta(self, moving: list[BodyMotion]) -> Array:
+        """Return the momenta (N, 6) about a fixed point, point by point."""
+        found = []
+        for motion in moving:
+            arms = self.points @ motion.R_WT.T
+            p = self.masses[:, np.newaxis] * (motion.v + np.cross(motion.omega, arms))
+            L = np.cross(motion.r_WT + arms - ABOUT, p)
+            found.append([*p.sum(axis=0), *L.sum(axis=0)])
+        return np.array(found)
+
+
+BODY = Body(
+    np.array([3.0, 1.5, 0.7, 2.2, 0.4]),
+    np.array(
+        [[0.3, -0.1, 0.2], [0.5, 0.4, -0.3], [-0.2, 0.6, 0.1], [0.1, -0.5, 0.6], [0.9, 0.2, -0.4]]
+    ),
 )
-"""A body of point masses, kg and m in its frame."""
 
 ABOUT = np.array([0.4, -1.2, 0.7])
 TOTAL = np.array([0.3, -0.2, 0.5, 1.1, -0.7, 0.2])
 ROBOT_MASS, RADIUS = 40.0, 0.6
-
-
-def true_parameters() -> Array:
-    about = sum(
-        m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(MASSES, POINTS, strict=True)
-    )
-    h = MASSES @ POINTS
-    six = [about[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-    return np.array([MASSES.sum(), *h, *six])
 
 
 def motions(count: int = 20, *, planar: bool = False) -> list[BodyMotion]:
@@ -296,15 +316,8 @@ def motions(count: int = 20, *, planar: bool = False) -> list[BodyMotion]:
     return found
 
 
-def momentum(motion: BodyMotion) -> Array:
-    """The momenta of the point masses about a fixed point."""
-    p, L = np.zeros(3), np.zeros(3)
-    for m, r in zip(MASSES, POINTS, strict=True):
-        arm = motion.R_WT @ r
-        of_point = m * (motion.v + np.cross(motion.omega, arm))
-        p += of_point
-        L += np.cross(motion.r_WT + arm - ABOUT, of_point)
-    return np.concatenate([p, L])
+def regressors_of(moving: list[BodyMotion]) -> Array:
+    return np.array([momentum_regressor(motion, ABOUT) for motion in moving])
 
 
 def fitted(regressors: Array, known: Array) -> PayloadEstimate:
@@ -313,15 +326,15 @@ def fitted(regressors: Array, known: Array) -> PayloadEstimate:
     )
 
 
-def estimate(moving: list[BodyMotion], noise: float = 0.0, scale: float = 1.0) -> PayloadEstimate:
-    known = np.array([TOTAL - scale * momentum(motion) for motion in moving])
+def estimate(moving: list[BodyMotion], noise: float = 0.0) -> PayloadEstimate:
+    known = TOTAL - BODY.momenta(moving)
     known += noise * np.random.default_rng(8).normal(size=known.shape) * [1, 1, 1, 0.5, 0.5, 0.5]
-    return fitted(np.array([momentum_regressor(motion, ABOUT) for motion in moving]), known)
+    return fitted(regressors_of(moving), known)
 
 
 def test_all_ten_parameters_follow_from_motion_in_space() -> None:
     found = estimate(motions())
-    np.testing.assert_allclose(found.parameters, true_parameters(), rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(found.parameters, BODY.parameters, rtol=1e-11, atol=1e-12)
     assert found.undetermined == ()
     assert found.directions.shape == (0, 10)
     assert not found.corrected
@@ -329,23 +342,22 @@ def test_all_ten_parameters_follow_from_motion_in_space() -> None:
     payload = found.payload
     assert payload is not None
     assert payload.link == "hand"
-    center = MASSES @ POINTS / MASSES.sum()
+    center = BODY.masses @ BODY.points / BODY.masses.sum()
     np.testing.assert_allclose(payload.inertia.com, center, rtol=1e-10)
-    off = POINTS - center
-    about = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(MASSES, off, strict=True))
+    about = BODY.inertia_about(center)
     np.testing.assert_allclose(payload.inertia.about_com, about, atol=1e-10)
-    assert payload.inertia.mass == pytest.approx(MASSES.sum(), rel=1e-10)
+    assert payload.inertia.mass == pytest.approx(BODY.masses.sum(), rel=1e-10)
 
 
 def test_noise_is_averaged_and_the_deviations_say_how_well() -> None:
     found = estimate(motions(130), noise=0.02)
-    error = found.parameters - true_parameters()
+    error = found.parameters - BODY.parameters
     assert found.undetermined == ()
     assert np.abs(error / found.deviations).max() < 3.5
     assert 0.5 < np.sqrt(np.mean((error / found.deviations) ** 2)) < 1.7
     assert abs(error[0]) < 0.02
     # By hand: the covariance of the linear problem at the noise that was added.
-    A = np.array([momentum_regressor(motion, ABOUT) for motion in motions(130)])
+    A = regressors_of(motions(130))
     A = (A - A.mean(axis=0)) / (0.02 * np.array([1, 1, 1, 0.5, 0.5, 0.5]))[:, np.newaxis]
     covariance = np.linalg.inv(np.einsum("nij,nik->jk", A, A))
     np.testing.assert_allclose(found.deviations, np.sqrt(np.diag(covariance)), rtol=0.1)
@@ -356,14 +368,13 @@ def test_noise_is_averaged_and_the_deviations_say_how_well() -> None:
 def test_deviations_are_those_of_the_errors_where_momenta_drift(noise: float, seeds: int) -> None:
     """A random walk that ends at 0.01, beside white noise: none, less, as much, and more."""
     moving, error = motions(130), []
-    regressors = np.array([momentum_regressor(motion, ABOUT) for motion in moving])
-    exact = np.array([TOTAL - momentum(motion) for motion in moving])
+    regressors, exact = regressors_of(moving), TOTAL - BODY.momenta(moving)
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
         walk = np.cumsum(rng.normal(size=(130, 6)), axis=0) * 0.01 / np.sqrt(130)
         off = noise * rng.normal(size=exact.shape) + np.repeat(walk, 3, axis=0)
         found = fitted(regressors, exact + off * [1, 1, 1, 0.5, 0.5, 0.5])
-        error.append((found.parameters - true_parameters()) / found.deviations)
+        error.append((found.parameters - BODY.parameters) / found.deviations)
     assert 0.7 < np.sqrt(np.mean(np.square(error))) < 1.5
     assert np.sqrt(np.mean(np.square(error), axis=0)).max() < 2.0
 
@@ -377,25 +388,22 @@ def test_parameters_that_a_planar_motion_does_not_show_are_named() -> None:
     assert not found.corrected
     shown = ~np.isnan(found.parameters)
     assert np.array_equal(shown, ~np.isnan(found.deviations))
-    np.testing.assert_allclose(found.parameters[shown], true_parameters()[shown], atol=1e-10)
+    np.testing.assert_allclose(found.parameters[shown], BODY.parameters[shown], atol=1e-10)
     off = [PAYLOAD_PARAMETERS.index(name) for name in found.undetermined]
     np.testing.assert_allclose(np.delete(found.directions, off, axis=1), 0.0, atol=1e-9)
 
 
-def test_bodies_that_a_planar_motion_shows_in_part_are_not_corrected(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_bodies_that_a_planar_motion_shows_in_part_are_not_corrected() -> None:
     """The moments that it does not show can be those of a body, whatever the others are."""
     moving, shown = motions(60, planar=True), [0, 1, 2, 3, 6]
-    regressors = np.array([momentum_regressor(motion, ABOUT) for motion in moving])
+    regressors = regressors_of(moving)
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        monkeypatch.setattr(sys.modules[__name__], "MASSES", rng.uniform(1.0, 9.0, 4))
-        points = rng.normal(size=(4, 3)) * 0.3 + rng.normal(size=3) * 0.8
-        monkeypatch.setattr(sys.modules[__name__], "POINTS", points)
-        known = np.array([TOTAL - momentum(motion) for motion in moving])
+        masses = rng.uniform(1.0, 9.0, 4)
+        body = Body(masses, rng.normal(size=(4, 3)) * 0.3 + rng.normal(size=3) * 0.8)
+        known = TOTAL - body.momenta(moving)
         found = fitted(regressors, known + 1e-5 * rng.normal(size=known.shape))
-        error = (found.parameters - true_parameters())[shown] / found.deviations[shown]
+        error = (found.parameters - body.parameters)[shown] / found.deviations[shown]
         assert not found.corrected
         assert np.abs(error).max() < 4.0
 
@@ -411,22 +419,18 @@ def test_a_body_at_rest_shows_nothing() -> None:
 def test_errors_of_the_velocities_of_the_body_do_not_bias_its_mass() -> None:
     """Both sides have them: the robot of 40 kg turns with the body that it holds."""
     rng, moving = np.random.default_rng(5), motions(300)
-    regressors, known = [], []
-    for motion in moving:
-        off = 0.05 * rng.normal(size=3)
-        seen = replace(motion, v=motion.v + off)
-        regressors.append(momentum_regressor(seen, ABOUT))
-        known.append(TOTAL - momentum(motion) + np.array([*(ROBOT_MASS * off), 0.0, 0.0, 0.0]))
-    found = fitted(np.array(regressors), np.array(known))
-    mass, spread = found.parameters[0], found.deviations[0]
+    off = 0.05 * rng.normal(size=(len(moving), 3))
+    A = regressors_of([replace(x, v=x.v + by) for x, by in zip(moving, off, strict=True)])
+    b = TOTAL - BODY.momenta(moving) + np.hstack([ROBOT_MASS * off, np.zeros_like(off)])
+    found = fitted(A, b)
+    (mass, *_), (spread, *_), true = found.parameters, found.deviations, BODY.masses.sum()
     assert spread < 1.0
-    assert abs(mass - MASSES.sum()) < 3.5 * spread
+    assert abs(mass - true) < 3.5 * spread
     # Without the correction the errors make it lighter by their share of 40 kg.
-    A, b = np.array(regressors), np.array(known)
     plain = np.linalg.lstsq(
         (A - A.mean(axis=0)).reshape(-1, 10), -(b - b.mean(axis=0)).ravel(), rcond=None
     )[0]
-    assert abs(plain[0] - MASSES.sum()) > 6.0 * spread
+    assert abs(plain[0] - true) > 6.0 * spread
 
 
 def test_a_motion_that_drowns_in_errors_shows_nothing() -> None:
@@ -456,8 +460,9 @@ class Case:
     def x(self) -> Array:
         return np.concatenate([self.q, self.quaternion_WB])
 
-    def L_W(self, spinning: bool) -> Array:
-        return self.spin_W if spinning else np.zeros(3)
+    def step(self, L_W: Array, substeps: int) -> Array:
+        (x,) = self.robot.buffered(f"velocity_step:{substeps}")(self.x, self.qdot, L_W, DURATION)
+        return np.asarray(x)
 
 
 @cache
@@ -476,22 +481,15 @@ def random_case(seed: int) -> Case:
     )
 
 
-def step(robot: SpaceRobot, case: Case, spinning: bool, substeps: int) -> Array:
-    (x,) = robot.buffered(f"velocity_step:{substeps}")(
-        case.x, case.qdot, case.L_W(spinning), DURATION
-    )
-    return np.asarray(x)
-
-
-@pytest.mark.parametrize("spinning", [False, True], ids=["at_rest", "spinning"])
+@pytest.mark.parametrize("spins", [0.0, 1.0], ids=["at_rest", "spinning"])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_attitude_converges_at_fourth_order(seed: int, spinning: bool) -> None:
+def test_attitude_converges_at_fourth_order(seed: int, spins: float) -> None:
     case = random_case(seed)
-    start, momenta = np.append(np.zeros(3), case.quaternion_WB), [0, 0, 0, *case.L_W(spinning)]
-    expected = carried(case.oracle, case.q, case.qdot, DURATION, start, momenta)[3:]
+    start, L_W = np.append(np.zeros(3), case.quaternion_WB), spins * case.spin_W
+    expected = carried(case.oracle, case.q, case.qdot, DURATION, start, [0, 0, 0, *L_W])[3:]
     assert np.linalg.norm(case.quaternion_WB - expected) > 0.02, "the base turns"
     errors = [
-        np.linalg.norm(step(case.robot, case, spinning, substeps)[case.robot.n :] - expected)
+        np.linalg.norm(case.step(L_W, substeps)[case.robot.n :] - expected)
         for substeps in (4, 8, 16)
     ]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
@@ -502,16 +500,14 @@ def test_attitude_converges_at_fourth_order(seed: int, spinning: bool) -> None:
 @pytest.mark.parametrize("substeps", [1, 3, 16])
 def test_shape_is_exact(seed: int, substeps: int) -> None:
     case = random_case(seed)
-    shape = step(case.robot, case, spinning=True, substeps=substeps)[: case.robot.n]
+    shape = case.step(case.spin_W, substeps)[: case.robot.n]
     np.testing.assert_allclose(shape, case.q + DURATION * case.qdot, rtol=0.0, atol=1e-15)
 
 
 def test_joints_at_rest_and_no_momentum_leave_everything_as_it_is() -> None:
     case = random_case(71)
-    (x,) = case.robot.buffered("velocity_step:2")(
-        case.x, np.zeros(case.robot.n), np.zeros(3), DURATION
-    )
-    np.testing.assert_allclose(x, case.x, rtol=0.0, atol=1e-15)
+    still = replace(case, qdot=np.zeros(case.robot.n))
+    np.testing.assert_allclose(still.step(np.zeros(3), 2), case.x, rtol=0.0, atol=1e-15)
 
 
 def test_a_robot_of_few_calls_is_not_compiled(compiled_code: Path) -> None:

@@ -242,11 +242,6 @@ BROKEN = {
         changed(SOME_INERTIA, SOME_INERTIA.replace('ixy="0"', 'ixy="1.5"'), 1),
         r"inertia of link 'hull' has a negative principal moment",
     ),
-    "an inertia that is no number": (urdf(ixx="nan"), r"<inertia> of link 'arm' is not finite"),
-    "a centre that is no number": (
-        changed('<mass value="2"/>', '<origin xyz="0 0 nan"/><mass value="2"/>'),
-        r"<origin> of link 'arm' is not finite",
-    ),
     "an impossible inertia": (
         urdf(ixx="3"),
         r"inertia of link 'arm' is not physical: .* 1, 1 and 3 kg m\^2, .* Check units",
@@ -259,10 +254,6 @@ BROKEN = {
     "a mass in no unit": (
         urdf(mass="9e15"),
         r"in the <mass> of link 'hull' is larger than 1e\+12 in its SI unit",
-    ),
-    "a comma": (
-        urdf(mass="9,5"),
-        r"<mass> of link 'hull' has '9,5', which is not a number; write <mass value=",
     ),
     # Joints.
     "no limits": (
@@ -277,10 +268,6 @@ BROKEN = {
         limited('lower="1" upper="-1" velocity="1" effort="3"'),
         r"lower limit of joint 'elbow' \(1\.0\) is not below its upper limit \(-1\.0\)",
     ),
-    "a limit that is no number": (
-        limited('lower="nan" upper="1" velocity="1" effort="3"'),
-        r"A number in the <limit> of joint 'elbow' is not finite: nan",
-    ),
     "a negative velocity": (
         limited('lower="-1" upper="1" velocity="-2" effort="3"'),
         r"The limit 'velocity' of joint 'elbow' is negative \(-2\.0\)",
@@ -292,22 +279,6 @@ BROKEN = {
     "an axis of zero length": (
         changed('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>'),
         r"The axis of joint 'elbow' is zero; give it a direction",
-    ),
-    "an axis that is no number": (
-        changed('<axis xyz="0 0 1"/>', '<axis xyz="0 nan 1"/>'),
-        r"A number in the <axis> of joint 'elbow' is not finite: 0 nan 1",
-    ),
-    "a place that is no number": (
-        changed("<axis", '<origin xyz="0 nan 0"/><axis'),
-        r"<origin> of joint 'elbow' is not finite",
-    ),
-    "a turn that is no number": (
-        changed("<axis", '<origin rpy="0 nan 0"/><axis'),
-        r"<origin> of joint 'elbow' is not finite",
-    ),
-    "commas in an origin": (
-        changed("<axis", '<origin xyz="1, 2, 3"/><axis'),
-        r"<origin> of joint 'elbow' has '1,', which is not a number; write <origin xyz=",
     ),
     "no type": (
         changed(' type="revolute"', ""),

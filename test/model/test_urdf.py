@@ -387,6 +387,7 @@ def test_attributes_have_their_count_of_numbers(
             assert f"has {len(words)} numbers instead of {count}" in text
             assert text.endswith(remedy)
         assert "has 'one', which is not a number; write" in refusal(f'{name}="{"one " * count}"')
+        assert "is not finite: " in refusal(f'{name}="{"nan " * count}"')
 
 
 # -- masses -------------------------------------------------------------------------------------
