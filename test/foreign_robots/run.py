@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from support.hand_motion import attitude_after
 from support.oracles import PinocchioOracle
@@ -27,6 +26,7 @@ from support.planners import Planner
 
 from spacerobot_ros.errors import NotFoundError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.planning import (
     GaitMethod,
@@ -38,8 +38,6 @@ from spacerobot_ros.planning import (
     method_options,
 )
 from spacerobot_ros.resources import robot_file
-
-Array = npt.NDArray[np.float64]
 
 PROJECT = Path(__file__).parents[2]
 KEPT = PROJECT / "out" / "foreign_robots"
@@ -274,9 +272,7 @@ class Trials:
 def kept(name: str) -> list[Outcome]:
     """Return what is done of a robot's goals."""
     file = KEPT / f"{name}.jsonl"
-    if not file.is_file():
-        return []
-    lines = file.read_text("utf-8").splitlines()
+    lines = file.read_text("utf-8").splitlines() if file.is_file() else []
     # What was looked at again stands below.
     latest = {each.number: each for each in (Outcome(**json.loads(line)) for line in lines)}
     return list(latest.values())
@@ -350,23 +346,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--goals", type=int, default=100, help="goals a robot")
     parser.add_argument("--only", default="", help="robots whose name contains this")
-    parser.add_argument("--fresh", action="store_true", help="forget what is done")
-    parser.add_argument("--only-table", action="store_true", help="plan nothing more")
-    parser.add_argument("--no-table", action="store_true", help="leave the documents as they are")
     given = parser.parse_args()
-    names = [name for name in ROBOTS if given.only in name]
-    for name in names:
-        if given.fresh:
-            (KEPT / f"{name}.jsonl").unlink(missing_ok=True)
-        if not given.only_table:
+    for name in ROBOTS:
+        if given.only in name:
             run(name, given.goals)
-        elif kept(name):
-            confirm(name, SpaceRobot.from_file(robot_file(name)))
     earlier = {each["robot"]: each for each in json.loads(TABLE.read_text("utf-8"))}
     rows = [row(name, given.goals) or earlier[name] for name in ROBOTS]
     print(json.dumps(rows, indent=1))
-    if not given.no_table:
-        TABLE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    TABLE.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

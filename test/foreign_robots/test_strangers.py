@@ -20,6 +20,7 @@ from foreign_robots.run import OUT_OF_REACH, ROBOTS, TABLE, Outcome, classes, ta
 from planning.drifting import angle_between, flown_by_pinocchio
 from scipy.spatial.transform import Rotation
 from support.command_line import CliRunner
+from support.urdf_text import link, numbers
 
 from spacerobot_ros.bag import RecordedRobot, read_bag
 from spacerobot_ros.cli.main import main
@@ -249,37 +250,30 @@ def robot_urdf(
     size: Sequence[float], mass: float, limbs: Sequence[Limb], rate: float, reach: float
 ) -> str:
     """Return a robot whose joints turn by ``reach``, rad, either way, at a ``rate``, rad/s."""
-    parts = [link("base_link", size, mass, np.zeros(3))]
+    parts = [box_link("base_link", size, mass, np.zeros(3))]
     for number, limb in enumerate(limbs):
         parent, at, way = "base_link", np.asarray(limb.at), np.asarray(limb.way)
         for k, axis in enumerate(limb.axes):
             name = f"limb_{number}_{k}"
             # Neighbours nearly touch.
             box = limb.width + (0.96 * limb.length - limb.width) * np.abs(way)
-            parts.append(link(name, box, limb.mass, limb.length / 2 * way))
+            parts.append(box_link(name, box, limb.mass, limb.length / 2 * way))
             unit = " ".join("1" if letter == axis else "0" for letter in "xyz")
             parts.append(
                 f'<joint name="{name}" type="revolute"><parent link="{parent}"/>'
-                f'<child link="{name}"/><origin xyz="{text(at)}"/><axis xyz="{unit}"/>'
+                f'<child link="{name}"/><origin xyz="{numbers(at)}"/><axis xyz="{unit}"/>'
                 f'<limit lower="{-reach}" upper="{reach}" velocity="{rate}" effort="1e6"/></joint>'
             )
             parent, at = name, limb.length * way
     return f'<robot name="written">{"".join(parts)}</robot>'
 
 
-def link(name: str, size: Sequence[float] | Array, mass: float, center: Array) -> str:
+def box_link(name: str, size: Sequence[float] | Array, mass: float, center: Array) -> str:
     squares = np.square(size)
-    ixx, iyy, izz = mass / 12 * (squares.sum() - squares)
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{text(center)}"/><mass value="{mass}"/>'
-        f'<inertia ixx="{ixx}" ixy="0" ixz="0" iyy="{iyy}" iyz="0" izz="{izz}"/></inertial>'
-        f'<collision><origin xyz="{text(center)}"/><geometry><box size="{text(size)}"/></geometry>'
-        "</collision></link>"
-    )
-
-
-def text(values: Sequence[float] | Array) -> str:
-    return " ".join(f"{value:.9g}" for value in values)
+    moments = np.diag(mass / 12 * (squares.sum() - squares))
+    solid = f'<geometry><box size="{numbers(size)}"/></geometry>'
+    collision = f'<collision><origin xyz="{numbers(center)}"/>{solid}</collision>'
+    return link(name, mass, moments, center).replace("</link>", f"{collision}</link>")
 
 
 LEGS = [

@@ -11,12 +11,11 @@ from scipy.spatial.transform import Rotation
 from support.planners import Planner
 
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState
 from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
-
-Array = npt.NDArray[np.float64]
 
 STEP = 0.05
 """Integration step of plant and prediction, s: slow motions, and Runge-Kutta 4."""

@@ -23,14 +23,13 @@ from support.slow import some_fast
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot, load_robot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import METHODS, Goal, PlanRequest, RobotState, Tolerance
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.methods import area_loop
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait, EdgePath, edge_path
 from spacerobot_ros.planning.methods.nominal_shape import NominalShape, NominalShapeChooser
 from spacerobot_ros.resources import robot_file
-
-Array = npt.NDArray[np.float64]
 
 URDF = Path(__file__).parents[2] / "urdf" / "three_joint_arm.urdf"
 NOMINAL = np.radians([0.0, -45.0, 90.0])

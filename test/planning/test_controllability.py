@@ -6,7 +6,6 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from planning.sliding_robots import SlidingRobot, paper_robot, random_sliding_robot
 from support.oracles import PinocchioOracle
@@ -15,6 +14,7 @@ from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import METHODS, GaitMethod
 from spacerobot_ros.planning.core.controllability import (
     best_sampled_brackets,
@@ -27,8 +27,6 @@ from spacerobot_ros.planning.core.controllability import (
     sample_shapes,
 )
 from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
-
-Array = npt.NDArray[np.float64]
 
 
 def bracket(oracle: PinocchioOracle, q: Array, i: int, j: int) -> Array:

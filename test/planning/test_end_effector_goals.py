@@ -13,13 +13,13 @@ from support.planner_loop import robot_of
 from support.planners import assert_within
 
 from spacerobot_ros.errors import GoalError, NotFoundError, PlanningError, Proof, UnreachableError
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, RobotState, build_method, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, PoseError, Tolerance
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_effector
 from spacerobot_ros.planning.methods.registry import method_options
 
-Array = npt.NDArray[np.float64]
 QUICK: dict[str, Any] = {
     **{"cache": 0, "answers": 1, "intervals": 30},
     **{"control_period": 0.1, "clearance": 0.0},

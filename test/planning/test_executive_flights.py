@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod
 from support.planner_phases import until
 from support.sentences import assert_one_sentence
 
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -20,8 +20,6 @@ from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.resources import share_directory
-
-Array = npt.NDArray[np.float64]
 
 # Wide tolerances and one large cycle: a first order that is some way off.
 COARSE = {

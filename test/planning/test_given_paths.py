@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,6 +16,7 @@ from support.planner_loop import robot_of
 from support.planners import assert_within
 
 from spacerobot_ros.errors import GoalError, PlanningError
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.goal import MAX_PATH_POSES, EndEffectorGoal
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -25,8 +25,6 @@ from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.pose_path import PosePath, RoundedPath
 from spacerobot_ros.planning.methods.resolved_rate import PathProgress
-
-Array = npt.NDArray[np.float64]
 
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 CORNER = np.array([[1.0, -2.0, 0.5], [1.0, -1.6, 0.8], [1.3, -1.6, 0.8], [1.3, -1.2, 0.4]])

@@ -17,6 +17,7 @@ from support.planners import Planner, planner_of, refusal_in
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import (
     METHODS,
     GaitMethod,
@@ -27,8 +28,6 @@ from spacerobot_ros.planning import (
     Tolerance,
 )
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
-
-Array = npt.NDArray[np.float64]
 
 PERIOD = 0.05
 TIGHT = Tolerance(1e-5, 1e-5)

@@ -8,7 +8,6 @@ from threading import Condition
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from support.planner_loop import TICK, robot_of
@@ -17,6 +16,7 @@ from spacerobot_ros import plan
 from spacerobot_ros.cli.terminal import Display, display
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.progress import (
@@ -33,56 +33,45 @@ from spacerobot_ros.planning.execution.path_deviation import (
 )
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, time_to_end
 
-Array = npt.NDArray[np.float64]
-
 ROBOTS = ("sliding_masses", "three_joint_arm", "servicer")
 START = Rotation.from_rotvec([0.4, -0.2, 0.3])
 
 
-def weighing(robot: SpaceRobot, errors: Array) -> SpaceRobot:
-    """Return the robot with other masses and inertias, two relative errors a body."""
-    masses, inertias = np.split(1 + errors, 2)
-    return SpaceRobot(
-        robot.inertial.scaled(masses, inertias).apply_to_description(robot.description)
-    )
+class Trip:
+    """A schedule that goes to and fro, each joint in its own time, and what is learnt on it."""
 
+    def __init__(self, name: str, ticks: int) -> None:
+        self.robot = robot_of(name)
+        s = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
+        lower, upper = np.maximum(self.robot.lower, -2.0), np.minimum(self.robot.upper, 2.0)
+        number: Array = np.arange(self.robot.n, dtype=float)
+        swing = np.sin(2 * np.pi * s * (1 + number % 3) + number)
+        self.shapes = lower + (upper - lower) * (0.5 + 0.3 * swing)
+        sensitivity = PathSensitivity(self.robot)
+        self.count = sensitivity.count
+        goal = Goal(np.zeros(3), START.as_quat())
+        self.schedule = GaitSchedule(
+            "any", self.robot.joint_names, TICK, self.shapes, self.path(np.zeros(self.count)), goal
+        )
+        self.derivatives = sensitivity.path_derivatives(self.schedule)
+        self.masses = MassEstimate(self.count)
 
-def shapes_of(robot: SpaceRobot, ticks: int) -> Array:
-    """Return shapes (ticks + 1, n) that go to and fro, each joint in its own time."""
-    s = np.linspace(0.0, 1.0, ticks + 1)[:, np.newaxis]
-    lower, upper = np.maximum(robot.lower, -2.0), np.minimum(robot.upper, 2.0)
-    number: Array = np.arange(robot.n, dtype=float)
-    return lower + (upper - lower) * (0.5 + 0.3 * np.sin(2 * np.pi * s * (1 + number % 3) + number))
+    def path(self, errors: Array) -> BasePath:
+        """Return the base path at every tick, integrated with masses and inertias that are off by
+        relative errors, two a body.
+        """
+        weights = self.robot.inertial.scaled(*np.split(1 + errors, 2))
+        true = SpaceRobot(weights.apply_to_description(self.robot.description))
+        state = RobotState(np.array([0.3, -0.1, 0.2]), START.as_quat(), self.shapes[0])
+        return BasePrediction(true, TICK, 0.01).path(state, self.shapes)
 
+    def check(self, average: int) -> PathCheck:
+        of_masses = self.derivatives, self.masses
+        return PathCheck(self.robot, self.schedule, 0, PlannerConfig(), average, *of_masses)
 
-def flown(robot: SpaceRobot, shapes: Array) -> BasePath:
-    """Return the base path by numerical integration at every tick."""
-    state = RobotState(np.array([0.3, -0.1, 0.2]), START.as_quat(), shapes[0])
-    return BasePrediction(robot, TICK, 0.01).path(state, shapes)
-
-
-def schedule_of(robot: SpaceRobot, shapes: Array) -> GaitSchedule:
-    goal = Goal(np.zeros(3), START.as_quat())
-    return GaitSchedule("any", robot.joint_names, TICK, shapes, flown(robot, shapes), goal)
-
-
-class Measured:
-    """A path check, and the schedule on which poses are measured tick by tick."""
-
-    def __init__(
-        self,
-        robot: SpaceRobot,
-        schedule: GaitSchedule,
-        average: int,
-        derivatives: Array,
-        masses: MassEstimate,
-    ) -> None:
-        self.check = PathCheck(robot, schedule, 0, PlannerConfig(), average, derivatives, masses)
-        self._shapes = schedule.positions
-
-    def add(self, k: int, position: Array, quaternion: Array) -> None:
-        assert self.check.due(round(k * TICK * 1e9))
-        self.check.average_pose(RobotState(position, quaternion, self._shapes[k]))
+    def measure(self, check: PathCheck, k: int, position: Array, quaternion: Array) -> None:
+        assert check.due(round(k * TICK * 1e9))
+        check.average_pose(RobotState(position, quaternion, self.shapes[k]))
 
 
 def deviations(path: BasePath, predicted: BasePath) -> Array:
@@ -95,12 +84,10 @@ def deviations(path: BasePath, predicted: BasePath) -> Array:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("ticks", [40, 300, 950])
 def test_sensitivities_are_those_of_integrated_paths(name: str, ticks: int) -> None:
-    robot = robot_of(name)
-    schedule = schedule_of(robot, shapes_of(robot, ticks))
-    sensitivity = PathSensitivity(robot)
-    errors = 1e-4 * np.random.default_rng(3).normal(size=sensitivity.count)
-    expected = deviations(flown(weighing(robot, errors), schedule.positions), schedule.path)
-    found = sensitivity.path_derivatives(schedule) @ errors
+    trip = Trip(name, ticks)
+    errors = 1e-4 * np.random.default_rng(3).normal(size=trip.count)
+    expected = deviations(trip.path(errors), trip.schedule.path)
+    found = trip.derivatives @ errors
     assert np.abs(expected[:, :3]).max() > 1e-6
     np.testing.assert_allclose(found, expected, atol=0.05 * np.abs(expected).max())
 
@@ -108,24 +95,20 @@ def test_sensitivities_are_those_of_integrated_paths(name: str, ticks: int) -> N
 @pytest.mark.slow
 def test_half_of_a_path_tells_where_it_ends() -> None:
     """Masses wrong by a tenth, poses with noise of a milliradian, and where it begins as well."""
-    robot = robot_of("three_joint_arm")
-    schedule = schedule_of(robot, shapes_of(robot, 120))
-    sensitivity = PathSensitivity(robot)
-    derivatives = sensitivity.path_derivatives(schedule)
-    missed: list[float] = []
-    known: list[float] = []
+    trip, missed, known = Trip("three_joint_arm", 120), list[float](), list[float]()
     for seed in range(10):
         rng = np.random.default_rng(seed)
-        true = weighing(robot, rng.uniform(-0.1, 0.1, sensitivity.count))
-        path = flown(true, schedule.positions)
+        path = trip.path(rng.uniform(-0.1, 0.1, trip.count))
+        trip.masses = MassEstimate(trip.count)
         off = Rotation.from_rotvec(2e-3 * rng.normal(size=3))
-        measured = Measured(robot, schedule, 3, derivatives, MassEstimate(sensitivity.count))
+        check = trip.check(3)
         for k in range(60):
             noise = Rotation.from_rotvec(1e-3 * rng.normal(size=3))
             attitude = off * Rotation.from_quat(path.quaternion[k]) * noise
-            measured.add(k, path.position[k] + 1e-3 * rng.normal(size=3), attitude.as_quat())
+            position = path.position[k] + 1e-3 * rng.normal(size=3)
+            trip.measure(check, k, position, attitude.as_quat())
         end = off * Rotation.from_quat(path.quaternion[-1])
-        for where, errors in ((measured.check.end, missed), (measured.check.expected_end, known)):
+        for where, errors in ((check.end, missed), (check.expected_end, known)):
             errors.append((end.inv() * Rotation.from_quat(where[1])).magnitude())
     assert np.median(missed) > 0.009
     assert np.median(known) < 0.2 * np.median(missed)
@@ -133,22 +116,18 @@ def test_half_of_a_path_tells_where_it_ends() -> None:
 
 
 def test_what_was_learnt_on_one_path_counts_on_the_next() -> None:
-    robot = robot_of("three_joint_arm")
-    sensitivity = PathSensitivity(robot)
-    schedule = schedule_of(robot, shapes_of(robot, 100))
-    derivatives, masses = sensitivity.path_derivatives(schedule), MassEstimate(sensitivity.count)
-    true = weighing(robot, np.random.default_rng(8).uniform(-0.1, 0.1, sensitivity.count))
-    path = flown(true, schedule.positions)
-    first = Measured(robot, schedule, 1, derivatives, masses)
+    trip = Trip("three_joint_arm", 100)
+    path = trip.path(np.random.default_rng(8).uniform(-0.1, 0.1, trip.count))
+    first = trip.check(1)
     for k in range(101):
-        first.add(k, path.position[k], path.quaternion[k])
-    learnt = masses.errors.copy()
+        trip.measure(first, k, path.position[k], path.quaternion[k])
+    learnt = trip.masses.errors.copy()
     assert np.abs(learnt).max() > 0.01
-    second = Measured(robot, schedule, 1, derivatives, masses)
-    second.add(0, path.position[0], path.quaternion[0])
-    np.testing.assert_allclose(masses.errors, learnt, rtol=1e-9)
-    end = Rotation.from_quat(second.check.expected_end[1])
-    unknown = Rotation.from_quat(second.check.end[1])
+    second = trip.check(1)
+    trip.measure(second, 0, path.position[0], path.quaternion[0])
+    np.testing.assert_allclose(trip.masses.errors, learnt, rtol=1e-9)
+    end = Rotation.from_quat(second.expected_end[1])
+    unknown = Rotation.from_quat(second.end[1])
     true_end = Rotation.from_quat(path.quaternion[-1])
     assert (true_end.inv() * end).magnitude() < 0.1 * (true_end.inv() * unknown).magnitude()
 
@@ -156,14 +135,11 @@ def test_what_was_learnt_on_one_path_counts_on_the_next() -> None:
 @pytest.mark.parametrize("size", [1e-4, 1e-2, 1.0], ids="{:g}".format)
 @pytest.mark.parametrize("name", ROBOTS)
 def test_an_offset_of_all_poses_tells_nothing_of_masses(name: str, size: float) -> None:
-    robot = robot_of(name)
-    sensitivity = PathSensitivity(robot)
-    schedule = schedule_of(robot, shapes_of(robot, 60))
-    derivatives = sensitivity.path_derivatives(schedule)
-    true = 0.02 * np.random.default_rng(5).normal(size=sensitivity.count)
+    trip = Trip(name, 60)
+    true = 0.02 * np.random.default_rng(5).normal(size=trip.count)
     offset = size * np.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.01])
-    plain, shifted = MassEstimate(sensitivity.count), MassEstimate(sensitivity.count)
-    for derivative in derivatives:
+    plain, shifted = MassEstimate(trip.count), MassEstimate(trip.count)
+    for derivative in trip.derivatives:
         plain.add(derivative, derivative @ true)
         shifted.add(derivative, derivative @ true + offset)
     # Not an implausible estimate, which is zero whatever the poses were.
@@ -179,20 +155,16 @@ def test_an_offset_of_all_poses_tells_nothing_of_masses(name: str, size: float) 
     ],
 )
 def test_a_jump_of_what_is_measured_tells_nothing_of_masses(name: str, step: list[float]) -> None:
-    robot = robot_of(name)
-    sensitivity = PathSensitivity(robot)
-    schedule = schedule_of(robot, shapes_of(robot, 120))
-    derivatives, masses = sensitivity.path_derivatives(schedule), MassEstimate(sensitivity.count)
-    true = weighing(robot, np.random.default_rng(8).uniform(-0.1, 0.1, sensitivity.count))
-    path = flown(true, schedule.positions)
+    trip = Trip(name, 120)
+    path = trip.path(np.random.default_rng(8).uniform(-0.1, 0.1, trip.count))
 
     def follow(until: int, jump_at: int) -> PathCheck:
-        measured = Measured(robot, schedule, 3, derivatives, masses)
+        check = trip.check(3)
         for k in range(until):
             off = np.array(step) * (k >= jump_at)
             attitude = Rotation.from_rotvec(off[3:]) * Rotation.from_quat(path.quaternion[k])
-            measured.add(k, path.position[k] + off[:3], attitude.as_quat())
-        return measured.check
+            trip.measure(check, k, path.position[k] + off[:3], attitude.as_quat())
+        return check
 
     jumped = follow(60, jump_at=30)
     for found, plain in zip(jumped.expected_end, jumped.end, strict=True):

@@ -6,16 +6,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from planning.test_optimal import ARM_START, QUICK
-from planning.test_reach import some_shape, urdf_of
+from planning.test_reach import some_robot, some_shape
 from scipy.spatial.transform import Rotation
 from support.hand_motion import attitude_after
-from support.oracles import PinocchioOracle
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, PlanRequest, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
@@ -28,10 +27,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
 )
-from spacerobot_ros.planning.methods.optimal.search import ManoeuvreSearch
 from spacerobot_ros.resources import robot_file
-
-Array = npt.NDArray[np.float64]
 
 PERIOD = 0.1
 WHOLE = np.eye(3)
@@ -52,12 +48,18 @@ def of_two(kind: str, origin: str, axis: str, com: str = "0 0 0") -> SpaceRobot:
     return SpaceRobot.from_urdf(f'<robot name="two">{links[0]}{links[1]}{joint}</robot>')
 
 
-def bound_of(robot: SpaceRobot, boundary: BoundaryConditions, **limits: Any) -> DurationBound:
-    """Return the bound of a robot with limits (n,), for any attitude or that about its axis."""
-    axes = limits.pop("axes", None)
+def bound_of(
+    robot: SpaceRobot,
+    boundary: BoundaryConditions,
+    velocity: Array,
+    acceleration: Array,
+    axes: Array | None = None,
+    **options: Any,
+) -> DurationBound:
+    """Return the bound with limits (n,), for any attitude or that about the robot's axis."""
     axes = BaseRotations.of(robot).axes if axes is None else axes
-    given = {"final_is_given": boundary.final is not None, **limits.pop("more", {})}
-    within = MotionLimits(robot.lower, robot.upper, **limits)
+    within = MotionLimits(robot.lower, robot.upper, velocity, acceleration)
+    given = {"final_is_given": boundary.final is not None, **options}
     connection = ConnectionBounds.of(robot, axes)
     return DurationBound.of(robot, boundary, within, PERIOD, axes, connection, **given)
 
@@ -69,9 +71,7 @@ def bound_of(robot: SpaceRobot, boundary: BoundaryConditions, **limits: Any) -> 
 @pytest.mark.parametrize("kind", ["tree", "chain", "planar", "sliders"])
 def test_no_joint_moves_the_base_beyond_its_bound(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    urdf = urdf_of(kind, rng)
-    robot = SpaceRobot.from_urdf(urdf)
-    oracle = PinocchioOracle(urdf, robot.joint_names)
+    robot, oracle = some_robot(kind, rng)
     axes = BaseRotations.of(robot).axes
     bounds = ConnectionBounds.of(robot, axes)
     step = 1e-5
@@ -193,9 +193,7 @@ def test_a_joint_takes_the_time_of_its_fastest_motion(way: float, acceleration: 
 @pytest.mark.parametrize("kind", ["tree", "chain", "planar", "sliders"])
 def test_no_motion_is_faster_than_the_bound(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    urdf = urdf_of(kind, rng)
-    robot = SpaceRobot.from_urdf(urdf)
-    oracle = PinocchioOracle(urdf, robot.joint_names)
+    robot, oracle = some_robot(kind, rng)
     velocity, acceleration = rng.uniform(0.1, 0.6, robot.n), rng.uniform(0.2, 2.0, robot.n)
     ticks = int(rng.integers(2, 30))
     rates = held_rates(ticks, velocity, acceleration) * rng.choice([-1, 1], robot.n)
@@ -225,7 +223,7 @@ def test_no_motion_is_faster_than_the_bound(kind: str, seed: int) -> None:
     request = PlanRequest(state, goal, Tolerance(0.0, 0.0))
     axes = BaseRotations.of(robot).axes
     demands = list(link_demands(robot, request, free, ConnectionBounds.of(robot, axes)))
-    found = bound_of(robot, free, **limits, axes=np.zeros((0, 3)), more={"demands": demands})
+    found = bound_of(robot, free, **limits, axes=np.zeros((0, 3)), demands=demands)
     assert found.seconds <= (ticks + 1e-6) * PERIOD
     assert found.seconds > 0 or ticks < 4 or max(each.amount for each in demands) < 1e-3
     if share.max() == 1.0:
@@ -245,7 +243,7 @@ def test_ends_in_motion_and_a_drift_shorten_the_bound() -> None:
         assert time - 2 * PERIOD < found.seconds <= time
     drifting = replace(rest, angular_momentum=np.array([0.35, 0.0, 0.0]))
     assert bound_of(robot, drifting, **limits, axes=WHOLE).seconds <= 0.2 / 0.1
-    slow = bound_of(robot, rest, **limits, axes=WHOLE, more={"base_rate_limit": 0.01})
+    slow = bound_of(robot, rest, **limits, axes=WHOLE, base_rate_limit=0.01)
     assert slow.seconds == pytest.approx(20.0)
     assert slow.reason == "the base rotates by 0.2 rad at no more than optimal.max_base_rate"
     # A turn about another axis than the only one is no part of the goal.
@@ -254,14 +252,6 @@ def test_ends_in_motion_and_a_drift_shorten_the_bound() -> None:
 
 
 # -- refusals ---------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def no_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any, **__: Any) -> None:
-        pytest.fail("A search was begun.")
-
-    monkeypatch.setattr(ManoeuvreSearch, "search", fail)
 
 
 @pytest.mark.parametrize(

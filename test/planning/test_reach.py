@@ -20,6 +20,7 @@ from support.random_robots import random_chain_urdf, random_robot_urdf
 
 from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import (
     Goal,
     PlanRequest,
@@ -35,22 +36,22 @@ from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpeci
 from spacerobot_ros.planning.methods.optimal.motion_bounds import CenterReach
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
 
-Array = npt.NDArray[np.float64]
-
 TOLERANCE = Tolerance(1e-4, 1e-4, 1e-4)
 SEEDS = st.integers(0, 10**6)
 
 
-def urdf_of(kind: str, rng: np.random.Generator) -> str:
+def some_robot(kind: str, rng: np.random.Generator) -> tuple[SpaceRobot, PinocchioOracle]:
     match kind:
         case "tree":
-            return random_robot_urdf(rng, int(rng.integers(1, 6)))
+            urdf = random_robot_urdf(rng, int(rng.integers(1, 6)))
         case "chain":
-            return random_chain_urdf(rng, int(rng.integers(1, 6)))
+            urdf = random_chain_urdf(rng, int(rng.integers(1, 6)))
         case "planar":
-            return random_tree(rng, int(rng.integers(2, 5))).urdf
+            urdf = random_tree(rng, int(rng.integers(2, 5))).urdf
         case _:
-            return random_sliding_robot(rng, int(rng.integers(3, 6))).urdf
+            urdf = random_sliding_robot(rng, int(rng.integers(3, 6))).urdf
+    robot = SpaceRobot.from_urdf(urdf)
+    return robot, PinocchioOracle(urdf, robot.joint_names)
 
 
 def some_shape(robot: SpaceRobot, rng: np.random.Generator) -> Array:
@@ -98,9 +99,7 @@ KINDS = ["tree", "chain", "planar", "sliders"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_many_random_motions_reach_is_never_called_unreachable(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    urdf = urdf_of(kind, rng)
-    robot = SpaceRobot.from_urdf(urdf)
-    oracle = PinocchioOracle(urdf, robot.joint_names)
+    robot, oracle = some_robot(kind, rng)
     start = Rotation.random(random_state=rng).as_quat()
     state = RobotState(rng.normal(size=3), start, some_shape(robot, rng))
     attitude, position, q = moved(oracle, robot, state, rng)
@@ -125,9 +124,7 @@ def test_what_many_random_motions_reach_is_never_called_unreachable(kind: str, s
 @pytest.mark.parametrize("kind", ["tree", "chain", "sliders"])
 def test_the_bound_holds_every_centre_of_mass(kind: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    urdf = urdf_of(kind, rng)
-    robot = SpaceRobot.from_urdf(urdf)
-    oracle = PinocchioOracle(urdf, robot.joint_names)
+    robot, oracle = some_robot(kind, rng)
     reach = CenterReach.of(robot, *robot.description.shape_box)
     centres = [oracle.center_of_mass(some_shape(robot, rng)) for _ in range(20)]
     assert max(reach.distance_outside(center) for center in centres) < 1e-9

@@ -16,6 +16,7 @@ from support.planners import Planner
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import (
@@ -37,8 +38,6 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.config import PlantConfig
-
-Array = npt.NDArray[np.float64]
 
 TICK = 0.05
 NEEDED = 20

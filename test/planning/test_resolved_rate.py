@@ -18,6 +18,7 @@ from support.planners import assert_within
 
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, build_method, plan
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import Clearance
@@ -28,7 +29,6 @@ from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.planning.methods.resolved_rate import ResolvedRateGait
 from spacerobot_ros.simulation import InitialState
 
-Array = npt.NDArray[np.float64]
 Pose = tuple[Array, Rotation]
 
 PLACE, ATTITUDE = np.array([0.4, -0.3, 0.2]), Rotation.from_rotvec([0.3, -0.5, 0.4])

@@ -9,7 +9,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from planning.flown import fly, plant_at
 from scipy.spatial.transform import Rotation
@@ -32,6 +31,7 @@ from support.slow import some_fast
 
 from spacerobot_ros.errors import UnreachableError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitMethod, GaitSchedule, Goal, Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
@@ -40,8 +40,6 @@ from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.worker import Planned, PlanningTask, Refused
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState, VelocityPlant
-
-Array = npt.NDArray[np.float64]
 
 SECOND_TICK = 0.05
 TOLERANCE = Tolerance(2e-3, 2e-3, 1e-6)
@@ -285,23 +283,19 @@ class BalancedLoop(Loop):
     """kg m/s and kg m^2/s about the origin of the base."""
 
     def tick(self, count: int = 1, *, base: bool = True) -> None:
+        plant, oracle = self.plant, oracle_of(self.plant.robot)
         for _ in range(count):
             super().tick(base=base)
-            self.largest = max(self.largest, float(np.abs(momentum(self.plant)).max()))
+            oracle.place(plant.q, plant.pose[3:], plant.pose[:3])
+            u = oracle.joint_velocities(plant.qdot)
+            u[:6] = plant.twist
+            momentum = (oracle.own_mass_matrix() @ u)[:6]
+            self.largest = max(self.largest, float(np.abs(momentum).max()))
 
 
 @cache
 def oracle_of(model: SpaceRobot) -> PinocchioOracle:
     return PinocchioOracle(model.description.urdf, model.joint_names)
-
-
-def momentum(plant: VelocityPlant) -> Array:
-    """Return the momentum (6,) of all bodies by Pinocchio, from what the plant reports."""
-    oracle = oracle_of(plant.robot)
-    oracle.place(plant.q, plant.pose[3:], plant.pose[:3])
-    u = oracle.joint_velocities(plant.qdot)
-    u[:6] = plant.twist
-    return np.asarray((oracle.own_mass_matrix() @ u)[:6])
 
 
 def loop_of(robot: str, method: GaitMethod | None, **parameters: Any) -> BalancedLoop:
@@ -384,31 +378,23 @@ def test_a_goal_that_is_changed_halfway_is_reached_without_a_stop() -> None:
 class NoisyState(PlantState):
     """The measured state with noise of the base (1 mm, 0.87 mrad), the joints, and all rates."""
 
-    def __init__(self, plant: VelocityPlant, seed: int) -> None:
-        super().__init__(plant)
-        self._rng, self._drawn_ns = np.random.default_rng(seed), -1
-
-    def _draw(self) -> None:
-        if self._drawn_ns == self.stamp_ns:
-            return
-        self._drawn_ns, plant, normal = self.stamp_ns, self._plant, self._rng.normal
-        n = len(plant.q)
-        self._q = plant.q + 1e-3 * normal(size=n)
-        noise = Rotation.from_rotvec(8.7e-4 * normal(size=3))
-        attitude = (Rotation.from_quat(plant.pose[3:]) * noise).as_quat()
-        pose = np.concatenate([plant.pose[:3] + 1e-3 * normal(size=3), attitude])
-        twist, rates = plant.twist + 1e-3 * normal(size=6), plant.qdot + 1e-3 * normal(size=n)
-        self._base = BaseMeasurement(pose, twist, rates)
+    @property
+    def _noise(self) -> Array:
+        """Numbers (2, 6 + n) of order one that are the same as long as the state is."""
+        return np.random.default_rng(self.stamp_ns).normal(size=(2, 6 + len(self._plant.q)))
 
     @property
     def q(self) -> Array:
-        self._draw()
-        return self._q
+        return np.asarray(self._plant.q + 1e-3 * self._noise[0, 6:])
 
     @property
     def base(self) -> BaseMeasurement | None:
-        self._draw()
-        return self._base
+        plant, (of_place, of_rates) = self._plant, self._noise
+        noise = Rotation.from_rotvec(8.7e-4 * of_place[3:6])
+        attitude = (Rotation.from_quat(plant.pose[3:]) * noise).as_quat()
+        pose = np.concatenate([plant.pose[:3] + 1e-3 * of_place[:3], attitude])
+        rates = 1e-3 * of_rates
+        return BaseMeasurement(pose, plant.twist + rates[:6], plant.qdot + rates[6:])
 
 
 def with_wrong_masses(*, horizon: bool) -> tuple[Loop, float]:
@@ -428,7 +414,7 @@ def with_wrong_masses(*, horizon: bool) -> tuple[Loop, float]:
     loop = Loop(parameters, robot="planar_chain", initial=initial)
     wrong = robot_of("planar_chain").description.with_model_error(0.1, 1)
     loop.plant = VelocityPlant(SpaceRobot(wrong), TICK, initial)
-    loop.measured = NoisyState(loop.plant, 1)
+    loop.measured = NoisyState(loop.plant)
     angle = np.random.default_rng(1).uniform(0.8, 2.0)
     loop.propose_goal(Goal.checked(np.zeros(3), Rotation.from_rotvec([0, 0, angle]).as_quat()))
     loop.until(PlannerState.REACHED_PARTLY, PlannerState.FAILED)

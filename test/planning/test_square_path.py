@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.integrate import dblquad, quad
 from scipy.spatial.transform import Rotation
@@ -34,6 +33,7 @@ from support.planners import refusal_in
 
 from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
 from spacerobot_ros.planning.methods.geometric_phase import (
     PhasePlane,
@@ -94,9 +94,6 @@ def test_without_a_shape_the_present_one_is_kept() -> None:
 
 
 # -- square paths within joint limits, or the true reason why there is none ----------------------
-
-
-Array = npt.NDArray[np.float64]
 
 
 @pytest.mark.slow

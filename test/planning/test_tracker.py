@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 from support.oracles import PinocchioOracle
 from support.planner_loop import TICK, StubMethod, goal_at, robot_of
 
 from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest, RobotState, Tolerance
 from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
@@ -22,8 +22,6 @@ from spacerobot_ros.planning.execution.state_average import StateAverage
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.simulation import EffortPlant, InitialState
-
-Array = npt.NDArray[np.float64]
 
 PERIOD = 0.1
 PERIOD_NS = 100_000_000
