@@ -255,6 +255,10 @@ BROKEN = {
         urdf(mass="9e15"),
         r"in the <mass> of link 'hull' is larger than 1e\+12 in its SI unit",
     ),
+    "a comma": (
+        urdf(mass="9,5"),
+        r"<mass> of link 'hull' has '9,5', which is not a number; write <mass value=",
+    ),
     # Joints.
     "no limits": (
         urdf(limit=""),
