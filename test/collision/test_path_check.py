@@ -133,7 +133,7 @@ def test_obstacles_are_met_between_ticks_where_the_base_moves_or_turns(
     assert (found[0].tick, found[0].distance) == pytest.approx((0.5, -0.05), abs=1e-4)
 
 
-# -- bodies of revolution that spin in place, such as reaction wheels, come no nearer to ---------
+# -- bodies of revolution that spin in place come no nearer -------------------------------------
 
 
 def robot(origin: str = "0 0 0.2", rpy: str = "0 0 0", shape: str = "") -> RobotDescription:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pinocchio as pin
 import pytest
+from model.test_coupled_joints import coupled_robot
 from planning.sliding_robots import random_sliding_robot
 from scipy.spatial.transform import Rotation
 from support.oracles import Array, PinocchioOracle, assert_agrees
@@ -17,46 +17,11 @@ from support.planar_manoeuvres import closed_forms, phase_density
 from support.random_robots import random_robot_urdf
 from support.slow import some_fast
 
-from spacerobot_ros.model import SpaceRobot, load_robot
-from spacerobot_ros.model.description import Inertia, RobotDescription
+from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.description import Inertia
 from spacerobot_ros.model.external_loads import mean_motion_at
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.resources import robot_file
-
-_LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 0"/><mass value="2"/>
-  <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.3"/></inertial>
-  <visual><origin xyz="{at}" rpy="0.3 -0.2 0.5"/><geometry>{shape}</geometry></visual></link>"""
-
-_JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
-  <origin xyz="{at}" rpy="0.4 -0.7 1.1"/><axis xyz="0.6 0 0.8"/>
-  <limit lower="-2" upper="1.5" effort="9" velocity="1"/>{mimic}</joint>"""
-
-
-def branched_robot(folder: Path) -> RobotDescription:
-    """Return the robot, from a URDF in a folder."""
-    links = {
-        "base": ("0 0 0.1", '<box size="0.5 0.4 0.3"/>'),
-        "a1": ("0.2 0 0", '<cylinder radius="0.05" length="0.4"/>'),
-        "a2": ("0.1 0.2 0", '<box size="0.3 0.2 0.25"/>'),
-        "a3": ("0 0 0.2", '<sphere radius="0.08"/>'),
-        "b1": ("0 0.1 0.2", '<box size="0.06 0.3 0.25"/>'),
-        "b2": ("0.2 0.1 0", '<cylinder radius="0.06" length="0.5"/>'),
-    }
-    joints = [
-        ("b_slide", "prismatic", "base", "b1", "0.1 0.5 0", ""),
-        ("a_turn", "revolute", "base", "a1", "0.4 0 0.1", ""),
-        ("a_slide", "prismatic", "a1", "a2", "0.5 0.1 0", ""),
-        ("a_follow", "revolute", "a2", "a3", "0.3 0 0.2", "a_turn"),
-        ("b_turn", "revolute", "b1", "b2", "0 0.4 0.1", ""),
-    ]
-    text = "".join(_LINK.format(name=k, at=at, shape=shape) for k, (at, shape) in links.items())
-    for name, kind, parent, child, at, leader in joints:
-        mimic = f'<mimic joint="{leader}" multiplier="-0.7" offset="0.2"/>' if leader else ""
-        text += _JOINT.format(name=name, kind=kind, parent=parent, child=child, at=at, mimic=mimic)
-    path = folder / "branched.urdf"
-    path.write_text(f'<robot name="branched">{text}</robot>', encoding="utf-8")
-    return load_robot(path)
-
 
 SEEDS = range(20, 24)
 
@@ -269,10 +234,10 @@ def compare(robot: SpaceRobot, seed: int) -> None:
             assert found.full() == pytest.approx(expected.full(), abs=1e-13 * scale)
 
 
-def test_branches_sliders_and_joints_that_follow(tmp_path: Path) -> None:
-    description = branched_robot(tmp_path)
-    assert description.has_mimic_joints
-    compare(SpaceRobot(description), 2)
+def test_branches_sliders_and_joints_that_follow() -> None:
+    robot = coupled_robot(0).robot
+    assert robot.description.has_mimic_joints
+    compare(robot, 2)
 
 
 @pytest.mark.parametrize("name", some_fast(["seven_joint_arm", "quadruped"]))
@@ -280,7 +245,7 @@ def test_robots_of_the_package(name: str) -> None:
     compare(of_package(name), 4)
 
 
-# -- joint rates that leave the base still, against Pinocchio, alone and with a captured ---------
+# -- joint rates that leave the base still, alone and after a capture ---------------------------
 
 
 BODY = Inertia(

@@ -258,7 +258,7 @@ def test_what_cannot_be_locked_is_named() -> None:
             robot.with_locked({name: 0.0})
 
 
-# -- parameters of a held body from momenta of point masses, with noise, in a plane, and ---------
+# -- parameters of a held body from momenta of point masses -------------------------------------
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,7 @@ def test_fixed_joints_are_welded_as_pinocchio_welds_them(seed: int) -> None:
         assert_agrees(pose.r, frame.placement.translation)
 
 
-# -- obstacles in the world: URDF files without moving joints, carried by the text of a ----------
+# -- obstacles in the world, carried by the text of a robot -------------------------------------
 
 
 BALL = '<collision><geometry><sphere radius="0.3"/></geometry></collision>'

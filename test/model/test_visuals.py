@@ -44,29 +44,22 @@ def volume(mesh: TriangleMesh) -> float:
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
-def area(mesh: TriangleMesh) -> float:
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
-
-
 @pytest.mark.parametrize(
-    ("kind", "size", "inside", "surface", "edges"),
+    ("kind", "size", "inside", "edges"),
     [
-        ("box", (0.3, 0.5, 0.7), 0.105, 1.42, 12),
-        ("cylinder", (0.2, 1.5), 0.06 * math.pi * POLYGON, None, 48),
-        ("sphere", (0.4,), None, None, 0),
+        ("box", (0.3, 0.5, 0.7), 0.105, 12),
+        ("cylinder", (0.2, 1.5), 0.06 * math.pi * POLYGON, 48),
+        ("sphere", (0.4,), None, 0),
     ],
 )
 def test_solids_are_closed_and_seen_from_outside(
-    kind: str, size: tuple[float, ...], inside: float | None, surface: float | None, edges: int
+    kind: str, size: tuple[float, ...], inside: float | None, edges: int
 ) -> None:
     mesh = solid_mesh(Shape(kind, size, PLACED))
     if inside is not None:
         assert volume(mesh) == pytest.approx(inside)
     else:
         assert 0.97 < volume(mesh) / (4 / 3 * math.pi * size[0] ** 3) < 1.0
-    if surface is not None:
-        assert area(mesh) == pytest.approx(surface)
     # Every edge has a face on both sides, which go along it in opposite directions.
     directed = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).tolist()
     assert {(a, b) for a, b in directed} == {(b, a) for a, b in directed}
@@ -171,7 +164,7 @@ def test_a_robot_without_visuals_has_balls_at_links_and_bars_to_its_joints() -> 
         assert bar.body == robot.frames[joint.parent][0]
 
 
-# -- meshes of visuals: what is read of files, what is refused, and the example robot's ----------
+# -- meshes of visuals, and those of the example robot ------------------------------------------
 
 
 WEDGE = np.array([[0.0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 5]])
