@@ -52,12 +52,11 @@ def fly(
     plant: VelocityPlant,
     goal: Goal,
     *,
-    most: int = 1000,
     watch: Callable[[GaitSchedule], None] | None = None,
 ) -> Flight:
     """Fly to the goal: a partial schedule is followed by the next from where the plant is then."""
     flight = Flight([], [], [])
-    for _ in range(most):
+    for _ in range(1000):
         schedule = method.plan(measured(plant), goal, correction=bool(flight.pieces))
         if watch is not None:
             watch(schedule)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from planning.test_given_paths import distance_from
 from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod
 from support.planner_phases import until
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
@@ -134,15 +134,6 @@ def test_small_tracking_errors_are_left_to_the_end() -> None:
     loop = Loop({"drift_position": 2e-3, "drift_attitude": 2e-3})
     loop.decide(NEAR)
     assert loop.states == ["executing", "reached"]
-
-
-def distance_from(path: Array, shape: Array) -> float:
-    """Return how far a shape is from the polygon through the shapes of a path."""
-    legs = np.diff(path, axis=0)
-    lengths = np.maximum((legs**2).sum(axis=1), 1e-30)
-    share = np.clip(((shape - path[:-1]) * legs).sum(axis=1) / lengths, 0.0, 1.0)
-    nearest = path[:-1] + share[:, np.newaxis] * legs
-    return float(np.linalg.norm(shape - nearest, axis=1).min())
 
 
 def test_abortion_brings_the_joints_to_rest_on_their_path() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -41,12 +40,12 @@ def turning() -> PosePath:
 
 
 def distance_from(lines: Array, place: Array) -> float:
-    """Return the distance of a place (3,) from a polyline (K, 3), m."""
-    found = []
-    for a, b in pairwise(lines):
-        share = np.clip((place - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-        found.append(np.linalg.norm(a + share * (b - a) - place))
-    return float(min(found))
+    """Return the distance of a place (n,) from a polyline (K, n)."""
+    legs = np.diff(lines, axis=0)
+    lengths = np.maximum((legs**2).sum(axis=1), 1e-30)
+    share = np.clip(((place - lines[:-1]) * legs).sum(axis=1) / lengths, 0.0, 1.0)
+    nearest = lines[:-1] + share[:, np.newaxis] * legs
+    return float(np.linalg.norm(place - nearest, axis=1).min())
 
 
 # -- lines --------------------------------------------------------------------------------------
@@ -213,9 +212,6 @@ def flown(start: Array) -> GaitSchedule:
     )
 
 
-# -- plans --------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_the_hand_keeps_to_the_lines_within_the_tolerance(
     start: Array, flown: GaitSchedule
@@ -312,7 +308,7 @@ def test_paths_that_are_none_are_refused(path: Any, message: str) -> None:
         EndEffectorGoal.along("hand", path)
 
 
-# -- one place ----------------------------------------------------------------------------------
+# -- paths as goals -----------------------------------------------------------------------------
 
 
 def test_a_path_is_a_goal_with_waypoints() -> None:

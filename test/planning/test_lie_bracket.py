@@ -75,13 +75,6 @@ def note(schedule: GaitSchedule, name: str) -> Array:
     return np.array(schedule.notes[name], dtype=float)
 
 
-def knots(schedule: GaitSchedule) -> list[int]:
-    """Return the ticks of the predicted path."""
-    ticks = schedule.path.time / schedule.control_period
-    np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
-    return [int(k) for k in np.round(ticks)]
-
-
 def check_prediction(
     robot: SlidingRobot, state: RobotState, schedule: GaitSchedule, accuracy: float = 1e-9
 ) -> tuple[Array, Rotation]:
@@ -89,7 +82,8 @@ def check_prediction(
     start = Rotation.from_quat(state.quaternion)
     attitudes = robot.attitudes(schedule.positions, PERIOD, start)
     positions = robot.positions(schedule.positions, attitudes, state.position)
-    at = knots(schedule)
+    at = np.round(schedule.path.time / PERIOD).astype(int)
+    np.testing.assert_allclose(schedule.path.time / PERIOD, at, atol=1e-6)
     assert (at[0], at[-1]) == (0, schedule.ticks)
     np.testing.assert_allclose(schedule.path.position, positions[at], rtol=0, atol=accuracy)
     for quaternion, k in zip(schedule.path.quaternion, at, strict=True):
@@ -204,7 +198,7 @@ def test_a_goal_of_position_alone_is_a_slide_and_what_it_turned() -> None:
     np.testing.assert_allclose(schedule.positions[-1], [-0.8, 0.0, 0.0], atol=1e-12)
 
 
-# -- the gait of sliding masses: strokes and rates are kept, or the goal is refused --------------
+# -- strokes and rates are kept, or the goal is refused -----------------------------------------
 
 
 SLIDE = goal_at([0.1, 0.0, 0.0], Rotation.identity())
@@ -213,9 +207,6 @@ NEAR = goal_at([0.05, 0.02, -0.03], Rotation.from_rotvec([0.01, 0.02, 0.03]))
 
 def refusal_of(robot: SlidingRobot, state: RobotState, goal: Goal, **options: Any) -> str:
     return refusal_in(lambda: planner(robot, **options).plan(state, goal))
-
-
-# -- limits -----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -271,9 +262,6 @@ def test_a_slow_servo_stretches_the_slide() -> None:
     assert schedule.duration == pytest.approx(32.0, abs=PERIOD)
     position, attitude = check_prediction(robot, origin(), schedule)
     assert max(misses(SLIDE, position, attitude)) <= 1e-5
-
-
-# -- refusals ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -336,7 +324,7 @@ def test_servos_that_are_too_slow_or_have_no_room_are_refused(
     assert words in refusal_of(paper_robot(rate=rate), origin(), goal, **options)
 
 
-# -- the gait of sliding masses: paper 1's manoeuvre and its numbers -----------------------------
+# -- paper 1's manoeuvre and its numbers --------------------------------------------------------
 
 
 PAPER_GOAL = goal_at([0.3, -0.25, 0.1], Rotation.from_rotvec([0.5, -0.15, 0.1]))
@@ -421,9 +409,6 @@ def test_a_correction_asks_for_little(paper_method: GaitMethod, paper_gait: Gait
     path = correction.path
     left = misses(PAPER_GOAL, path.position[-1], Rotation.from_quat(path.quaternion[-1]))
     assert max(left) <= 1e-3
-
-
-# -- numbers that the method states ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rate", [0.04, 0.02])

@@ -182,7 +182,7 @@ def test_a_worker_plans_among_the_obstacles_that_it_is_given(*, obstacles: bool)
     assert clearance is None or (clearance.has_obstacles, clearance.distance) == (True, 0.01)
 
 
-# -- rows of distances along an interval: the points that they are taken at, and their -----------
+# -- rows of distances along an interval --------------------------------------------------------
 
 
 N = 2

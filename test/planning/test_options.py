@@ -248,7 +248,7 @@ def test_options_by_name_are_ros_parameters_of_texts() -> None:
     assert (named.type_.name, named.value) == ("STRING_ARRAY", ["a:0.5"])
 
 
-# -- limits of joints, constraints on paths, and initial guesses, as functions of numbers --------
+# -- limits of joints and constraints on paths --------------------------------------------------
 
 
 def test_limits_are_the_robots_narrowed_by_options(arm: SpaceRobot) -> None:
@@ -274,9 +274,6 @@ def test_limits_are_the_robots_narrowed_by_options(arm: SpaceRobot) -> None:
     ):
         with pytest.raises(ParameterError, match=re.escape(words)):
             MotionLimits.of(arm, OptimalOptions(**wrong), "area_loop")
-
-
-# -- constraints on paths -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def test_joints_that_never_follow_again_are_found_in_the_end(
     assert 10.0 + 4 * NEEDED * TICK < min(found.values()) < 10.0 + 20 * NEEDED * TICK
 
 
-# -- goals are planned with the joints that remain, and the plant, whose joints are --------------
+# -- goals are planned with the joints that remain ----------------------------------------------
 
 
 SERVICER, ARM, CHAIN = (

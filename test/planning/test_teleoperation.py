@@ -345,7 +345,7 @@ def test_joints_that_are_too_few_are_told() -> None:
     assert TwistFollower(seven, "link_7", ResolvedRateOptions(), TICK).turns
 
 
-# -- an executive whose schedules the robot's own controller follows: when they end, and ---------
+# -- an executive whose schedules the robot's own controller follows ----------------------------
 
 
 def flown(ticks: int = 8, **options: float) -> Loop:

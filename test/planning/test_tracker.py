@@ -403,7 +403,7 @@ def test_what_is_not_finite_is_refused(part: int) -> None:
         average.state()
 
 
-# -- aims of plans for end-effectors, stamps and bounds of a path, and the time that was ---------
+# -- aims of plans for end-effectors ------------------------------------------------------------
 
 
 SHAPE = np.array([0.2, -0.6, 1.3])
