@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from control.pinocchio_plant import PinocchioPlant
 from scipy.spatial.transform import Rotation
+from support.oracles import Array, PinocchioOracle
+from support.oracles.integrated import quaternion_rate
 
 from spacerobot_ros.control import (
     LAWS,
@@ -25,9 +26,10 @@ from spacerobot_ros.control import (
     PoseReference,
     Reference,
 )
+from spacerobot_ros.control.executive import ControlExecutive
+from spacerobot_ros.control.status import ControllerState, ControllerStatus
+from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
-
-Array = npt.NDArray[np.float64]
 
 URDF = Path(__file__).parents[2] / "urdf"
 END_EFFECTOR = "end_effector"
@@ -117,7 +119,84 @@ def servicer_start() -> ControlState:
     return ControlState.at_rest(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), SERVICER_SHAPE)
 
 
+# -- executives -------------------------------------------------------------------------------
+
+
+class Reporting:
+    """What an executive has reported so far."""
+
+    executive: ControlExecutive
+
+    @property
+    def statuses(self) -> list[ControllerStatus]:
+        return [each for each in self.executive.outputs if isinstance(each, ControllerStatus)]
+
+    @property
+    def events(self) -> list[Event]:
+        return [each for each in self.executive.outputs if isinstance(each, Event)]
+
+
+def refusals(statuses: Iterable[ControllerStatus]) -> list[ControllerStatus]:
+    return [each for each in statuses if each.state is ControllerState.REFUSED]
+
+
 # -- closed loop ------------------------------------------------------------------------------
+
+
+class PinocchioPlant(PinocchioOracle):
+    """Pinocchio's articulated-body algorithm under Runge-Kutta 4, always at the present state.
+
+    A wrench acts at the base link's origin, and efforts at the joints.
+    """
+
+    def __init__(self, robot: SpaceRobot, start: ControlState, longest_step: float = 0.01) -> None:
+        super().__init__(robot.description.urdf, robot.joint_names)
+        self.longest_step, self.state = longest_step, start
+
+    @property
+    def state(self) -> ControlState:
+        return self._state
+
+    @state.setter
+    def state(self, state: ControlState) -> None:
+        self._state = state
+        self._show(self._stacked())
+
+    def step(self, actuation: Actuation, duration: float) -> ControlState:
+        """Advance under held actuation; return the new state."""
+        count = max(1, round(duration / self.longest_step))
+        h, n, x = duration / count, self.n, self._stacked()
+        for _ in range(count):
+            k1 = self._rate(x, actuation)
+            k2 = self._rate(x + h / 2 * k1, actuation)
+            k3 = self._rate(x + h / 2 * k2, actuation)
+            k4 = self._rate(x + h * k3, actuation)
+            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            x[3:7] /= np.linalg.norm(x[3:7])
+        r, quaternion, q, v, omega, qdot = np.split(x, [3, 7, 7 + n, 10 + n, 13 + n])
+        self.state = ControlState(r, quaternion, v, omega, q, qdot)
+        return self.state
+
+    def joint_accelerations(self, actuation: Actuation) -> Array:
+        udot = self.own_acceleration(actuation.wrench_B, actuation.tau)
+        return np.asarray(self.selection[3:] @ udot)
+
+    def _stacked(self) -> Array:
+        s = self.state
+        return np.concatenate([s.r_WB, s.quaternion_WB, s.q, s.v_WB_B, s.omega_WB_B, s.qdot])
+
+    def _show(self, x: Array) -> None:
+        twist, qdot = np.split(x[7 + self.n :], [6])
+        self.place(x[7 : 7 + self.n], x[3:7] / np.linalg.norm(x[3:7]), x[:3])
+        self.move(self.base_velocities(twist) + self.joint_velocities(qdot))
+
+    def _rate(self, x: Array, actuation: Actuation) -> Array:
+        self._show(x)
+        v, omega, qdot = np.split(x[7 + self.n :], [3, 6])
+        udot = self.own_acceleration(actuation.wrench_B, actuation.tau)
+        velocity = self.data.oMi[1].rotation @ v
+        turn = quaternion_rate(x[3:7], omega)
+        return np.concatenate([velocity, turn, qdot, udot[:6], self.selection[3:] @ udot])
 
 
 def law_of(name: str, robot: SpaceRobot, gains: Gains, **options: float) -> ControlLaw:
@@ -155,7 +234,3 @@ def fly(
             flight.statuses.append(law.status)
         plant.step(actuation, 1 / rate)
     return flight
-
-
-def plant_of(robot: SpaceRobot, start: ControlState, longest_step: float = 0.01) -> PinocchioPlant:
-    return PinocchioPlant(robot.description.urdf, robot.joint_names, start, longest_step)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -24,46 +23,40 @@ from spacerobot_ros.model import SpaceRobot
 COMMAND = Actuation(np.array([3.0, 4.0, 12.0, -1.0, 2.0, 2.0]), np.array([5.0, -7.0]))
 
 
-def test_force_and_torque_keep_their_directions() -> None:
-    limits = ActuatorLimits(6.5, 1.5, np.array([6.0, 6.0]))
-    saturated = limits.apply(COMMAND)
-    wrench = saturated.realised.wrench_B
-    np.testing.assert_allclose(wrench[:3], COMMAND.wrench_B[:3] / 2)
-    np.testing.assert_allclose(wrench[3:], COMMAND.wrench_B[3:] / 2)
-    np.testing.assert_array_equal(saturated.realised.tau, [5.0, -6.0])
-    assert saturated.limited
-    np.testing.assert_allclose(saturated.excess.wrench_B, COMMAND.wrench_B - wrench)
-    np.testing.assert_array_equal(saturated.excess.tau, [0.0, -1.0])
-
-
-def test_force_and_torque_are_limited_apart() -> None:
-    saturated = ActuatorLimits(1.3, np.inf, np.full(2, np.inf)).apply(COMMAND)
-    np.testing.assert_allclose(saturated.realised.wrench_B[:3], COMMAND.wrench_B[:3] / 10)
-    np.testing.assert_array_equal(saturated.realised.wrench_B[3:], COMMAND.wrench_B[3:])
-    np.testing.assert_array_equal(saturated.realised.tau, COMMAND.tau)
-
-
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_efforts_of_all_joints_beyond_their_limits_are_lowered(sign: float) -> None:
-    limits = ActuatorLimits(np.inf, np.inf, np.array([2.0, 3.0]))
-    saturated = limits.apply(Actuation(np.zeros(6), sign * np.array([2.5, 7.0])))
-    np.testing.assert_array_equal(saturated.realised.tau, [sign * 2.0, sign * 3.0])
-    np.testing.assert_array_equal(saturated.excess.tau, [sign * 0.5, sign * 4.0])
+@pytest.mark.parametrize(
+    ("limits", "efforts", "force", "torque", "tau"),
+    [
+        # Force and torque keep their directions.
+        ((6.5, 1.5), (6.0, 6.0), 1 / 2, 1 / 2, (5.0, -6.0)),
+        ((1.3, np.inf), (np.inf, np.inf), 1 / 10, 1.0, (5.0, -7.0)),
+        ((np.inf, np.inf), (2.0, 3.0), 1.0, 1.0, (2.0, -3.0)),
+        ((13.0, 3.0), (7.0, 7.0), 1.0, 1.0, (5.0, -7.0)),
+        ((np.inf, np.inf), (np.inf, np.inf), 1.0, 1.0, (5.0, -7.0)),
+        ((0.0, 0.0), (0.0, 0.0), 0.0, 0.0, (0.0, 0.0)),
+    ],
+)
+def test_what_is_beyond_a_limit_is_cut_off(
+    limits: tuple[float, float],
+    efforts: tuple[float, float],
+    force: float,
+    torque: float,
+    tau: tuple[float, float],
+    sign: float,
+) -> None:
+    """``force`` and ``torque`` are the shares of the command that the limits leave."""
+    command = Actuation(sign * COMMAND.wrench_B, sign * COMMAND.tau)
+    saturated = ActuatorLimits(*limits, np.array(efforts)).apply(command)
+    realised, excess = saturated.realised, saturated.excess
+    shares = np.repeat([force, torque], 3)
+    np.testing.assert_allclose(realised.wrench_B, shares * command.wrench_B, rtol=1e-15)
+    np.testing.assert_array_equal(realised.tau, sign * np.array(tau))
+    np.testing.assert_allclose(excess.wrench_B, command.wrench_B - realised.wrench_B)
+    np.testing.assert_array_equal(excess.tau, command.tau - realised.tau)
+    assert saturated.limited == ((force, torque, tau) != (1.0, 1.0, (5.0, -7.0)))
 
 
-@pytest.mark.parametrize("limits", [(13.0, 3.0, 7.0), (np.inf, np.inf, np.inf)])
-def test_what_is_possible_passes(limits: tuple[float, float, float]) -> None:
-    force, torque, effort = limits
-    saturated = ActuatorLimits(force, torque, np.full(2, effort)).apply(COMMAND)
-    np.testing.assert_array_equal(saturated.realised.wrench_B, COMMAND.wrench_B)
-    np.testing.assert_array_equal(saturated.realised.tau, COMMAND.tau)
-    assert not saturated.limited
-
-
-def test_without_thrusters_or_motors() -> None:
-    saturated = ActuatorLimits(0.0, 0.0, np.zeros(2)).apply(COMMAND)
-    np.testing.assert_array_equal(saturated.realised.wrench_B, 0.0)
-    np.testing.assert_array_equal(saturated.realised.tau, 0.0)
+def test_nothing_is_limited_at_rest_without_thrusters_or_motors() -> None:
     still = ActuatorLimits(0.0, 0.0, np.zeros(2)).apply(Actuation(np.zeros(6), np.zeros(2)))
     assert not still.limited
 
@@ -71,16 +64,8 @@ def test_without_thrusters_or_motors() -> None:
 # -- references that small thrusters can follow, against Pinocchio's rigid-body inertia ----------
 
 
-URDF = Path(__file__).parents[2] / "urdf" / "servicer.urdf"
-
-
-@pytest.fixture(scope="module")
-def robot() -> SpaceRobot:
-    return SpaceRobot.from_file(URDF)
-
-
-def test_strong_thrusters_and_none_at_all_leave_the_limits_as_they_are(robot: SpaceRobot) -> None:
-    motion = MotionLimits()
+def test_strong_thrusters_and_none_at_all_leave_the_limits_as_they_are() -> None:
+    motion, robot = MotionLimits(), load("servicer")
     q = np.zeros(robot.n)
     for force, torque in ((np.inf, np.inf), (1e9, 1e9), (0.0, 0.0)):
         limits = ActuatorLimits(force, torque, robot.effort_limit)

@@ -8,6 +8,7 @@ from typing import Any
 import coal
 import numpy as np
 import pytest
+from control.flights import Reporting, refusals
 from scipy.spatial.transform import Rotation
 from support.sentences import assert_one_sentence
 
@@ -130,14 +131,13 @@ def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:
     ):
         flight = docked(goal, **settings)
         states = [each for _, each in flight.statuses if isinstance(each, ControllerStatus)]
-        refusals = [each for each in states if each.state is ControllerState.REFUSED]
-        assert len(refusals) == 1
-        assert words in refusals[0].message
+        (refused,) = refusals(states)
+        assert words in refused.message
         assert flight.outcome is Outcome.REFUSED
         assert np.linalg.norm(flight.pose[-1, :3]) < 1e-6
 
 
-class Follower:
+class Follower(Reporting):
     """A cube that follows its reference exactly, answered by an executive."""
 
     def __init__(self, **config: Any) -> None:
@@ -166,10 +166,6 @@ class Follower:
         result = self.executive.command(self.time, measured, none, none)
         self.executive.evaluate(self.time, result)
         self.time += 0.02
-
-    @property
-    def statuses(self) -> list[ControllerStatus]:
-        return [each for each in self.executive.outputs if isinstance(each, ControllerStatus)]
 
     def pursue(self, goal: Goal, name: str = "") -> None:
         self.executive.submit("base", IdentifiedGoal(goal, name))
@@ -405,5 +401,4 @@ def test_a_start_within_an_obstacle_is_refused() -> None:
     rig = Follower()
     rig.executive.use_obstacles(ball(PLACE + np.array([0.2, 0.0, 0.0])))
     rig.pursue(Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0, 0]))
-    refused = [each.message for each in rig.statuses if each.state is ControllerState.REFUSED]
-    assert_one_sentence(refused[-1], "obstacle 'ball' touch at the start")
+    assert_one_sentence(refusals(rig.statuses)[-1].message, "obstacle 'ball' touch at the start")

@@ -14,16 +14,15 @@ from control.flights import (
     SERVICER_GAINS,
     SERVICER_GOAL,
     SERVICER_PACE,
+    PinocchioPlant,
     fly,
     law_of,
     load,
     planar_start,
-    plant_of,
     random_state,
     scaled_robot,
     servicer_start,
 )
-from control.pinocchio_plant import PinocchioPlant
 from scipy.spatial.transform import Rotation
 from support.executive_loop import planar_manipulator
 from support.oracles import PinocchioOracle
@@ -54,7 +53,7 @@ def assert_arrived(plant: PinocchioPlant) -> None:
         (END_EFFECTOR, SERVICER_GOAL.end_effector),
     ):
         assert isinstance(goal, PoseReference)
-        position, attitude = plant.frame(link)
+        attitude, position = plant.frame_W(link)
         turn = Rotation.from_quat(goal.quaternion) * Rotation.from_matrix(attitude).inv()
         assert np.linalg.norm(position - goal.position) < MILLIMETRE, link
         assert turn.magnitude() < TENTH_OF_A_DEGREE, link
@@ -82,7 +81,7 @@ def test_both_poses_are_reached_with_wrong_masses(
     present = Reference.present(load("servicer"), servicer_start(), END_EFFECTOR)
     reference = PROFILES[profile](present, SERVICER_GOAL, SERVICER_PACE)
     settling = 12.0 if profile == "step" else 5.0
-    plant = plant_of(load("servicer"), servicer_start())
+    plant = PinocchioPlant(load("servicer"), servicer_start())
     fly(plant, law, reference.at, reference.duration + settling, rate=50.0)
     assert_arrived(plant)
 
@@ -115,7 +114,7 @@ def test_true_model_follows_the_plant(seed: int) -> None:
     rng = np.random.default_rng(seed)
     robot = SpaceRobot.from_urdf(random_robot_urdf(rng, 3 + seed))
     start = random_state(rng, robot.n)
-    plant = plant_of(robot, start, longest_step=1e-3)
+    plant = PinocchioPlant(robot, start, longest_step=1e-3)
     estimator = DeadReckoning(robot, 0.01, integration_step=1e-3)
     assert estimator.elapsed == 0.0
     estimator.reset(start)
@@ -134,7 +133,7 @@ def fly_blind(believed: SpaceRobot, *, joints: bool) -> float:
     """Fly the paper's manoeuvre without inertial measurements; return the largest error, 12 s."""
     robot = load("planar_manipulator")
     law = law_of("model_based", believed, PLANAR_GAINS)
-    plant = plant_of(robot, planar_start())
+    plant = PinocchioPlant(robot, planar_start())
     estimator = DeadReckoning(believed, 0.01)
     estimator.reset(plant.state)
     estimate = plant.state

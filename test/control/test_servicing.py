@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from control.flights import refusals
 from scipy.spatial.transform import Rotation
 from support.executive_loop import (
     AIM,
@@ -25,7 +26,6 @@ from support.thrust_flights import tumbled
 
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.servicing import MeasuredTarget, Task
-from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model.description import Inertia
@@ -58,6 +58,7 @@ SETTINGS: dict[str, Any] = {
     "motion.acceleration": 0.2,
     "max_torque": 0.5,
 }
+PLANNED = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
 
 
 class Meeting(ExecutiveLoop):
@@ -217,37 +218,51 @@ def test_without_a_target_an_approach_is_refused_and_the_robot_holds() -> None:
     assert loop.state == "tracking"
     assert loop.status.message == "Approaching the target."
     loop.answer(2)
-    refused = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
+    (refused,) = refusals(loop.statuses)
     assert_one_sentence(
-        refused[0].message, "The approach is refused: the target is unknown", "'target/odom'"
+        refused.message, "The approach is refused: the target is unknown", "'target/odom'"
     )
-    assert refused[0].goal_id == "5"
+    assert refused.goal_id == "5"
     loop.answer(3)
     assert loop.state == "holding"
     np.testing.assert_allclose(loop.answer()[0], 0.0, atol=1e-9)
 
 
-def test_a_target_without_the_grapple_frame_is_refused_at_once() -> None:
-    loop = Meeting()
-    loop.executive.servicing.target.describe(BLOCK, "ring")
+@pytest.mark.parametrize(
+    ("settings", "frame", "x", "mentions"),
+    [
+        ({}, "ring", NEAR[0], ("no link 'ring'", "'target.grapple_frame'")),
+        ({}, "handle", 5.0, ("The approach is refused: the target is out of reach",)),
+        (
+            {"base_outputs": "x y rz"},
+            "handle",
+            NEAR[0],
+            ("'transposed_jacobian' does not control an end-effector",),
+        ),
+        # The start is beside the corridor of the target.
+        (
+            {**PLANNED, "target.corridor_length": 3.0, "target.corridor_angle": 0.2},
+            "handle",
+            NEAR[0],
+            ("refused: at the start", "corridor_angle = 0.2 rad", "corridor_length = 3 m"),
+        ),
+    ],
+)
+def test_a_target_that_cannot_be_met_is_refused(
+    settings: dict[str, Any], frame: str, x: float, mentions: tuple[str, ...]
+) -> None:
+    loop = Meeting(**settings)
+    loop.executive.plan_at_once()
+    loop.executive.servicing.target.describe(BLOCK, frame)
+    loop.block[0] = x
     loop.aim(base=goal_at(AIM, "5"))
-    loop.answer()
-    (refused,) = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
-    assert_one_sentence(refused.message, "no link 'ring'", "'target.grapple_frame'")
-
-
-def test_a_target_that_cannot_be_met_is_refused_with_the_sentence_of_the_plan() -> None:
-    loop = Meeting()
-    loop.block = np.array([5.0, 0.0, 0.0])
-    loop.aim(base=goal_at(AIM, "5"))
-    loop.answer()
-    (refused,) = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
-    assert_one_sentence(refused.message, "The approach is refused: the target is out of reach")
+    loop.answer(2)
+    (refused,) = refusals(loop.statuses)
+    assert_one_sentence(refused.message, *mentions)
 
 
 def test_base_and_arm_are_planned_once_the_rates_of_a_noisy_target_are_averaged() -> None:
-    planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
-    loop = Meeting(**planned, **{"target.detumble": "none", "target.horizon": 9.0})
+    loop = Meeting(**PLANNED, **{"target.detumble": "none", "target.horizon": 9.0})
     loop.executive.plan_at_once()
     loop.aim(base=goal_at(AIM, "5"))
     loop.seen, rng, pose = False, np.random.default_rng(2), np.concatenate([NEAR, UPRIGHT])
@@ -257,25 +272,6 @@ def test_base_and_arm_are_planned_once_the_rates_of_a_noisy_target_are_averaged(
         loop.answer()
     assert loop.kinds() == ["goal_accepted", "approach_started"]
     assert float(loop.events[-1].about["starts_s"]) == pytest.approx(100 * PERIOD)
-
-
-def test_a_start_beside_the_corridor_of_a_target_is_refused() -> None:
-    planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
-    loop = Meeting(**planned, **{"target.corridor_length": 3.0, "target.corridor_angle": 0.2})
-    loop.executive.plan_at_once()
-    loop.aim(base=goal_at(AIM, "5"))
-    loop.answer(2)
-    (refused,) = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
-    values = "corridor_angle = 0.2 rad", "corridor_length = 3 m"
-    assert_one_sentence(refused.message, "The approach is refused: at the start", *values)
-
-
-def test_a_law_without_an_end_effector_approaches_nothing() -> None:
-    loop = Meeting(base_outputs="x y rz")
-    loop.aim(base=goal_at(AIM, "5"))
-    loop.answer()
-    (refused,) = [each for each in loop.statuses if each.state is ControllerState.REFUSED]
-    assert_one_sentence(refused.message, "'transposed_jacobian' does not control an end-effector")
 
 
 def test_a_target_that_is_not_seen_any_more_is_lost() -> None:
@@ -324,8 +320,7 @@ def test_an_approach_goes_on_if_no_plan_for_a_deviation_at_contact_is_found() ->
 def test_base_and_arm_are_planned_to_a_target_and_anew_if_it_strays() -> None:
     # The robot of the test stays where it is.
     any_error = {"error_margin.position": 0.0, "error_margin.attitude": 0.0}
-    planned = {"profile": "planned", "max_force": 4.0, "plan.clearance": 0.0}
-    loop = Meeting(**planned, **any_error, **{"target.detumble": "none", "target.horizon": 9.0})
+    loop = Meeting(**PLANNED, **any_error, **{"target.detumble": "none", "target.horizon": 9.0})
     loop.executive.plan_at_once()
     loop.aim(base=goal_at(AIM, "5"))
     loop.answer(3)
@@ -368,17 +363,6 @@ def test_detumbling_that_lasts_too_long_is_given_up() -> None:
     loop.answer()
     assert loop.state == "aborted"
     assert_one_sentence(loop.status.message, "not at rest after 0.05 s", "0.3 rad/s")
-
-
-def test_drift_is_no_rest_where_thrusters_could_end_it() -> None:
-    loop = Meeting(tasks="detumble")
-    loop.velocity = np.array([0.003, 0.0, 0.0])
-    loop.aim(base=goal_at(AIM, "5"))
-    loop.answer(10)
-    assert loop.status.task == "detumble"
-    loop.velocity = np.array([0.0015, 0.0, 0.0])
-    loop.answer(5)
-    assert loop.status.task == ""
 
 
 def test_a_task_alone_is_reached_and_an_abort_ends_it() -> None:
@@ -483,13 +467,6 @@ def test_a_noisy_target_is_predicted_from_the_average_of_its_momenta() -> None:
     assert np.linalg.norm(place - r[3199]) > 0.02
 
 
-def test_a_status_tells_its_task() -> None:
-    status = ControllerStatus(ControllerState.TRACKING, "x", "7", None, "approach")
-    assert status.to_values() == {"state": "tracking", "goal_id": "7", "task": "approach"}
-    assert ControllerStatus.from_values(status.to_values(), "x") == status
-    assert "task" not in ControllerStatus(ControllerState.TRACKING).to_values()
-
-
 @pytest.mark.parametrize("limit", [0.002, 0.0])
 def test_the_grasp_takes_no_more_than_its_torque_limit(limit: float) -> None:
     loop = Meeting(**{"tasks": "detumble", "detumble.grapple_torque_limit": limit})
@@ -502,6 +479,17 @@ def test_the_grasp_takes_no_more_than_its_torque_limit(limit: float) -> None:
     took = float(loop.events[-1].about["grasp_torque_Nm"])
     # With the whole demand the grasp takes more; joints at rest need less.
     assert took > 0.05 if limit == 0.0 else took < 0.05
+
+
+def test_drift_is_no_rest_where_thrusters_could_end_it() -> None:
+    loop = Meeting(tasks="detumble")
+    loop.velocity = np.array([0.003, 0.0, 0.0])
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer(10)
+    assert loop.status.task == "detumble"
+    loop.velocity = np.array([0.0015, 0.0, 0.0])
+    loop.answer(5)
+    assert loop.status.task == ""
 
 
 def test_rest_is_what_the_parameters_say() -> None:

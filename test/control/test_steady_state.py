@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -27,7 +27,6 @@ from support.sentences import assert_one_sentence
 from spacerobot_ros.control import LAWS, ControlLaw, ControlState, GainPair, Gains, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
-from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import fly
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
@@ -156,26 +155,6 @@ def test_a_limited_command_lets_integrals_shrink_only() -> None:
     law.integrate_error(0.5, limited=True)
     expected = ERRORS * [1.0, 2.0, 0.0, 0.25, 0.5]
     np.testing.assert_allclose(integral_of(law), expected, atol=1e-12)
-
-
-class _Spring(ControlLaw):
-    """A law that pulls the base, as somebody else may write it."""
-
-    name = "spring"
-    gain_units = ("N/m", "N s/m")
-
-    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
-        z1 = self.outputs
-        pull = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
-        return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull}
-
-
-def test_a_law_without_an_integral_term_says_so() -> None:
-    robot = load("planar_manipulator")
-    law = _Spring(robot, _Spring.default_outputs(robot, END_EFFECTOR), PLANAR_GAINS)
-    with pytest.raises(ParameterError) as refused:
-        law.set_gains(Gains.uniform(1.0, 1.0, 0.1))
-    assert str(refused.value) == ("The law 'spring' has no integral term: its gains ki must be 0.")
 
 
 def test_a_new_goal_and_a_reset_begin_the_integral_anew() -> None:
@@ -335,15 +314,6 @@ def test_a_group_with_gains_keeps_them() -> None:
     np.testing.assert_allclose(loop.answer()[0][:3], STEP_KP * AIM, rtol=1e-9, atol=1e-9)
 
 
-def test_a_law_without_automatic_gains_says_which_it_needs() -> None:
-    robot = load("planar_manipulator")
-    outputs = _Spring.default_outputs(robot, "end_effector")
-    with pytest.raises(ParameterError) as refused:
-        _Spring(robot, outputs, replace(Gains.uniform(1.0, 2.0), base_attitude=GainPair(1.0)))
-    assert_one_sentence(str(refused.value), "The law 'spring' has no automatic gains")
-    _Spring(robot, outputs, Gains.uniform(1.0, 2.0))
-
-
 def test_a_robot_without_joints_is_controlled() -> None:
     urdf = """<robot name="cube"><link name="hull"><inertial><mass value="16"/>
       <inertia ixx="0.18" iyy="0.18" izz="0.18" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -402,10 +372,7 @@ def test_a_robot_that_does_not_move_is_stalled_until_it_moves() -> None:
         loop.answer()
     assert loop.state == "tracking"
     assert loop.status.message.startswith("Flying to the goal; ")
-
-
-def test_a_new_goal_is_not_stalled_from_the_beginning() -> None:
-    loop = aimed()
+    # A new goal is not stalled from the beginning.
     wait_for_stall(loop)
     move(loop, -AIM, "8")
     loop.answer()
@@ -413,55 +380,72 @@ def test_a_new_goal_is_not_stalled_from_the_beginning() -> None:
     wait_for_stall(loop)
 
 
-def test_within_the_tolerances_nothing_is_stalled() -> None:
-    loop = aimed(position_tolerance=1.0, settle_time=1000.0)
-    loop.answer(40 * SECONDS)
-    assert loop.state == "tracking"
-
-
-def test_errors_that_shrink_slowly_are_no_stall() -> None:
-    loop = aimed()
-    for tick in range(60 * SECONDS):
-        loop.place = (1 - np.exp(-tick * PERIOD / 30.0)) * AIM
+@pytest.mark.parametrize(
+    ("settings", "seconds", "share"),
+    [
+        # Within the tolerances.
+        ({"position_tolerance": 1.0, "settle_time": 1000.0}, 40, lambda t: 0.0),
+        # Errors shrink slowly.
+        ({}, 60, lambda t: 1 - np.exp(-t / 30.0)),
+        # With 1 mm/s^2, it makes 2 % of its way in 4.7 s at first, and more and more.
+        ({"max_force": 0.05}, 25, lambda t: 0.5 * 0.001 * t**2 / np.linalg.norm(AIM)),
+    ],
+    ids=["near", "slow", "slow at first"],
+)
+def test_a_robot_that_comes_nearer_is_not_stalled(
+    settings: dict[str, Any], seconds: int, share: Callable[[float], float]
+) -> None:
+    loop = aimed(**settings)
+    for tick in range(seconds * SECONDS):
+        loop.place = share(tick * PERIOD) * AIM
         loop.answer()
         assert loop.state == "tracking"
 
 
-def test_a_robot_that_starts_slowly_is_not_stalled() -> None:
-    """With 1 mm/s^2, it makes 2 % of its way in 4.7 s at first, and more and more."""
-    loop = aimed(max_force=0.05)
-    for tick in range(25 * SECONDS):
-        loop.place = 0.5 * 0.001 * (tick * PERIOD) ** 2 * AIM / np.linalg.norm(AIM)
-        loop.answer()
-        assert loop.state == "tracking"
-
-
-def test_limits_that_hold_the_robot_back_are_named() -> None:
-    loop = aimed(max_force=1.0)
-    wait_for_stall(loop)
-    assert loop.status.message.endswith(": the thruster force is at its limit.")
+def test_limits_that_hold_the_robot_back_are_named_and_so_in_a_failure() -> None:
     loop = ExecutiveLoop(max_torque=0.01, base_outputs="x y rz", end_effector_outputs="")
     turned = np.array([0.0, 0.0, np.sin(0.1), np.cos(0.1)])
     loop.aim(base=IdentifiedGoal(Goal(np.zeros(3), turned), "turned"))
     loop.answer()
     wait_for_stall(loop)
     assert loop.status.message.endswith(": the base torque is at its limit.")
-
-
-def test_a_failure_names_the_cause() -> None:
     loop = aimed(max_force=1.0, time_limit=40.0)
     wait_for_stall(loop)
+    assert loop.status.message.endswith(": the thruster force is at its limit.")
     loop.answer(41 * SECONDS)
     assert loop.state == "failed"
     message = "The goal is not reached in time, as the thruster force is at its limit: 0.559"
     assert_one_sentence(loop.status.message, message)
 
 
+def following(way: float, rotvec: float = 0.0, **settings: Any) -> ExecutiveLoop:
+    """Return a robot on its way along x, with its end-effector, perhaps turning about z."""
+    loop = ExecutiveLoop(profile="quintic", **settings)
+    loop.answer()
+    turned = np.array([0.0, 0.0, np.sin(rotvec / 2), np.cos(rotvec / 2)])
+    far = np.array([way, 0.0, 0.0])
+    goals = {"base": IdentifiedGoal(Goal(far, turned), "far")}
+    if not rotvec:
+        goals["end_effector"] = goal_at(TIP + far, "far")
+    loop.aim(**goals)
+    loop.answer()
+    return loop
+
+
+def follow(loop: ExecutiveLoop, error: Callable[[float], float], delay: float, end: float) -> None:
+    """Show a robot that is so late and off up to a share of the motion; it is never stalled."""
+    profile = loop.executive.controller.profile
+    assert profile is not None
+    while (time := loop.tick * PERIOD) < end * profile.duration:
+        base = profile.at(time - delay).base
+        assert base is not None
+        loop.place = base.position - [error(time), 0.0, 0.0]
+        loop.answer()
+        assert loop.state == "tracking", (time, loop.status.message)
+
+
 def test_a_robot_that_stays_behind_its_reference_is_stalled_on_the_way() -> None:
-    loop = ExecutiveLoop(profile="quintic")
-    loop.answer()
-    move(loop, np.array([10.0, 0.0, 0.0]), "far")
-    loop.answer()
+    loop = following(10.0)
     ends = loop.executive.controller.reference_ends
     assert ends is not None
     assert wait_for_stall(loop, ends) < 0.8 * ends
@@ -469,51 +453,21 @@ def test_a_robot_that_stays_behind_its_reference_is_stalled_on_the_way() -> None
 
 
 def test_a_robot_that_is_behind_and_follows_is_not_stalled_on_the_way() -> None:
-    loop = ExecutiveLoop(profile="quintic")
-    loop.answer()
-    move(loop, np.array([2.0, 0.0, 0.0]), "far")
-    loop.answer()
-    controller = loop.executive.controller
-    while not controller.reference_at_rest(loop.tick * PERIOD):
-        late = controller.profile.at(loop.tick * PERIOD - 4.0).base if controller.profile else None
-        assert late is not None
-        loop.place = late.position
-        loop.answer()
-        assert loop.state == "tracking"
+    follow(following(2.0), lambda time: 0.0, delay=4.0, end=1.0)
 
 
 def test_a_part_within_its_tolerance_lags_behind_no_reference() -> None:
     """The robot follows 2 m some seconds late, and need not turn by half of 0.015 rad yet."""
-    loop = ExecutiveLoop(profile="quintic", attitude_tolerance=0.014)
-    loop.answer()
-    turned = np.array([0.0, 0.0, np.sin(0.0075), np.cos(0.0075)])
-    far = Goal(np.array([2.0, 0.0, 0.0]), turned)
-    loop.aim(base=IdentifiedGoal(far, "far"))
-    loop.answer()
-    controller = loop.executive.controller
-    assert controller.reference_ends is not None
-    while loop.tick * PERIOD < 0.8 * controller.reference_ends:
-        late = controller.profile.at(loop.tick * PERIOD - 2.0).base if controller.profile else None
-        assert late is not None
-        loop.place = late.position
-        loop.answer()
-        assert loop.state == "tracking", loop.status.message
+    loop = following(2.0, rotvec=0.015, attitude_tolerance=0.014)
+    follow(loop, lambda time: 0.0, delay=2.0, end=0.8)
 
 
 @pytest.mark.parametrize("decay", [0.02, 0.2])
 def test_errors_that_have_begun_to_shrink_on_the_way_are_no_stall(decay: float) -> None:
     """A knock throws the robot back by 65 % of its way at 23 s; then it catches up."""
-    loop = ExecutiveLoop(profile="quintic")
-    loop.answer()
-    move(loop, np.array([2.0, 0.0, 0.0]), "far")
-    loop.answer()
-    controller = loop.executive.controller
-    assert controller.profile is not None
-    for time in np.arange(0.0, controller.profile.duration, PERIOD):
-        base = controller.profile.at(time).base
-        assert base is not None
+
+    def error(time: float) -> float:
         after = time - 23.0
-        error = 1.3 * np.exp(-(after**2) if after < 0.0 else -decay * after)
-        loop.place = base.position - [error, 0.0, 0.0]
-        loop.answer()
-        assert loop.state == "tracking", (time, loop.status.message)
+        return float(1.3 * np.exp(-(after**2) if after < 0.0 else -decay * after))
+
+    follow(following(2.0), error, delay=0.0, end=1.0)

@@ -17,9 +17,10 @@ from spacerobot_ros.model.grasp import BodyMotion
 IDENTITY = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
-def _quaternion_rate(quaternion: Array, omega: Array) -> Array:
-    x, w = quaternion[:3], quaternion[3]
-    return 0.5 * np.append(w * omega + np.cross(x, omega), -x @ omega)
+def quaternion_rate(quaternion: Array, omega: Array) -> Array:
+    """Return the rate (4,) of a quaternion (x, y, z, w) at an angular velocity in its body."""
+    x, y, z, w = quaternion
+    return 0.5 * np.array([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]]) @ omega
 
 
 def carried(
@@ -35,7 +36,7 @@ def carried(
     def rate(t: float, y: Array) -> Array:
         turn = Rotation.from_quat(y[3:])
         twist = oracle.base_twist(q + t * qdot, qdot, turn.as_quat(), momenta)
-        return np.append(turn.apply(twist[:3]), _quaternion_rate(y[3:], twist[3:]))
+        return np.append(turn.apply(twist[:3]), quaternion_rate(y[3:], twist[3:]))
 
     return _end(rate, pose, np.array([duration]))[0]
 
@@ -55,7 +56,7 @@ def tumbled_body(
     def rate(t: float, y: Array) -> Array:
         omega = y[4:]
         moment = torque(t, Rotation.from_quat(y[:4])) - np.cross(omega, J @ omega)
-        return np.append(_quaternion_rate(y[:4], omega), np.linalg.solve(J, moment))
+        return np.append(quaternion_rate(y[:4], omega), np.linalg.solve(J, moment))
 
     quaternion = Rotation.from_matrix(start.R_WT).as_quat()
     found = _end(rate, np.append(quaternion, start.R_WT.T @ start.omega), np.asarray(times))
