@@ -26,7 +26,6 @@ from spacerobot_ros.simulation.actuators import (
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
 from spacerobot_ros.simulation.faults import (
     FAULT_KINDS,
-    Fault,
     FaultTargets,
     Timeline,
     parse_fault,
@@ -394,9 +393,3 @@ def test_nozzles_stay_open_closed_and_weak() -> None:
     plant.inject("clear")
     plant.step(np.zeros(plant.robot.n), np.zeros(6))
     assert thrusters.thrust[opened] == 0.0
-
-
-def test_a_fault_begins_at_the_start_and_never_ends_unless_it_says_so() -> None:
-    fault = Fault("joint_stuck", "elbow_pitch")
-    assert (fault.value, fault.start, fault.end) == (0.0, 0.0, np.inf)
-    assert str(fault) == "joint_stuck elbow_pitch at 0"

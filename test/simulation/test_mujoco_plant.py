@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulation.test_capture import SPATIAL, capturing_of, plant_of, relative_change, total_momentum
+from simulation.test_capture import SPATIAL, capturing_of, relative_change, total_momentum
 from support.oracles import Array
 
 from spacerobot_ros.errors import (
@@ -70,6 +70,17 @@ def plant(model: SpaceRobot | None = None, **values: Any) -> PlantWithFaults:
     return build_plant(model or SpaceRobot.from_file(robot_file(config.robot)), config)
 
 
+def pair(model: SpaceRobot | None = None, **values: Any) -> tuple[PlantWithFaults, PlantWithFaults]:
+    """Return a plant in MuJoCo and the exact one."""
+    return plant(model, **values), plant(model, **{**values, "engine": "exact"})
+
+
+def step_both(plants: tuple[PlantWithFaults, PlantWithFaults], ticks: int, *commands: Any) -> None:
+    for _ in range(ticks):
+        for flown in plants:
+            flown.step(*map(np.array, commands))
+
+
 def state_of(flown: PlantWithFaults) -> Array:
     return np.concatenate([flown.pose, flown.twist, flown.q, flown.qdot])
 
@@ -78,8 +89,7 @@ def state_of(flown: PlantWithFaults) -> Array:
 def test_efforts_and_wrenches_move_it_as_the_exact_plant(step: float) -> None:
     """In free motion, at momenta that are not zero, with the ledger of the thrust."""
     values = {**ARM, "actuation": "effort", "initial_joint_velocities": [0.2, -0.1, 0.3]}
-    ours = plant(**values, integration_step=step)
-    exact = plant(**values, engine="exact", integration_step=step)
+    ours, exact = pair(**values, integration_step=step)
     rng = np.random.default_rng(5)
     for _ in range(40):
         effort, wrench = rng.normal(size=3) * 4.0, rng.normal(size=6) * [9, 9, 9, 2, 2, 2]
@@ -94,7 +104,7 @@ def test_efforts_and_wrenches_move_it_as_the_exact_plant(step: float) -> None:
 
 def test_servos_move_it_as_the_exact_plant() -> None:
     """Rates jump within a step of 1 ms in place of at once; efforts are those of the motion."""
-    ours, exact = plant(**ARM), plant(**ARM, engine="exact")
+    ours, exact = pair(**ARM)
     for tick in range(40):
         rates = 0.3 * np.sin(0.15 * tick + np.array([0.0, 1.0, 2.5]))
         for flown in (ours, exact):
@@ -132,11 +142,8 @@ def test_links_push_each_other_where_the_exact_plant_goes_through() -> None:
     """The ball runs at the block, which it takes along; a servo stalls at its limit of effort."""
     robot = pucks()
     start = {"initial_joint_positions": [-0.35, 0.1], "tick_rate": 50.0}
-    free = plant(robot, **start, engine="exact", actuation="effort")
-    ours = plant(robot, **start, actuation="effort")
-    for _ in range(70):
-        for flown in (free, ours):
-            flown.step(np.array([2.0, 0.0]), np.zeros(6))
+    ours, free = both = pair(robot, **start, actuation="effort")
+    step_both(both, 70, [2.0, 0.0], np.zeros(6))
     # Ball and block overlap along x from a distance of 0.2 m of their centres, in the exact plant.
     assert free.q[0] - free.q[1] > 0.0
     assert ours.q[1] - ours.q[0] > 0.2 - 0.02
@@ -173,20 +180,13 @@ def test_a_robot_that_drifts_against_an_obstacle_is_stopped_by_it() -> None:
 
 
 def test_a_grasp_is_a_weld_and_a_release_ends_it() -> None:
-    ours, exact = (
-        plant_of(SPATIAL, actuation="effort", engine=engine, integration_step=0.001)
-        for engine in ("mujoco", "exact")
-    )
+    ours, exact = both = pair(**{**SPATIAL, "integration_step": 0.001}, actuation="effort")
     before = total_momentum(ours)
     np.testing.assert_allclose(before, total_momentum(exact), rtol=1e-12)
-    for flown in (ours, exact):
-        flown.step(np.zeros(3), np.zeros(6))
-        event = capturing_of(flown).capture()
-        assert capture_values(event.about)["requested"]
-    joints = np.array([1.0, -2.0, 0.5])
-    for _ in range(20):
-        for flown in (ours, exact):
-            flown.step(joints, np.array([3.0, 0, 0, 0, 0.5, 0]))
+    step_both(both, 1, np.zeros(3), np.zeros(6))
+    for flown in both:
+        assert capture_values(capturing_of(flown).capture().about)["requested"]
+    step_both(both, 20, [1.0, -2.0, 0.5], [3.0, 0, 0, 0, 0.5, 0])
     held, reference = capturing_of(ours), capturing_of(exact)
     assert held.payload is not None
     assert reference.payload is not None
@@ -197,9 +197,8 @@ def test_a_grasp_is_a_weld_and_a_release_ends_it() -> None:
     np.testing.assert_allclose(ours.momentum[:6], ours.expected_momenta, rtol=0, atol=2e-3)
     momentum = total_momentum(ours)
     held.release()
-    for flown in (ours,):
-        for _ in range(10):
-            flown.step(np.zeros(3), np.zeros(6))
+    for _ in range(10):
+        ours.step(np.zeros(3), np.zeros(6))
     assert held.payload is None
     assert relative_change(total_momentum(ours), momentum) < 1e-6
     with pytest.raises(CommandError, match="does not hold a target"):
@@ -216,12 +215,8 @@ def test_loads_act_as_in_the_exact_plant() -> None:
         "orbit.orientation": [0.1, 0.2, -0.3, 0.9],
         "disturbances": ["link_2 force 1 -2 0.5 in world", "base_link torque 0.3 0 0.2 in link"],
     }
-    ours, exact = plant(**values), plant(**values, engine="exact")
-    for _ in range(40):
-        for flown in (ours, exact):
-            flown.step(np.array([0.5, -0.3, 0.2]), np.array([1.0, 0, 0, 0, 0, 0.1]))
-    free = plant(**{**values, "orbit.mean_motion": 0.0, "disturbances": []})
-    assert np.abs(state_of(free) - state_of(exact)).max() < 10.0
+    ours, exact = both = pair(**values)
+    step_both(both, 40, [0.5, -0.3, 0.2], [1.0, 0, 0, 0, 0, 0.1])
     np.testing.assert_allclose(state_of(ours), state_of(exact), rtol=0, atol=1e-4)
     np.testing.assert_allclose(ours.momentum, exact.momentum, rtol=0, atol=2e-3)
     np.testing.assert_allclose(ours.expected_momenta, exact.expected_momenta, rtol=0, atol=2e-3)
@@ -237,10 +232,8 @@ def test_a_table_with_friction_acts_as_in_the_exact_plant() -> None:
         "table.friction": 0.4,
         "linear_momentum": [20.0, -5.0, 0.0],
     }
-    ours, exact = plant(**values), plant(**values, engine="exact")
-    for _ in range(50):
-        for flown in (ours, exact):
-            flown.step(np.array([0.1, -0.2]))
+    ours, exact = both = pair(**values)
+    step_both(both, 50, [0.1, -0.2])
     np.testing.assert_allclose(ours.pose, exact.pose, rtol=0, atol=5e-4)
     np.testing.assert_allclose(ours.momentum[:2], exact.momentum[:2], rtol=2e-3)
 
@@ -306,13 +299,8 @@ def test_a_reset_begins_the_same_flight_again() -> None:
 def test_masses_are_those_of_the_model_and_not_of_the_urdf() -> None:
     robot = SpaceRobot.from_file(robot_file("three_joint_arm"))
     heavy = robot.with_inertial(robot.inertial.scaled(np.array([1.0, 1.7, 0.6, 1.3])))
-    ours, exact = (
-        plant(heavy, **{**ARM, "engine": engine, "actuation": "effort"})
-        for engine in ("mujoco", "exact")
-    )
-    for _ in range(20):
-        for flown in (ours, exact):
-            flown.step(np.array([1.0, -2.0, 0.7]), np.zeros(6))
+    ours, exact = both = pair(heavy, **ARM, actuation="effort")
+    step_both(both, 20, [1.0, -2.0, 0.7], np.zeros(6))
     np.testing.assert_allclose(state_of(ours), state_of(exact), rtol=0, atol=1e-9)
 
 

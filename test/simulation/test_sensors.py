@@ -466,22 +466,6 @@ def test_the_truth_goes_to_its_own_topics_once_the_sensors_err() -> None:
     assert not state.update()
 
 
-def test_the_end_effector_is_where_the_link_is() -> None:
-    link = ARM.link_names[-1]
-    config = PlantConfig(
-        end_effector_frame=link,
-        initial_position=(1.0, 2.0, 3.0),
-        initial_orientation=(0.0, 0.0, 1.0, 1.0),
-    )
-    plant = build_plant(ARM, config)
-    state = ReportedState(plant, config)
-    state.update()
-    in_base = plant.link_r[:, -1]
-    # A quarter turn about z.
-    expected = [1.0 - in_base[1], 2.0 + in_base[0], 3.0 + in_base[2]]
-    np.testing.assert_allclose(state.quantities["end_effector_pose"][:3], expected, atol=1e-12)
-
-
 def test_named_links_are_where_pinocchio_sees_them_in_the_measured_state() -> None:
     named = ("link_3", "base_link", "link_1")
     config = PlantConfig(

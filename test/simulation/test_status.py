@@ -190,12 +190,6 @@ def test_the_stamp_of_the_last_command_is_exact_also_after_a_long_time() -> None
     assert rig.monitor.status.time_s == 4_000_001.05
 
 
-def test_a_status_of_nothing_is_at_the_begin() -> None:
-    status = PlantStatus(PlantState.INACTIVE, "It is not active.")
-    assert (status.time_s, status.rearms, status.resets, status.timeouts) == (0.0, 0, 0, 0)
-    assert (status.faults, status.last_command_s, status.reason) == ((), None, "")
-
-
 @pytest.mark.parametrize("state", list(PlantState))
 @pytest.mark.parametrize("faults", [(), ("joint_stuck slider_1",), ("a", "b")])
 @pytest.mark.parametrize(("reason", "latched"), [("", ""), ("timeout", ""), ("abort", "abort")])

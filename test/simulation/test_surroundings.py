@@ -158,30 +158,6 @@ def test_a_dumbbell_swings_like_a_pendulum_and_drifts_as_clohessy_and_wiltshire_
     np.testing.assert_allclose(plant.pose[:3], turned.apply(r_O), atol=1e-5)
 
 
-def test_small_librations_have_the_period_of_the_textbook() -> None:
-    """``2 pi / (n sqrt(3 (Iy - Ix) / Iz))``, by the zeros of the angle."""
-    start = InitialState(
-        quaternion=Rotation.from_rotvec([0.0, 0.0, 0.01]).as_quat(),
-        angular_momentum=np.array([0.0, 0.0, 1.1 * N]),
-    )
-    plant = EffortPlant(robot_of(DUMBBELL), 20.0, start, 20.0)
-    loads = PlantLoads(plant.robot, Surroundings(N))
-    plant.load(loads)
-    zeros, before = [], 0.01
-    for tick in range(1, 180):
-        loads.time = 20.0 * (tick - 1)
-        plant.step(np.zeros(0))
-        angle = math.remainder(
-            2 * math.atan2(plant.pose[5], plant.pose[6]) - 20 * N * tick, 2 * math.pi
-        )
-        if before * angle < 0:
-            zeros.append(20.0 * (tick - 1 + before / (before - angle)))
-        before = angle
-    period = 2 * math.pi / (N * math.sqrt(3 * 0.9 / 1.1))
-    assert len(zeros) == 2
-    assert 2 * (zeros[1] - zeros[0]) == pytest.approx(period, rel=1e-4)
-
-
 # -- the table --------------------------------------------------------------------------------
 
 
@@ -253,6 +229,7 @@ def test_an_altitude_is_a_mean_motion() -> None:
     steep = Surroundings.of(OrbitConfig(), TableConfig(tilt=0.1, direction=0.5, gravity=2.0))
     expected = 2 * math.sin(0.1) * np.array([math.cos(0.5), math.sin(0.5), 0.0])
     np.testing.assert_allclose(steep.gravity_W, expected)
+    assert PlantLoads(robot_of(DUMBBELL), steep).has_loads
 
 
 TABLE = TableConfig(tilt=0.01)
@@ -299,19 +276,6 @@ def test_surroundings_that_do_not_suit_are_refused(
     with pytest.raises(ParameterError) as refused:
         build_plant(model, PlantConfig(actuation="effort", **parameters))
     assert str(refused.value).startswith(message)
-
-
-def test_loads_that_act_are_told_from_those_that_do_not() -> None:
-    robot = robot_of(DUMBBELL)
-    loads = PlantLoads(robot)
-    loads.time = 3.5
-    assert not loads.has_loads
-    assert loads.time == 3.5
-    loads.in_link[0, 5] = 1.0
-    assert loads.has_loads
-    given = [{"mean_motion": 0.1}, {"gravity_W": (0.0, 0.1, 0.0)}, {"friction": 0.1}]
-    for each in given:
-        assert PlantLoads(robot, Surroundings(**each)).has_loads
 
 
 def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
-from support.effort_flights import robot_of
+from support.effort_flights import robot_of, tumbling
 from support.oracles import Array, Motion, PinocchioOracle
 from support.oracles.integrated import carried, tumbled_body
 from support.random_robots import random_robot_urdf
@@ -194,7 +195,8 @@ def test_motion_is_that_of_another_integration(seed: int, momentum: bool) -> Non
     assert turned.magnitude() < 1e-9
 
 
-def test_a_body_without_joints_tumbles_as_euler_says() -> None:
+@pytest.mark.parametrize("torque", [None, [0.3, -0.2, 0.1]], ids=["free", "under a torque"])
+def test_a_body_without_joints_tumbles_as_euler_says(torque: list[float] | None) -> None:
     moments = np.array([1.0, 2.0, 2.5])
     urdf = (
         '<robot name="brick"><link name="brick"><inertial><mass value="4"/><inertia ixx="1" '
@@ -202,31 +204,26 @@ def test_a_body_without_joints_tumbles_as_euler_says() -> None:
     )
     L = np.array([0.3, 1.0, -0.4])
     initial = InitialState(linear_momentum=np.array([4.0, 0.0, -2.0]), angular_momentum=L)
-    plant = VelocityPlant(SpaceRobot.from_urdf(urdf), TICK, initial)
+    kind: Any = VelocityPlant if torque is None else EffortPlant
+    commands = [np.zeros(0)]
+    if torque is not None:
+        commands.append(np.array([0.0, 0.0, 0.0, *torque]))
+    plant = kind(SpaceRobot.from_urdf(urdf), TICK, initial)
 
     start = BodyMotion(np.eye(3), np.zeros(3), np.array([1.0, 0.0, -0.5]), L / moments)
     times = np.linspace(TICK, 100 * TICK, 100)
-    _, r, omega = tumbled_body(Inertia(4.0, np.zeros(3), np.diag(moments)), start, times)
-    energy = float(np.sum(L**2 / moments)) / 2 + float(np.sum([16.0, 4.0])) / 8
+    inertia = Inertia(4.0, np.zeros(3), np.diag(moments))
+    given = np.zeros(3) if torque is None else np.array(torque)
+    _, r, omega = tumbled_body(inertia, start, times, lambda t, R: given)
     for tick in range(100):
-        plant.step(np.zeros(0))
+        plant.step(*commands)
         np.testing.assert_allclose(plant.twist[3:], omega[tick], atol=1e-8)
         np.testing.assert_allclose(plant.pose[:3], r[tick], atol=1e-12)
+        energy = float(moments @ omega[tick] ** 2) / 2 + float(np.sum([16.0, 4.0])) / 8
         assert plant.momentum[6] == pytest.approx(energy, rel=1e-8)
 
 
 # -- start and reset --------------------------------------------------------------------------
-
-
-def test_it_starts_at_rest_where_it_is_told() -> None:
-    case = Case(4, momentum=False)
-    plant = case.plant()
-    np.testing.assert_array_equal(plant.q, case.initial.joint_positions)
-    np.testing.assert_allclose(plant.pose[:3], case.initial.position, atol=1e-14)
-    np.testing.assert_allclose(plant.pose[3:], case.initial.quaternion, atol=1e-15)
-    np.testing.assert_array_equal(plant.qdot, np.zeros(case.robot.n))
-    np.testing.assert_allclose(plant.twist, np.zeros(6), atol=1e-15)
-    np.testing.assert_allclose(plant.momentum, np.zeros(7), atol=1e-15)
 
 
 def test_a_quaternion_of_any_length_is_taken() -> None:
@@ -362,6 +359,23 @@ def test_center_of_mass_is_where_it_is_put(plant: Any) -> None:
     oracle = PinocchioOracle(TREE, robot_of(TREE).joint_names)
     oracle.set_configuration(built.q, built.pose[3:], built.pose[:3])
     np.testing.assert_allclose(oracle.center_of_mass_W(), center, atol=1e-13)
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+def test_a_start_is_as_given(plant: Any) -> None:
+    robot, zero = robot_of(TREE), np.zeros(3)
+    start = tumbling(robot, np.random.default_rng(95))
+    if plant is VelocityPlant:
+        start = replace(start, linear_momentum=zero, angular_momentum=zero, joint_velocities=zero)
+    built = plant(robot, 0.01, start)
+    turned = Rotation.from_quat(start.quaternion).inv() * Rotation.from_quat(built.pose[3:])
+    assert turned.magnitude() < 1e-14
+    np.testing.assert_allclose(built.pose[:3], start.position, atol=1e-14)
+    np.testing.assert_array_equal(built.q, start.joint_positions)
+    np.testing.assert_array_equal(built.qdot, start.joint_velocities)
+    np.testing.assert_allclose(built.momentum[:6], start.momenta(), atol=1e-13)
+    if plant is VelocityPlant:
+        np.testing.assert_allclose([*built.twist, built.momentum[6]], 0.0, atol=1e-15)
 
 
 def test_position_given_twice_is_refused() -> None:
