@@ -132,12 +132,6 @@ def fly_beside_single_ones(name: str, mode: str, arguments: dict[str, Any], step
 
 
 @pytest.mark.usefixtures("strict")
-@pytest.mark.parametrize("mode", MODES)
-def test_a_vector_environment_is_as_many_single_ones(mode: str) -> None:
-    assert fly_beside_single_ones(ARM, mode, SHORT, 12) > 5
-
-
-@pytest.mark.usefixtures("strict")
 def test_a_wrapper_that_needs_one_mode_of_resets_is_told_the_mode() -> None:
     for mode in ("SameStep", "Disabled"):
         with pytest.raises(ValueError, match="NEXT_STEP"):
@@ -412,13 +406,6 @@ exec(compile(_SOURCE, "point.py", "exec"), _OF_PAGE)
 Point: type[Task] = TASKS.register(_OF_PAGE["Point"])
 
 
-@pytest.mark.usefixtures("strict")
-@pytest.mark.parametrize("mode", MODES)
-def test_a_task_of_ones_own_in_vectors_is_as_many_single_ones(mode: str) -> None:
-    arguments = {**SHORT, "task": Point, "spread": 0.3, "time_limit": 0.1}
-    assert fly_beside_single_ones(OWN, mode, arguments, 12) > 5
-
-
 def test_a_task_of_ones_own_decides_starts_rewards_and_ends() -> None:
     environment: Any = gymnasium.make(
         OWN, task=Point, scenario="planar_chain", tolerance=0.2, reward={"time": 0.0, "spin": 2.0}
@@ -484,25 +471,32 @@ def test_starts_are_given() -> None:
     )
 
 
-# -- what lanes lack ---------------------------------------------------------------------------
+# -- vectors, and what lanes lack --------------------------------------------------------------
+
+OF_POINT = {**SHORT, "task": "point", "spread": 0.3, "time_limit": 0.1}
+LACKING = {"hold": 2, "time_limit": 0.4}
+NOISY = {**LACKING, "scenario": "faults/noisy_sensors"}
 
 
 @pytest.mark.usefixtures("strict")
 @pytest.mark.parametrize(
-    ("scenario", "arguments"),
+    ("name", "mode", "arguments"),
     [
-        ("faults/weak_motors", {}),
-        ("faults/noisy_sensors", {}),
-        ("faults/noisy_sensors", {"link": "mass_1"}),
-        pytest.param("servicer_thrusters", {"time_limit": 0.1}, marks=pytest.mark.slow),
+        *((ARM, mode, SHORT) for mode in MODES),
+        *((OWN, mode, OF_POINT) for mode in MODES),
+        (ARM, "NextStep", {**LACKING, "scenario": "faults/weak_motors"}),
+        (ARM, "NextStep", NOISY),
+        ("spacerobot/Reach-v0", "NextStep", {**NOISY, "link": "mass_1"}),
+        pytest.param(
+            *(ARM, "NextStep", {"scenario": "servicer_thrusters", "hold": 2, "time_limit": 0.1}),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
-def test_scenarios_with_faults_noise_or_thrusters_in_vectors_are_as_many_single_ones(
-    scenario: str, arguments: dict[str, Any]
+def test_a_vector_environment_is_as_many_single_ones(
+    name: str, mode: str, arguments: dict[str, Any]
 ) -> None:
-    arguments = {"scenario": scenario, "hold": 2, "time_limit": 0.4, **arguments}
-    name = "spacerobot/Reach-v0" if "link" in arguments else ARM
-    assert fly_beside_single_ones(name, "NextStep", arguments, 10) >= 5
+    assert fly_beside_single_ones(name, mode, arguments, 12) >= 5
 
 
 def test_faults_and_thrusters_are_those_of_the_plant() -> None:
