@@ -85,6 +85,13 @@ def started(folder: Path, *command: str, path: Path | None = None) -> Iterator[S
             process.wait()
 
 
+def command_of(folder: Path, **changes: Any) -> tuple[tuple[str, ...], Path]:
+    """Write a campaign; return the command that flies it, and the folder that this fills."""
+    file, out = folder / "many.yaml", folder / "out"
+    file.write_text(yaml.safe_dump({"campaign": section(**{**GIVEN, **changes})}))
+    return ("spacerobot_ros", "campaign", str(file), "--out", str(out)), out
+
+
 def flown(folder: Path) -> int:
     return len(Dataset(folder).flown_numbers()) if (folder / "flights").is_dir() else 0
 
@@ -112,14 +119,12 @@ def worker_of(address: str) -> tuple[str, ...]:
 
 def test_a_scheduler_that_goes_away_is_said_and_takes_no_flight_with_it(tmp_path: Path) -> None:
     """No flight is taken for one that kills its worker."""
-    file, out = tmp_path / "many.yaml", tmp_path / "out"
-    file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
-    command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--scheduler")
+    command, out = command_of(tmp_path)
     with started(tmp_path, *SCHEDULER) as scheduler:
         address = scheduler.awaited(ADDRESS)
         with started(tmp_path, *worker_of(address)) as worker:
             worker.awaited("Registered to")
-            with started(tmp_path, *command, address) as run:
+            with started(tmp_path, *command, "--scheduler", address) as run:
                 until(out, 10, run)
                 scheduler.kill()
                 assert run.process.wait(timeout=_LONGEST) == 2
@@ -134,15 +139,13 @@ def test_a_scheduler_that_goes_away_is_said_and_takes_no_flight_with_it(tmp_path
 
 
 def test_a_worker_that_has_no_package_is_refused(tmp_path: Path) -> None:
-    file, out = tmp_path / "many.yaml", tmp_path / "out"
-    file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
+    command, _ = command_of(tmp_path)
     (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['spacerobot_ros'] = None\n")
-    command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--scheduler")
     with started(tmp_path, *SCHEDULER) as scheduler:
         address = scheduler.awaited(ADDRESS)
         with started(tmp_path, *worker_of(address), path=tmp_path) as worker:
             worker.awaited("Registered to")
-            with started(tmp_path, *command, address) as run:
+            with started(tmp_path, *command, "--scheduler", address) as run:
                 assert run.process.wait(timeout=_LONGEST) == 2
                 expected = (
                     rf"The worker at {ADDRESS} does not have spacerobot_ros: install it there\.\n"
@@ -152,23 +155,20 @@ def test_a_worker_that_has_no_package_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.study
 def test_workers_and_campaigns_that_are_killed(tmp_path: Path) -> None:
-    file = tmp_path / "many.yaml"
-    file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
-    out = tmp_path / "out"
+    command, out = command_of(tmp_path)
     with started(tmp_path, *SCHEDULER) as process:
         address = process.awaited(ADDRESS)
-        worker = worker_of(address)
-        command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--scheduler")
+        worker, command = worker_of(address), (*command, "--scheduler", address)
         with started(tmp_path, *worker) as first, started(tmp_path, *worker) as second:
             for each in (first, second):
                 each.awaited("Registered to")
-            with started(tmp_path, *command, address) as run:
+            with started(tmp_path, *command) as run:
                 until(out, 10, run)
                 first.kill()
                 until(out, flown(out) + 10, run)
                 run.kill()
             assert 20 <= flown(out) < GIVEN["flights"]
-            with started(tmp_path, *command, address) as run:
+            with started(tmp_path, *command) as run:
                 assert run.process.wait(timeout=_LONGEST) == 0, run.log.read_text()
     run_campaign(campaign(**GIVEN), tmp_path / "undisturbed")
     assert [row["flight"] for row in rows(out)] == list(range(GIVEN["flights"]))
@@ -177,8 +177,7 @@ def test_workers_and_campaigns_that_are_killed(tmp_path: Path) -> None:
 
 def test_a_flight_that_kills_its_worker_twice_is_reported(tmp_path: Path) -> None:
     """The plant of flight 7 ends its process; all other flights are flown, and once."""
-    file, out = tmp_path / "many.yaml", tmp_path / "out"
-    file.write_text(yaml.safe_dump({"campaign": section(**{**GIVEN, "flights": 24})}))
+    command, out = command_of(tmp_path, flights=24)
     (tmp_path / "sitecustomize.py").write_text(
         "import os\n"
         "def poison():\n"
@@ -190,13 +189,8 @@ def test_a_flight_that_kills_its_worker_twice_is_reported(tmp_path: Path) -> Non
         "    engines.drawn_flight = flown\n"
         "poison()\n"
     )
-    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"}
-    command = ["spacerobot_ros", "campaign", str(file), "--out", str(out), "--workers", "2"]
-    done = subprocess.run(
-        [sys.executable, "-m", *command], env=environment, capture_output=True, text=True,
-        timeout=_LONGEST, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    with started(tmp_path, *command, "--workers", "2", path=tmp_path) as run:
+        assert run.process.wait(timeout=_LONGEST) == 0, run.log.read_text()
     found = rows(out)
     assert [row["flight"] for row in found] == list(range(24))
     assert {row["flight"]: row["outcome"] for row in found if row["outcome"] != "reached"} == {
@@ -234,10 +228,8 @@ def test_workers_of_this_machine_listen_nowhere() -> None:
 
 
 def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
-    file, out = tmp_path / "many.yaml", tmp_path / "out"
-    file.write_text(yaml.safe_dump({"campaign": section(**{**GIVEN, "flights": 100000})}))
-    command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--workers", "2")
-    with started(tmp_path, *command) as run:
+    command, out = command_of(tmp_path, flights=100_000)
+    with started(tmp_path, *command, "--workers", "2") as run:
         until(out, 8, run)
         assert run.kill(signal.SIGINT, all_of_it=True) == 130, run.log.read_text()
         assert "Traceback" not in run.log.read_text()
@@ -248,10 +240,8 @@ def test_what_was_flown_is_kept_after_ctrl_c(tmp_path: Path) -> None:
 
 
 def test_workers_end_with_a_campaign_that_is_killed(tmp_path: Path) -> None:
-    file, out = tmp_path / "many.yaml", tmp_path / "out"
-    file.write_text(yaml.safe_dump({"campaign": section(**GIVEN)}))
-    command = ("spacerobot_ros", "campaign", str(file), "--out", str(out), "--workers", "2")
-    with started(tmp_path, *command) as run:
+    command, out = command_of(tmp_path)
+    with started(tmp_path, *command, "--workers", "2") as run:
         until(out, 8, run)
         workers = psutil.Process(run.process.pid).children(recursive=True)
         assert len(workers) >= 2

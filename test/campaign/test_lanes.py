@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -65,6 +65,18 @@ def flown(engine: LanesEngine | FlightsEngine, made: Campaign) -> dict[int, Row]
     return {row.draw.number: row for row in rows}
 
 
+def assert_same_flights(made: Campaign, engine: str) -> tuple[dict[int, Row], dict[int, Row]]:
+    of_lanes, one_by_one = flown(engine_named(engine), made), flown(FlightsEngine(), made)
+    assert of_lanes.keys() == one_by_one.keys() == set(range(made.flights))
+    for number, row in one_by_one.items():
+        other = of_lanes[number]
+        deviation, at = largest_deviation(row.metrics, other.metrics)
+        assert deviation < RERUN_TOLERANCE, (number, at, deviation)
+        assert (row.outcome, row.reason) == (other.outcome, other.reason)
+        assert row.passed is other.passed
+    return of_lanes, one_by_one
+
+
 @on_engines()
 @pytest.mark.parametrize(("tolerance", "most"), [(0.05, 3), (0.0012, 3), (0.0012, 0)])
 def test_the_same_draw_is_the_same_flight_in_every_engine(
@@ -77,14 +89,7 @@ def test_the_same_draw_is_the_same_flight_in_every_engine(
         "planner.max_corrections": most,
     }
     made = campaign(disperse=DISPERSED, flights=12, seed=1, set=settings)
-    of_lanes, one_by_one = flown(engine_named(engine), made), flown(FlightsEngine(), made)
-    assert of_lanes.keys() == one_by_one.keys() == set(range(12))
-    for number, row in one_by_one.items():
-        other = of_lanes[number]
-        deviation, at = largest_deviation(row.metrics, other.metrics)
-        assert deviation < RERUN_TOLERANCE, (number, at, deviation)
-        assert (row.outcome, row.reason) == (other.outcome, other.reason)
-        assert row.passed is other.passed
+    of_lanes, one_by_one = assert_same_flights(made, engine)
     engines = [row.engine for row in of_lanes.values()]
     corrected = sum(row.metrics["corrections"] > 0 for row in one_by_one.values())
     assert engines.count("flights") == corrected
@@ -127,18 +132,6 @@ def controlled(**given: Any) -> Campaign:
     """Return a campaign of coordinated control, of flights that are short."""
     wanted = {"scenario": "coordinated_control", "disperse": CONTROLLED, "seed": 3, **given}
     return parse_campaign("controlled", {**wanted, "set": {**CONTROL, **given.get("set", {})}})
-
-
-def assert_same_flights(made: Campaign, engine: str) -> tuple[dict[int, Row], dict[int, Row]]:
-    of_lanes, one_by_one = flown(engine_named(engine), made), flown(FlightsEngine(), made)
-    assert of_lanes.keys() == one_by_one.keys() == set(range(made.flights))
-    for number, row in one_by_one.items():
-        other = of_lanes[number]
-        deviation, at = largest_deviation(row.metrics, other.metrics)
-        assert deviation < RERUN_TOLERANCE, (number, at, deviation)
-        assert (row.outcome, row.reason) == (other.outcome, other.reason)
-        assert row.passed is other.passed
-    return of_lanes, one_by_one
 
 
 @on_engines()
@@ -288,55 +281,91 @@ def test_lanes_fly_the_whole_command_of_a_law_or_leave_it(monkeypatch: pytest.Mo
     assert {row.engine for row in of_lanes.values()} == {"lanes"}
 
 
-def test_the_engine_is_chosen_and_says_why_it_cannot() -> None:
+OUTSIDE = "it has disturbances, an orbit or a table; use engine 'flights'"
+AVERAGES = "the planner averages states, or monitors the path"
+MEASURED = "the joints are measured with errors"
+STEADY = "coordinated_control.gains.base_position.ki"
+NOT_IN_LANES: list[tuple[Callable[..., Campaign], dict[str, Any], str]] = [
+    (campaign, {"set": {"plant.faults": ["joint_stuck slider_1 at 1"]}}, "it has faults"),
+    (campaign, {"set": {"plant.disturbances": ["mass_1 force 1 0 0 at 1"]}}, OUTSIDE),
+    (campaign, {"set": {"plant.orbit.altitude": 4e5}}, OUTSIDE),
+    (campaign, {"disperse": {"plant.table.friction": {"uniform": [0.0, 0.1]}}}, OUTSIDE),
+    (controlled, {"set": {STEADY: 0.5}}, "integral gains; use engine 'flights'"),
+    (controlled, {"disperse": {STEADY: {"uniform": [0.0, 0.5]}}}, "integral gains; use engine"),
+    (campaign, {"set": {"plant.target.robot": "block.urdf"}}, "it has a target"),
+    (campaign, {"set": {"plant.engine": "mujoco"}}, "its plant uses the engine 'mujoco'"),
+    (
+        campaign,
+        {"criteria": {"clearance_m": {"min": 0.0}}},
+        "lanes measure no distances between links",
+    ),
+    (
+        controlled,
+        {"set": {"plant.world": str(share_directory() / "config" / "worlds" / "panel.urdf")}},
+        "it has obstacles, and lanes do not detect contacts",
+    ),
+    (campaign, {"set": {"plant.sensors.joint_noise": 1e-3}}, MEASURED),
+    (campaign, {"set": {"plant.sensors.joint_bias": [0, 0, 0.1]}}, MEASURED),
+    (campaign, {"set": {"planner.averaging": 3}}, AVERAGES),
+    (campaign, {"set": {"planner.drift_position": 0.1}}, AVERAGES),
+    (campaign, {"set": {"planner.drift_attitude": 0.1}}, AVERAGES),
+    (campaign, {"set": {"planner.output": "reference"}}, "the planner replans during the motion"),
+    (
+        controlled,
+        {"set": {"plant.beyond_limits": "refuse"}},
+        "the plant refuses commands beyond limits",
+    ),
+    (
+        controlled,
+        {"set": {"coordinated_control.tasks": "detumble"}},
+        "its controller performs tasks before goals; use engine 'flights'",
+    ),
+    *(
+        (
+            campaign,
+            {"disperse": {name: {"choice": values}}},
+            f"'{name}' is dispersed, but shared by all lanes",
+        )
+        for name, values in (
+            # What would be another kind of flight is not flown as the nominal one.
+            ("plant.actuation", ["velocity", "effort"]),
+            ("plant.engine", ["exact", "mujoco"]),
+            ("plant.tick_rate", [20]),
+            ("plant.integration_step", [1.0, 3.0]),
+            ("planner.tick_rate", [1.0, 3.0]),
+            ("planner.averaging", [1.0, 3.0]),
+            ("planner.shape_gain", [1.0, 3.0]),
+            ("planner.drift_position", [1.0, 3.0]),
+            ("planner.max_corrections", [1.0, 3.0]),
+            ("planner.replan_period", [1.0, 3.0]),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "given", "why"), NOT_IN_LANES)
+def test_campaigns_that_lanes_cannot_fly_are_flown_one_by_one(
+    make: Callable[..., Campaign], given: dict[str, Any], why: str
+) -> None:
+    made = make(**given)
+    assert select_engine(made, "auto").name == "flights"
+    with pytest.raises(SpaceRobotError) as refused:
+        select_engine(made, "lanes")
+    assert str(refused.value).startswith("The engine 'lanes' cannot fly this campaign: ")
+    assert why in str(refused.value)
+
+
+def test_the_engine_is_chosen() -> None:
     made = campaign(disperse=DISPERSED)
     assert select_engine(made, "auto").name == "lanes"
     assert select_engine(made, "flights").name == "flights"
-    stuck = campaign(set={"plant.faults": ["joint_stuck slider_1 at 1"]})
-    assert select_engine(stuck, "auto").name == "flights"
-    with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has faults"):
-        select_engine(stuck, "lanes")
-    why = "it has disturbances, an orbit or a table; use engine 'flights'"
     for made in (
-        campaign(set={"plant.disturbances": ["mass_1 force 1 0 0 at 1"]}),
-        campaign(set={"plant.orbit.altitude": 4e5}),
-        campaign(disperse={"plant.table.friction": {"uniform": [0.0, 0.1]}}),
+        campaign(set={"planner.averaging": 1}),
+        campaign(set={"plant.sensors.joint_bias": [0, 0, 0.0]}),
+        controlled(),
+        controlled(set={"coordinated_control.law": "transposed_jacobian"}),
     ):
-        assert select_engine(made, "auto").name == "flights"
-        with pytest.raises(SpaceRobotError, match=why):
-            select_engine(made, "lanes")
-    normal = {"uniform": [0.0, 0.5]}
-    steady = {"coordinated_control.gains.base_position.ki": 0.5}
-    for made in (controlled(set=steady), controlled(disperse=dict.fromkeys(steady, normal))):
-        assert select_engine(made, "auto").name == "flights"
-        with pytest.raises(SpaceRobotError, match="integral gains; use engine 'flights'"):
-            select_engine(made, "lanes")
-    beside = campaign(set={"plant.target.robot": "block.urdf"})
-    with pytest.raises(SpaceRobotError, match="'lanes' cannot fly this campaign: it has a target"):
-        select_engine(beside, "lanes")
-    has_contact_forces = campaign(set={"plant.engine": "mujoco"})
-    assert select_engine(has_contact_forces, "auto").name == "flights"
-    with pytest.raises(SpaceRobotError, match="its plant uses the engine 'mujoco'"):
-        select_engine(has_contact_forces, "lanes")
-    near = campaign(criteria={"clearance_m": {"min": 0.0}})
-    assert select_engine(near, "auto").name == "flights"
-    with pytest.raises(SpaceRobotError, match="lanes measure no distances between links"):
-        select_engine(near, "lanes")
-    among = controlled(
-        set={"plant.world": str(share_directory() / "config" / "worlds" / "panel.urdf")}
-    )
-    with pytest.raises(SpaceRobotError, match="it has obstacles, and lanes do not detect contacts"):
-        select_engine(among, "lanes")
-    # What would be another kind of flight is not flown as the nominal one.
-    for name, values in (
-        ("plant.actuation", ["velocity", "effort"]),
-        ("plant.engine", ["exact", "mujoco"]),
-        ("plant.tick_rate", [20]),
-    ):
-        other = campaign(disperse={name: {"choice": values}})
-        assert select_engine(other, "auto").name == "flights"
-    for given in ({"plant.sensors.joint_noise": 1e-3}, {"planner.averaging": 3}):
-        assert select_engine(campaign(set=given), "auto").name == "flights"
+        assert select_engine(made, "lanes").name == "lanes"
 
 
 def test_a_device_flies_large_campaigns_of_controllers_where_there_is_one(
@@ -372,56 +401,6 @@ def test_a_campaign_that_is_stopped_in_flight_has_no_rows_of_that_batch(engine: 
 
     assert not list(engine_named(engine).fly(made, list(Draws(made)), stopped))
     assert asked == made.flights + 2
-
-
-SHARED = "is dispersed, but shared by all lanes"
-
-
-@pytest.mark.parametrize(
-    ("given", "reason"),
-    [
-        ({"planner.averaging": 1}, ""),
-        ({"planner.drift_position": 0.1}, "the planner averages states, or monitors the path"),
-        ({"planner.drift_attitude": 0.1}, "the planner averages states, or monitors the path"),
-        ({"planner.output": "reference"}, "the planner replans during the motion"),
-        ({"plant.sensors.joint_bias": [0, 0, 0.1]}, "the joints are measured with errors"),
-        ({"plant.sensors.joint_bias": [0, 0, 0.0]}, ""),
-    ],
-)
-def test_what_lanes_do_not_fly_of_a_planner(given: dict[str, Any], reason: str) -> None:
-    refusal = LanesEngine().refusal(campaign(set=given))
-    assert refusal.startswith(reason) if reason else not refusal
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("plant.integration_step", "planner.tick_rate", "planner.averaging", "planner.shape_gain"),
-        *("planner.drift_position", "planner.max_corrections", "planner.replan_period"),
-    ],
-)
-def test_what_all_lanes_share_is_not_dispersed(name: str) -> None:
-    made = campaign(disperse={name: {"uniform": [1.0, 3.0]}})
-    assert LanesEngine().refusal(made) == f"'{name}' {SHARED}"
-
-
-@pytest.mark.parametrize(
-    ("given", "reason"),
-    [
-        ({}, ""),
-        ({"plant.beyond_limits": "refuse"}, "the plant refuses commands beyond limits"),
-        (
-            {"coordinated_control.tasks": "detumble"},
-            "its controller performs tasks before goals; use engine 'flights'",
-        ),
-        (
-            {"coordinated_control.law": "transposed_jacobian"},
-            "",
-        ),
-    ],
-)
-def test_what_lanes_do_not_fly_of_a_controller(given: dict[str, Any], reason: str) -> None:
-    assert LanesEngine().refusal(controlled(set=given)) == reason
 
 
 @on_engines("lanes")

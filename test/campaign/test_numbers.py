@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
-from support.campaigns import campaign
+from support.campaigns import campaign, written
 
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign import running as reruns
@@ -40,24 +40,14 @@ MADE = campaign(flights=6, disperse={"mass.mass_1": {"uniform": [0.5, 1.5]}})
 # -- statistics -----------------------------------------------------------------------------------
 
 
-def wilson(count: int, total: int) -> tuple[float, float]:
-    z = stats.norm.ppf(0.975)
-    p, n = count / total, total
-    middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
-    half = z * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    return middle - half, middle + half
-
-
 @pytest.mark.parametrize(("count", "total"), [(3, 11), (11, 11), (0, 7), (40, 41)])
 def test_shares_have_intervals(count: int, total: int) -> None:
     found = share(np.arange(total) < count)
     assert found.value == count / total
-    assert (found.interval_low, found.interval_high) == pytest.approx(
-        wilson(count, total), abs=1e-12
-    )
-    low = stats.beta.ppf(0.025, count, total - count + 1) if count else 0.0
-    high = stats.beta.ppf(0.975, count + 1, total - count) if count < total else 1.0
-    assert found.exact_interval == pytest.approx((low, high), abs=1e-9)
+    expected = stats.binomtest(count, total)
+    wilson, exact = (tuple(expected.proportion_ci(0.95, kind)) for kind in ("wilson", "exact"))
+    assert (found.interval_low, found.interval_high) == pytest.approx(wilson, abs=1e-12)
+    assert found.exact_interval == pytest.approx(exact, abs=1e-9)
     assert str(found) == (
         f"{100 * count / total:.4g} % ({count} of {total}; 95 % interval "
         f"{100 * found.interval_low:.4g} to {100 * found.interval_high:.4g} %)"
@@ -310,12 +300,9 @@ def test_deviations_are_relative_above_one() -> None:
 
 
 def test_a_stored_flight_has_its_metrics(tmp_path: Path) -> None:
-    dataset = Dataset(tmp_path)
-    dataset.begin(MADE)
-    draws = Draws(MADE)
-    metrics = {"position_error_m": 0.25, "duration_s": 3.0}
-    dataset.add([Row(draws[n], "reached", ".", metrics, True, "lanes", 1.0, 2.0) for n in (2, 4)])
-    dataset.close()
+    draws, metrics = Draws(MADE), {"position_error_m": 0.25, "duration_s": 3.0}
+    rows = [Row(draws[n], "reached", ".", metrics, True, "lanes", 1.0, 2.0) for n in (2, 4)]
+    dataset = written(tmp_path, MADE, rows)
     assert running.stored_flight(dataset, 3) is None
     assert running.stored_flight(dataset, 4) == ("reached", "lanes", metrics)
 

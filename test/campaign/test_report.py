@@ -16,7 +16,7 @@ import pyarrow as arrow
 import pyarrow.parquet as parquet
 import pytest
 from scipy import stats
-from support.campaigns import campaign
+from support.campaigns import campaign, written
 from support.chromium import browser, chromium
 
 from spacerobot_ros.campaign.config import Campaign, passes_criteria
@@ -53,8 +53,6 @@ def filled(
     **others: float,
 ) -> Path:
     """Write a dataset whose flights have such position errors, and nothing else."""
-    dataset = Dataset(folder)
-    dataset.begin(made)
     rows = []
     for draw in (each for each in Draws(made) if flown(each.number)):
         metrics = {"position_error_m": error(draw), "manoeuvre_time_s": 4.0, **others}
@@ -66,8 +64,7 @@ def filled(
         left = "needed corrections" if draw.number % 50 == 0 else ""
         draw = replace(draw, fallback=left)
         rows.append(Row(draw, outcome, reason, metrics, ok, "lanes", 0.01, 0.0))
-    dataset.add(rows)
-    dataset.close()
+    written(folder, made, rows)
     return folder
 
 
@@ -109,16 +106,14 @@ def test_only_correlations_beyond_chance_are_called_drivers(driven: bool, tmp_pa
 def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
     """Of 40 flights 40 approach, 30 capture and none places."""
     made = campaign(flights=40, criteria={"captured": {"min": 1}})
-    folder = tmp_path / "dataset"
-    dataset = Dataset(folder)
-    dataset.begin(made)
+    folder, rows = tmp_path / "dataset", []
     for draw in Draws(made):
         captured = float(draw.number >= 10)
         metrics = {"position_error_m": 0.01, "captured": captured, "placed": 0.0}
         metrics |= {"capture_impulse_Ns": 0.1 * draw.number if captured else math.nan}
         ok = passes_criteria(made.criteria, "reached", metrics)
-        dataset.add([Row(draw, "reached", "Reached.", metrics, ok, "flights")])
-    dataset.close()
+        rows.append(Row(draw, "reached", "Reached.", metrics, ok, "flights"))
+    written(folder, made, rows)
     results = Results.of(folder)
     assert list(results.sampler_shares) == ["captured", "placed"]
     found = results.sampler_shares["captured"]
@@ -214,12 +209,9 @@ def test_success_is_counted_over_bins_of_what_was_drawn(tmp_path: Path) -> None:
             count, total = int(group["passed"].sum()), len(group)
             assert (found.passed.count, found.passed.total) == (count, total)
             assert (found.low, found.high) == (group[name].min(), group[name].max())
-            share, z = count / total, stats.norm.ppf(0.975)
-            middle = (share + z**2 / (2 * total)) / (1 + z**2 / total)
-            half = np.sqrt(share * (1 - share) / total + (z / (2 * total)) ** 2) * z
-            half /= 1 + z**2 / total
             interval = found.passed.interval_low, found.passed.interval_high
-            assert interval == pytest.approx((middle - half, middle + half))
+            wilson = stats.binomtest(count, total).proportion_ci(0.95, "wilson")
+            assert interval == pytest.approx(tuple(wilson))
     # The text first, then the mass that drives the result.
     assert results.drawn_by_influence(results.influences())[:2] == ["planner.method", "mass.mass_1"]
     page = tmp_path / "page.html"
@@ -236,13 +228,11 @@ def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Pa
     errors = results.columns["position_error_m"]
     assert [errors[row] for row in results.worst_rows()] == sorted(errors, reverse=True)[:10]
     mixed = campaign(disperse=MASSES, flights=43, seed=8, criteria=loose)
-    dataset = Dataset(tmp_path)
-    dataset.begin(mixed)
-    draws = Draws(mixed)
-    bad = {"position_error_m": 0.5, "manoeuvre_time_s": 4.0}
-    dataset.add([Row(draws[40], "error", "."), Row(draws[41], "reached", ".", bad)])
-    dataset.add([Row(draws[42], "failed", ".", {**bad, "position_error_m": 0.06})])
-    dataset.close()
+    draws, bad = Draws(mixed), {"position_error_m": 0.5, "manoeuvre_time_s": 4.0}
+    late = Row(draws[42], "failed", ".", {**bad, "position_error_m": 0.06})
+    written(
+        tmp_path, mixed, [Row(draws[40], "error", "."), Row(draws[41], "reached", ".", bad), late]
+    )
     assert Results.of(tmp_path).worst_rows()[:3] == [40, 42, 41]
 
 
@@ -326,10 +316,7 @@ def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -
         *[("refused", "Too far by 2 m."), ("error", "No robot."), ("refused", "Too far by 3 m.")],
         *[("refused", "No way."), ("aborted", "Lost."), ("failed", "Off by 1 m."), ("error", "")],
     ]
-    dataset = Dataset(tmp_path)
-    dataset.begin(made)
-    dataset.add([Row(draw, *each) for draw, each in zip(Draws(made), reasons, strict=True)])
-    dataset.close()
+    written(tmp_path, made, [Row(draw, *x) for draw, x in zip(Draws(made), reasons, strict=True)])
     lines = write_campaign_report(tmp_path, tmp_path / "report.html")
     assert [line for line in lines if " of 9: " in line] == [
         "refused     2 of 9: Too far by … m.",
@@ -345,10 +332,7 @@ def test_flights_that_all_failed_have_a_report(tmp_path: Path, count: int) -> No
     """And so has a single one, without a warning."""
     negative = {"mass": {"norm": {"loc": -1.0, "scale": 0.01}}}
     made = campaign(disperse=negative, flights=count, criteria=CRITERIA)
-    dataset = Dataset(tmp_path)
-    dataset.begin(made)
-    dataset.add([Row(draw, "error", "The mass is negative.") for draw in Draws(made)])
-    dataset.close()
+    written(tmp_path, made, [Row(draw, "error", "The mass is negative.") for draw in Draws(made)])
     lines = write_campaign_report(tmp_path, tmp_path / "report.html")
     assert lines[0].startswith(f"success     0 % (0 of {count};")
     assert lines.count(f"error       {count} of {count}: The mass is negative.") == 1

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
+from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.flight.flight import Flight
@@ -30,3 +33,12 @@ def flown(made: Campaign, number: int = 0) -> tuple[Flight, dict[str, Any]]:
     """Fly one draw; return the flight and what was drawn."""
     draw = Draws(made)[number]
     return FlightsEngine().fly_draw(made, drawn_flight(made, draw)), dict(draw.values)
+
+
+def written(folder: Path, made: Campaign, rows: Sequence[Row]) -> Dataset:
+    """Return a dataset with such rows."""
+    dataset = Dataset(folder)
+    dataset.begin(made)
+    dataset.add(rows)
+    dataset.close()
+    return dataset
