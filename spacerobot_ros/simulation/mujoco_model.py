@@ -199,11 +199,10 @@ def _set_masses(spec: Any, robot: RobotDescription) -> None:
     """Give each rigid body the mass properties of the description, which may not be its URDF's."""
     bodies = {body.name: body.inertia for body in robot.bodies}
     for link in robot.links:
-        body, inertia = spec.body(body_name(link.name)), bodies.get(link.name)
+        body = spec.body(body_name(link.name))
         body.explicitinertial = True
-        body.mass = 0.0 if inertia is None else inertia.mass
-        if inertia is not None:
-            _set_inertia(body, inertia)
+        # A link on a fixed joint is part of another body.
+        _set_inertia(body, bodies.get(link.name, Inertia()))
 
 
 def _set_inertia(body: Any, inertia: Inertia) -> None:

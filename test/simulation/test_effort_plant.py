@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
-import mujoco
 import numpy as np
-import numpy.typing as npt
 import pytest
 from scipy.integrate import simpson
 from support.effort_flights import (
@@ -21,8 +19,7 @@ from support.effort_flights import (
     with_effort_limit,
     without_stops,
 )
-from support.oracles import Array, Motion, MujocoOracle, PinocchioOracle, assert_agrees
-from support.slow import some_fast
+from support.oracles import Array, Motion, PinocchioOracle, assert_agrees
 from support.wheels import HULL, WHEELS, text, wheeled_robot
 
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
@@ -38,50 +35,6 @@ from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.effort_plant import DEFAULT_INTEGRATION_STEP, JointStops
-
-
-class MujocoFlight(MujocoOracle):
-    """A robot with motors at its joints and thrusters at the origin of its base link.
-
-    The thrusters are six motors on a site of the base, along and about its axes. They turn with
-    it within a step, unlike ``xfrc_applied`` and ``qfrc_applied``, which are held in the world.
-    """
-
-    def describe(self, urdf: str) -> mujoco.MjSpec:
-        spec = super().describe(urdf)
-        spec.worldbody.first_body().add_site(name="thrusters")
-        for gear in np.eye(6):
-            motor = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="thrusters")
-            motor.gear = gear
-        for name in self.joint_names:
-            spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
-        return spec
-
-    def start(
-        self, pose: Array, twist: Array, q: npt.ArrayLike, qdot: Array, step: float = 1e-3
-    ) -> None:
-        """Set the state as a plant publishes it, and the step in s of Runge-Kutta 4."""
-        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
-        self.model.opt.timestep = step
-        self.set_configuration(np.asarray(q), pose[3:], pose[:3])
-        self.move(self.base_velocities(twist) + self.joint_velocities(qdot))
-
-    def fly(self, effort: npt.ArrayLike, wrench_B: npt.ArrayLike, steps: int) -> None:
-        """Take steps under joint efforts (n,) and force over torque (6,), base components."""
-        self.data.ctrl[:6] = wrench_B
-        self.data.ctrl[6:] = effort
-        mujoco.mj_step(self.model, self.data, nstep=steps)
-
-    @property
-    def pose(self) -> Array:
-        """(7,) position and quaternion (x, y, z, w) of the base link."""
-        return np.append(self.data.qpos[:3], np.roll(self.data.qpos[3:7], -1))
-
-    @property
-    def joints(self) -> tuple[Array, Array]:
-        """Positions and velocities of the joints."""
-        return np.array(self.data.qpos[self._q]), self.selection[3:] @ self.data.qvel
-
 
 SERVICER = (Path(__file__).parents[2] / "urdf" / "servicer.urdf").read_text(encoding="utf-8")
 TICK = 0.01
@@ -147,26 +100,6 @@ def test_energy_grows_by_the_work_and_momenta_by_the_impulse() -> None:
         # Held efforts do the work of their way.
         gained[6] += effort @ (plant.q - q)
         assert_agrees(plant.momentum - before, gained, 1e-8)
-
-
-@pytest.mark.parametrize("seed", some_fast(range(4), 2, 3))
-def test_flight_of_mujoco(seed: int) -> None:
-    robot = robot_of(random_urdf(seed))
-    rng = np.random.default_rng(40 + seed)
-    plant = EffortPlant(robot, TICK, tumbling(robot, rng))
-    q = plant.q.copy()
-    other = MujocoFlight(random_urdf(seed), robot.joint_names)
-    other.start(plant.pose, plant.twist, plant.q, plant.qdot)
-    for effort, wrench in thrusts(rng, robot.n, 20):
-        for _ in range(20):
-            plant.step(effort, wrench)
-        other.fly(effort, wrench, steps=200)
-        sign = math.copysign(1.0, other.pose[3:] @ plant.pose[3:])
-        np.testing.assert_allclose(plant.pose[:3], other.pose[:3], atol=1e-9)
-        np.testing.assert_allclose(plant.pose[3:], sign * other.pose[3:], atol=1e-9)
-        np.testing.assert_allclose(plant.q, other.joints[0], atol=1e-9)
-        np.testing.assert_allclose(plant.qdot, other.joints[1], atol=1e-9)
-    assert np.abs(plant.q - q).min() > 0.01
 
 
 # -- integration ------------------------------------------------------------------------------
@@ -346,29 +279,6 @@ def test_wheels_go_on_spinning_when_joints_are_braked(
 HOUR = 3_600
 P_W, L_W = (0.01, 0.0, -0.004), (0.02, 0.0, 0.05)
 GIVEN = np.array([*P_W, *L_W])
-
-
-@pytest.mark.slow
-def test_momentum_is_what_it_was_after_an_hour(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A robot that drifts and turns, its sliders driven to and fro."""
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
-    config = PlantConfig(
-        robot="sliding_masses", tick_rate=20.0, linear_momentum=P_W, angular_momentum=L_W
-    )
-    plant = build_plant(SpaceRobot.from_file(robot_file("sliding_masses")), config, None)
-    command = np.zeros(plant.robot.n)
-    rng = np.random.default_rng(1)
-    ticks = round(HOUR * config.tick_rate)
-    for tick in range(ticks):
-        if tick % (ticks // 200) == 0:
-            command[:] = 1e-3 * rng.standard_normal(plant.robot.n)
-        plant.step(command)
-    drift = np.abs(np.asarray(plant.momentum)[:6] - GIVEN)
-    assert drift.max() < 1e-9
-    assert abs(np.linalg.norm(np.asarray(plant.pose)[3:7]) - 1) < 1e-12
-    assert np.all(np.isfinite(plant.q))
 
 
 @pytest.mark.slow
