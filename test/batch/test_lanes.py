@@ -16,8 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from support.plant_flights import command_of, decide, fly_one_by_one
+from support.plant_flights import fly_one_by_one
 from support.slow import some_fast
 from support.targets import needs_compiler, on_targets, target_named
 
@@ -34,15 +33,12 @@ from spacerobot_ros.batch import (
     fly_lanes,
     targets,
 )
-from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.lanes import symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick
 from spacerobot_ros.batch.targets import CUDA_OPTIONS, CudaDevice, Entries, Target, device_named
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.goal_monitor import GoalMonitor
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
-from spacerobot_ros.control.state import ControlState
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import (
     InertialParameters,
@@ -264,7 +260,6 @@ def controlled(
     ticks: int,
     count: int = 9,
     end_effector: Array | None = None,
-    noise: float = 1e-5,
     **parameters: Any,
 ) -> Flights:
     """Return flights to a pose nearby, each with other masses, noise, start and gains."""
@@ -275,7 +270,7 @@ def controlled(
     starts = InitialStates.of(robot, [InitialState(joint_positions=shape)] * count)
     starts.position[:, :2] = 0.01 * rng.normal(size=(count, 2))
     sensors = SensorErrors.of(robot, [SensorConfig()] * count)
-    sensors.noise[1:] = noise
+    sensors.noise[1:] = 1e-5
     sensors.pose_bias[2:] = 1e-4
     sensors.seeds[:] = np.arange(count)
     pair = config.gains.base_position
@@ -322,14 +317,16 @@ def test_control_in_lanes_is_that_of_the_controller(target_name: str) -> None:
         max_force=10.0,
         motion=MotionLimits(1.0, 1.0, 1.0, 1.0),
     )
+    assert flights.sensors is not None
+    flights.sensors.noise[4, 5] = 20.0  # Its joints seem to race.
     here, there = fly_lanes(flights, target), fly_one_by_one(flights)
     assert here.engine == target.engine
     assert_equal_flights(here, there)
     assert not here.failures
-    assert not here.fallback_ticks.any()
+    assert not here.fallback_ticks[:4].any()
     # Goals are reached at times of their own, and the force was at its limit.
-    assert set(there.decision.tolist()) == {Decision.REACHED}
-    assert len(set(there.decision_tick.tolist())) > 1
+    assert there.decision.tolist() == [Decision.REACHED] * 4 + [Decision.LOST]
+    assert len(set(there.decision_tick[:4].tolist())) > 1
     np.testing.assert_allclose(there.peak_wrench[:, 0].max(), 10.0)
 
 
@@ -386,92 +383,6 @@ def test_a_controller_at_another_rate_is_refused() -> None:
     flights = controlled("planar_manipulator", SHAPE, ticks=5)
     with pytest.raises(ParameterError, match="different rates"):
         dataclasses.replace(flights, control_period=0.02)
-
-
-@pytest.mark.parametrize("law", ["transposed_jacobian", "model_based"])
-def test_the_function_of_lanes_is_the_controller_and_its_monitor(
-    monkeypatch: pytest.MonkeyPatch, law: str
-) -> None:
-    """State by state: measurements, commands, and what the monitor remembers and decides."""
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    flights = controlled(
-        *("planar_manipulator", SHAPE),
-        ticks=9,
-        count=3,
-        law=law,
-        gains=Gains.uniform(1000.0, 60.0) if law == "transposed_jacobian" else Gains.uniform(9, 6),
-        position_tolerance=0.2,
-        attitude_tolerance=0.03,
-        max_force=10.0,
-        motion=MotionLimits(1.0, 1.0, 1.0, 1.0),
-    )
-    control = BatchController.of(flights)
-    function = control.function()
-    # The base and two joints: their two rates, after the pose and the twist of the base.
-    assert dict(zip(function.name_in(), map(function.size1_in, range(11)), strict=True)) == {
-        **{"state": 17, "pose": 7, "twist": 6, "normals": 16, "bias": 8, "sigma": 6, "time": 1},
-        **{"profile": function.size1_in(7), "gains": 10, "bounds": 5, "monitor": 3},
-    }
-    rng = np.random.default_rng(8)
-    start = ControlState.at_rest(np.array([0.01, -0.02, 0.0]), np.array([0.0, 0, 0, 1]), SHAPE)
-    profile, bounds = control.begin_flight(1, start)
-    goal = profile.goal
-    numbers, gains = control.profile_argument(profile), control.gains_argument([2, 1])[1]
-    assert numbers[0] == profile.duration > 0
-    begun = control.begin_flight(1, start)
-    np.testing.assert_array_equal(begun[1], bounds)
-    monitor, decisions = GoalMonitor(), []
-    memory = np.array([-1.0, 0.0, 0.0])
-    assert goal.base is not None
-    upright = goal.base.quaternion / np.linalg.norm(goal.base.quaternion)
-    at_goal = ControlState.at_rest(goal.base.position, upright, SHAPE)
-    cases = [(tick, False, 1.0) for tick in range(4)] + [(900 + k, True, 1.0) for k in range(25)]
-    cases += [(925 + k, False, 40.0 if k < 4 else 400.0) for k in range(8)]
-    for tick, settled, size in cases:
-        spread = 1e-4 if settled else 0.003 * size
-        truth = at_goal if settled else start
-        q, qdot = truth.q + spread * rng.normal(size=2), 10 * spread * rng.normal(size=2)
-        twist = spread * np.array([1.0, -2.0, 0.0, 0.0, 0.0, 1.5])
-        normals, sigma = rng.normal(size=16), 1e-5 * np.arange(1.0, 7.0)
-        bias = 1e-5 * rng.normal(size=8)
-        for plane in (bias, normals):
-            plane[[2, 3, 4]] = 0.0
-        normals[[8, 9, 10]] = 0.0
-        turn = Rotation.from_rotvec(bias[3:6] + sigma[1] * normals[3:6])
-        measured = ControlState(
-            truth.r_WB + bias[:3] + sigma[0] * normals[:3],
-            (Rotation.from_quat(truth.quaternion_WB) * turn).as_quat(),
-            twist[:3] + sigma[2] * normals[6:9],
-            twist[3:] + sigma[3] * normals[9:12],
-            q + bias[6:] + sigma[4] * normals[12:14],
-            qdot + sigma[5] * normals[14:],
-        )
-        state = np.concatenate([q, truth.quaternion_WB, qdot, np.zeros(9)])
-        pose = np.concatenate([truth.r_WB, truth.quaternion_WB])
-        results = function(
-            *(state, pose, twist, normals, bias, sigma, control.time_of_tick(tick)),
-            *(numbers, gains, bounds, memory),
-        )
-        command, exact, seen, verdict, after = (np.array(each).ravel() for each in results)
-        wanted = np.zeros(17)
-        measured.stack(wanted)
-        np.testing.assert_allclose(seen, wanted, rtol=1e-12, atol=1e-15)
-        expected = np.concatenate(command_of(control, tick, measured))
-        if not exact[0]:
-            np.testing.assert_allclose(command, expected, rtol=1e-9, atol=1e-9)
-        assert bool(exact[0]) <= (size > 1.0)
-        saturated = control.exact_command(1, profile, tick, measured)
-        np.testing.assert_allclose(saturated, expected)
-        decision = decide(control, monitor, tick, measured.qdot, bounds)
-        decisions.append(decision)
-        assert verdict[0] == decision
-        memory = after
-        np.testing.assert_allclose(memory, dataclasses.astuple(monitor)[1:])
-    assert decisions[:4] == [Decision.NONE] * 4
-    # Settled for 0.2 s, twenty ticks of 10 ms after the first.
-    assert decisions[4:29] == [Decision.NONE] * 20 + [Decision.REACHED] * 5
-    assert decisions[-1] is Decision.LOST
-    assert memory[1:].max() >= 3
 
 
 @pytest.mark.slow

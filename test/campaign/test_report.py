@@ -179,9 +179,6 @@ def test_what_grows_to_both_sides_is_found(tmp_path: Path) -> None:
     assert (strongest.cause, strongest.metric) == ("mass.mass_1", "position_error_m")
     assert abs(strongest.correlation) < 0.3
     assert strongest.distance_correlation > 0.9
-    x, y = results.drawn_numbers["mass.mass_1"], results.columns["position_error_m"]
-    expected = stats.spearmanr(np.abs(x - np.median(x)), y)
-    assert strongest.distance_correlation == pytest.approx(expected.statistic)
     assert "distance from the median" in str(strongest)
     worst = results.worst_rows()
     errors = results.columns["position_error_m"]

@@ -65,80 +65,36 @@ def applied(name: str, scenario: Scenario, value: Any) -> tuple[list[Any], dict[
     return targets, changes(scenario, flight, factors)
 
 
+def with_fault(index: int, *lines: str) -> dict[str, Any]:
+    """Return the faults of the scenario with others in place of one."""
+    return {"plant.faults": (*FAULTS[:index], *lines, *FAULTS[index + 1 :])}
+
+
+SHAPE, RATES = "plant.initial_joint_positions", "plant.initial_joint_velocities"
+BY_EFFORT = {RATES: (0.25, 0.0, 0.0), "plant.actuation": "effort"}
+
 CASES: dict[str, tuple[float | str, str, dict[str, Any]]] = {
     "plant.tick_rate": (12.5, "Hz", {"plant.tick_rate": 12.5, "planner.tick_rate": 12.5}),
     "planner.position_tolerance": (0.07, "m", {"planner.position_tolerance": 0.07}),
-    "plant.initial_joint_positions[1]": (
-        0.75,
-        "m or rad",
-        {"plant.initial_joint_positions": (0.5, 0.75, 0.125)},
-    ),
-    "plant.initial_joint_positions[slider_3]": (
-        0.75,
-        "m or rad",
-        {"plant.initial_joint_positions": (0.5, -0.25, 0.75)},
-    ),
-    "plant.initial_joint_velocities[0]": (
-        0.25,
-        "m/s or rad/s",
-        {"plant.initial_joint_velocities": (0.25, 0.0, 0.0), "plant.actuation": "effort"},
-    ),
+    f"{SHAPE}[1]": (0.75, "m or rad", {SHAPE: (0.5, 0.75, 0.125)}),
+    f"{SHAPE}[slider_3]": (0.75, "m or rad", {SHAPE: (0.5, -0.25, 0.75)}),
+    f"{RATES}[0]": (0.25, "m/s or rad/s", BY_EFFORT),
     "plant.initial_position[2]": (5.5, "m", {"plant.initial_position": (1.0, 2.0, 5.5)}),
     "initial.position.y": (0.25, "m", {"plant.initial_position": (1.0, 2.25, 3.0)}),
-    "initial.joints.slider_2": (
-        0.5,
-        "m or rad",
-        {"plant.initial_joint_positions": (0.5, 0.25, 0.125)},
-    ),
-    "faults[0].at": (
-        6.5,
-        "s",
-        {"plant.faults": ("joint_stuck slider_2 at 6.5 until 9", *FAULTS[1:])},
-    ),
-    "faults[0].until": (
-        8.5,
-        "s",
-        {"plant.faults": ("joint_stuck slider_2 at 5 until 8.5", *FAULTS[1:])},
-    ),
-    "faults[1].at": (
-        2.5,
-        "s",
-        {"plant.faults": (FAULTS[0], "joint_slow slider_1 0.5 at 2.5 until 7", FAULTS[2])},
-    ),
-    "faults[1].value": (
-        0.75,
-        "",
-        {"plant.faults": (FAULTS[0], "joint_slow slider_1 0.75 until 7", FAULTS[2])},
-    ),
-    "faults[1].target": (
-        "slider_3",
-        "",
-        {"plant.faults": (FAULTS[0], "joint_slow slider_3 0.5 until 7", FAULTS[2])},
-    ),
-    "faults[1].kind": (
-        "joint_stuck",
-        "",
-        {"plant.faults": (FAULTS[0], "joint_stuck slider_1 until 7", FAULTS[2])},
-    ),
-    "faults[2].kind": (
-        "actuator_noise",
-        "",
-        {"plant.faults": (*FAULTS[:2], "actuator_noise slider_3 0.125")},
-    ),
-    "faults[1].present": (0.0, "", {"plant.faults": (FAULTS[0], FAULTS[2])}),
-    "faults[2].until": (
-        4.5,
-        "s",
-        {"plant.faults": (*FAULTS[:2], "actuator_bias slider_3 0.125 until 4.5")},
-    ),
+    "initial.joints.slider_2": (0.5, "m or rad", {SHAPE: (0.5, 0.25, 0.125)}),
+    "faults[0].at": (6.5, "s", with_fault(0, "joint_stuck slider_2 at 6.5 until 9")),
+    "faults[0].until": (8.5, "s", with_fault(0, "joint_stuck slider_2 at 5 until 8.5")),
+    "faults[1].at": (2.5, "s", with_fault(1, "joint_slow slider_1 0.5 at 2.5 until 7")),
+    "faults[1].value": (0.75, "", with_fault(1, "joint_slow slider_1 0.75 until 7")),
+    "faults[1].target": ("slider_3", "", with_fault(1, "joint_slow slider_3 0.5 until 7")),
+    "faults[1].kind": ("joint_stuck", "", with_fault(1, "joint_stuck slider_1 until 7")),
+    "faults[1].present": (0.0, "", with_fault(1)),
+    "faults[2].kind": ("actuator_noise", "", with_fault(2, "actuator_noise slider_3 0.125")),
+    "faults[2].until": (4.5, "s", with_fault(2, "actuator_bias slider_3 0.125 until 4.5")),
     "mass": (1.25, "1", {"mass": [1.25, 1.25, 1.25, 1.25]}),
     "mass.mass_2": (0.75, "1", {"mass": [1.0, 1.0, 0.75, 1.0]}),
     "inertia.mass_3": (1.5, "1", {"inertia": [1.0, 1.0, 1.0, 1.5]}),
-    "com.mass_1.y": (
-        0.25,
-        "m",
-        {"com": [[0.0, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]},
-    ),
+    "com.mass_1.y": (0.25, "m", {"com": [[0.0] * 3, [0.0, 0.25, 0.0], [0.0] * 3, [0.0] * 3]}),
     "com.*": (0.5, "m", {"com": [[0.5, 0.5, 0.5]] * 4}),
 }
 """A value for each name, the unit of the name, and all that it changes."""

@@ -476,26 +476,6 @@ def test_goal_out_of_reach_is_approached_and_held_quietly(name: str) -> None:
     assert peak < 200.0
 
 
-@pytest.mark.parametrize("name", INVERTIBLE)
-def test_wrist_singularity_of_the_spatial_arm(name: str) -> None:
-    """A straight wrist: two joint axes in line."""
-    robot = load("servicer")
-    gains = Gains.uniform(1.0, 2.0)
-    q = np.array([0.2, -1.2, 2.0, 0.3, 0.0, -0.4])
-    start = ControlState.at_rest(np.zeros(3), LEVEL, q)
-    law = law_of(name, robot, gains)
-    present = Reference.present(robot, start, END_EFFECTOR)
-    assert present.end_effector is not None
-    goal = Reference(
-        pose([0.1, 0.1, 0.0], [0.0, 0.1, 0.1]),
-        pose(present.end_effector.position + 0.1, [0.3, 0.4, 0.2]),
-    )
-    actuation = law.command(start, goal)
-    assert law.status.singular
-    assert law.status.smallest_singular_value < 1e-12
-    assert np.abs(np.concatenate([actuation.wrench_B, actuation.tau])).max() < 500.0
-
-
 @pytest.mark.parametrize("wrist", [0.0, 0.02, -0.8])
 def test_a_motion_through_a_singularity_is_followed(wrist: float) -> None:
     """Its wrench and efforts, for Pinocchio, are the command if the reference has its joints."""

@@ -169,29 +169,15 @@ def test_velocities_and_accelerations_are_derivatives(seed: int) -> None:
     for fraction in (0.1, 0.5, 0.83):
         time = fraction * profile.duration
         before, now, after = (parts(profile.at(time + dt)) for dt in (-STEP, 0.0, STEP))
-        for i in (0, 1):
-            b, n, a = before[i], now[i], after[i]
-            assert isinstance(b, PoseReference)
-            assert isinstance(n, PoseReference)
-            assert isinstance(a, PoseReference)
-            np.testing.assert_allclose(
-                n.velocity, (a.position - b.position) / (2 * STEP), atol=1e-6
-            )
+        rates, changes = [now[2].qdot, now[2].qddot], []
+        changes += [after[2].q - before[2].q, after[2].qdot - before[2].qdot]
+        for n, b, a in zip(now[:2], before[:2], after[:2], strict=True):
             turn = Rotation.from_quat(a.quaternion) * Rotation.from_quat(b.quaternion).inv()
-            np.testing.assert_allclose(n.angular_velocity, turn.as_rotvec() / (2 * STEP), atol=1e-6)
-            for value, rate in (
-                ("velocity", n.acceleration),
-                ("angular_velocity", n.angular_acceleration),
-            ):
-                change = getattr(a, value) - getattr(b, value)
-                np.testing.assert_allclose(rate, change / (2 * STEP), atol=1e-6)
-        joints = [found[2] for found in (before, now, after)]
-        np.testing.assert_allclose(
-            joints[1].qdot, (joints[2].q - joints[0].q) / (2 * STEP), atol=1e-6
-        )
-        np.testing.assert_allclose(
-            joints[1].qddot, (joints[2].qdot - joints[0].qdot) / (2 * STEP), atol=1e-6
-        )
+            rates += [n.velocity, n.angular_velocity, n.acceleration, n.angular_acceleration]
+            changes += [a.position - b.position, turn.as_rotvec()]
+            changes += [a.velocity - b.velocity, a.angular_velocity - b.angular_velocity]
+        for rate, change in zip(rates, changes, strict=True):
+            np.testing.assert_allclose(rate, change / (2 * STEP), atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -83,13 +83,6 @@ def test_of_equal_allocations_the_one_with_least_shares_is_taken() -> None:
     np.testing.assert_allclose(held, [0.05, 0.1], atol=1e-9)
 
 
-def test_a_wheel_that_may_not_turn_faster_gives_nothing_that_way() -> None:
-    allocation = WheelAllocation(np.eye(3), np.array([0.1, 0.2, 0.3]))
-    upper = np.array([0.0, 0.2, 0.3])
-    tau = allocation.allocate(np.array([0.05, 0.3, -0.1]), -np.array([0.1, 0.2, 0.3]), upper)
-    np.testing.assert_allclose(tau, [0.0, 0.2, -0.1], atol=1e-9)
-
-
 def test_the_least_torque_of_a_pyramid_is_that_along_its_worst_direction() -> None:
     allocation = WheelAllocation(TENDER.axes_B, TENDER.torque)
     directions = RNG.normal(size=(2000, 3))

@@ -133,6 +133,11 @@ def test_every_component_has_its_noise_and_no_mean() -> None:
         # No tick knows of the one before.
         lagged = np.sum(errors[1:] * errors[:-1], axis=0) / np.sum(errors**2, axis=0)
         assert np.abs(lagged).max() < 5 / np.sqrt(ticks)
+    # A seed is a flight.
+    again, other = (Flight(replace(NOISY, seed=s), ticks=50) for s in (3, 6))
+    np.testing.assert_array_equal(again.measured, flight.measured[:50])
+    np.testing.assert_array_equal(again.true, other.true)
+    assert np.abs(again.measured - other.measured).max() > 1e-3
 
 
 def test_one_noise_leaves_the_rest_exact() -> None:
@@ -140,13 +145,6 @@ def test_one_noise_leaves_the_rest_exact() -> None:
     errors = flight.errors()
     assert np.abs(errors.pop("attitude")).min() > 0.0
     assert all(not error.any() for error in errors.values())
-
-
-def test_a_seed_is_a_flight() -> None:
-    once, again, other = (Flight(replace(NOISY, seed=s), ticks=50) for s in (5, 5, 6))
-    np.testing.assert_array_equal(once.measured, again.measured)
-    np.testing.assert_array_equal(once.true, other.true)
-    assert np.abs(once.measured - other.measured).max() > 1e-3
 
 
 def test_biases_are_added_and_attitudes_turned_in_the_base() -> None:

@@ -151,39 +151,25 @@ def _controlled_commands(controller: BatchController, row: int, result: BatchRes
         if tick == 0:
             profile, bounds = controller.begin_flight(row, state)
             goal = profile.goal
-        commands = command_of(controller, tick, state)
-        decision = decide(controller, monitor, tick, state.qdot, bounds)
+        control, time = controller.controller, controller.time_of_tick(tick)
+        realised = control.command(time, state, state.q, state.qdot).realised
+        assert control.reference_ends is not None
+        found = monitor.decide(
+            time,
+            control.reference_at_rest(time),
+            control.reference_ends,
+            control.errors(),
+            control.joint_rate_limits.largest_rate_share(state.qdot),
+            control.law.largest_error_share(bounds),
+            controller.program.config.for_robot(control.law.robot.description),
+        )
+        decision = Decision(int(found))
         if decision is not Decision.NONE and result.decision[row] == Decision.NONE:
             result.decision[row], result.decision_tick[row] = decision, tick
-            result.decision_distance[row] = controller.controller.distance_between(state, goal)
-        return commands
+            result.decision_distance[row] = control.distance_between(state, goal)
+        return [realised.tau, realised.wrench_B]
 
     return command
-
-
-def command_of(control: BatchController, tick: int, state: ControlState) -> list[Array]:
-    """Return the efforts and the wrench for a state of the last started flight."""
-    time = control.time_of_tick(tick)
-    realised = control.controller.command(time, state, state.q, state.qdot).realised
-    return [realised.tau, realised.wrench_B]
-
-
-def decide(
-    control: BatchController, monitor: GoalMonitor, tick: int, qdot: Array, bounds: Array
-) -> Decision:
-    """Return the goal decision after the last command, for measured joint rates (n,)."""
-    controller, time = control.controller, control.time_of_tick(tick)
-    assert controller.reference_ends is not None
-    found = monitor.decide(
-        time,
-        controller.reference_at_rest(time),
-        controller.reference_ends,
-        controller.errors(),
-        controller.joint_rate_limits.largest_rate_share(qdot),
-        control.law.largest_error_share(bounds),
-        control.program.config.for_robot(control.law.robot.description),
-    )
-    return Decision(int(found))
 
 
 def _update_peaks(plant: Plant, commands: Sequence[Array], result: BatchResult, row: int) -> None:
