@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.full_disk import MakeDisk
 from support.hostile.records import string
+from support.made_bags import STRING
 
 from spacerobot_ros.bag import (
     BagWriter,
@@ -23,10 +25,7 @@ from spacerobot_ros.bag import (
     read_bag,
 )
 from spacerobot_ros.bag.config import RecorderConfig
-from spacerobot_ros.bag.mcap_file import McapFile
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
-
-STRING = "std_msgs/msg/String"
 
 
 def numbers(path: Path) -> list[int]:
@@ -120,10 +119,6 @@ def test_a_file_in_the_way_of_a_split_is_stepped_over(tmp_path: Path) -> None:
 # -- a file that goes while it is written ------------------------------------------------------
 
 
-def unlink(path: Path) -> None:
-    path.unlink()
-
-
 def replace(path: Path) -> None:
     other = path.with_suffix(".other")
     other.write_bytes(path.read_bytes())
@@ -153,24 +148,29 @@ def lengthen(path: Path) -> None:
         file.write(b"x")
 
 
-def test_a_path_that_cannot_be_followed_is_told_by_its_reason(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    with BagWriter(path) as writer:
-        path.rename(tmp_path / "b.mcap")
-        path.symlink_to(path)
-        with pytest.raises(RecordingError) as caught:
-            writer.check()
-        reason = os.strerror(errno.ELOOP)
-        assert str(caught.value) == f"The bag {path} was lost during recording: {reason}."
-        path.unlink()
-        (tmp_path / "b.mcap").rename(path)
+def link_to_itself(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path)
+
+
+GONE = "it was removed or moved"
 
 
 @pytest.mark.parametrize(
-    "harm", [unlink, replace, move, remove_folder, replace_folder, cut, lengthen]
+    ("harm", "reason"),
+    [
+        (Path.unlink, GONE),
+        (replace, "another file replaced it"),
+        (move, GONE),
+        (remove_folder, GONE),
+        (replace_folder, GONE),
+        (cut, "it has 20 bytes, but "),
+        (lengthen, "were written"),
+        (link_to_itself, os.strerror(errno.ELOOP)),
+    ],
 )
 def test_a_file_that_goes_while_it_is_written_is_missed(
-    tmp_path: Path, harm: Callable[[Path], None]
+    tmp_path: Path, harm: Callable[[Path], None], reason: str
 ) -> None:
     path = tmp_path / "folder" / "a.mcap"
     failures: list[RecordingError] = []
@@ -186,7 +186,8 @@ def test_a_file_that_goes_while_it_is_written_is_missed(
     recording.check()
     recording.check()
     (failure,) = failures
-    assert f"The bag {path} was lost during recording: " in str(failure)
+    assert str(failure).startswith(f"The bag {path} was lost during recording: ")
+    assert reason in str(failure)
     assert recording.failure is failure
     assert not recording.running
     recording.close()
@@ -201,18 +202,23 @@ def test_a_file_that_goes_just_before_the_end_is_missed(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_is_full_at_the_very_end_is_a_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, make_disk: MakeDisk
 ) -> None:
-    def finish(self: McapFile) -> None:
-        self.close()
-        raise RecordingError(f"Cannot write the bag {self.path}: no space.")
-
-    recording = Recording(BagWriter(tmp_path / "a.mcap"), 0.0)
+    disk, path = make_disk(1_000_000), tmp_path / "a.mcap"
+    recording = Recording(BagWriter(path), 0.0)
+    channel = recording.writer.add_topic("/a", STRING)
     recording.start()
-    monkeypatch.setattr(McapFile, "finish", finish)
-    with pytest.raises(RecordingError, match="no space"):
+    recording.set_clock(5)
+    recording.record(channel, string("000007"))
+    recording.flush(True)
+    # Enough for the counts of the recording, and not for the end of the bag.
+    disk.size = path.stat().st_size + 200
+    with pytest.raises(RecordingError, match="No space left on device"):
         recording.close()
     assert recording.failure is not None
+    recording.close()
+    disk.size = 1_000_000
+    assert saved(path) == [7]
 
 
 # -- kills -------------------------------------------------------------------------------------

@@ -18,13 +18,13 @@ from rosbags.interfaces import (
     QosTime,
 )
 from support.hostile.records import string
+from support.made_bags import STRING
+from support.raw_messages import Content
 
 from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, type_hash
 
 Sample = tuple[str, str, Any]
 AssertSame = Callable[[Any, Any], None]
-
-STRING = "std_msgs/msg/String"
 
 
 @pytest.fixture
@@ -62,9 +62,7 @@ def test_rosbags_decodes_every_type(
 def test_the_channel_metadata_are_those_of_rosbag2(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.mcap") as writer:
         writer.add_topic("/robot_description", STRING, LATCHED)
-    with (tmp_path / "a.mcap").open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
+    summary = Content(tmp_path / "a.mcap").summary
     (channel,) = summary.channels.values()
     (schema,) = summary.schemas.values()
     assert (schema.name, schema.encoding, channel.message_encoding) == (STRING, "ros2msg", "cdr")

@@ -17,13 +17,13 @@ import pandas as pd
 import pytest
 import yaml
 import zstandard
-from mcap.reader import make_reader
 from mcap.writer import MCAP0_MAGIC
 from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-from support.command_line import CliRunner
+from support.altered_bags import altered
+from support.command_line import spacerobot
 from support.hostile.records import CASES, Part, bag, message, plain, raw, string, zstd_zeros
 from support.hostile_bags import QUICK
 from support.sentences import assert_one_sentence
@@ -39,7 +39,6 @@ from spacerobot_ros.bag import (
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
 from spacerobot_ros.bag.mcap_reading import INFLATED_SIZE_VARIABLE
 from spacerobot_ros.bag.salvage import last_state, salvage_bag
-from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.reading import open_flight_bag
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.resources import share_directory
@@ -95,8 +94,7 @@ def split_bag(tmp_path: Path) -> Path:
 
 def exported(bag: Path, folder: Path) -> dict[str, pd.DataFrame]:
     """Export by the command; return the tables as pandas reads them."""
-    result = CliRunner().invoke(main, ["export", str(bag), "-o", str(folder)])
-    assert result.exit_code == 0, result.output
+    spacerobot("export", bag, "-o", folder)
     files = [file for file in folder.glob("*.csv") if file.name != "_columns.csv"]
     return {file.stem: pd.read_csv(file) for file in files}
 
@@ -124,8 +122,7 @@ def test_a_split_bag_is_one_bag(split_bag: Path, tmp_path: Path) -> None:
     assert playback.ended
     for words in (["report"], ["figures", "--format", "svg"]):
         out = str(tmp_path / words[0])
-        result = CliRunner().invoke(main, [*words, str(split_bag), "-o", out])
-        assert result.exit_code == 0, result.output
+        spacerobot(*words, split_bag, "-o", out)
     (split_bag / "metadata.yaml").unlink()
     with pytest.raises(RecordingError, match="contains 11 MCAP files: name one of them"):
         read_bag(split_bag)
@@ -157,31 +154,10 @@ def test_a_split_flight_is_verified_as_the_whole(tmp_path: Path) -> None:
     """Its commands, and the states between two files, are in both."""
     folder = tmp_path / "flight"
     folder.mkdir()
-    with FLIGHT.open("rb") as file:
-        reader = make_reader(file)
-        messages = list(reader.iter_messages(log_time_order=False))
-        attachments, records = list(reader.iter_attachments()), list(reader.iter_metadata())
-    for part in (0, 1):
-        with (folder / f"flight_{part}.mcap").open("wb") as out:
-            writer = McapWriter(out)
-            writer.start("ros2")
-            for each in attachments:
-                writer.add_attachment(0, 0, each.name, each.media_type, each.data)
-            for record in records:
-                writer.add_metadata(record.name, record.metadata)
-            # Numbers of channels differ between the files.
-            half = messages[: len(messages) // 2] if part == 0 else messages[len(messages) // 2 :]
-            channels: dict[str, int] = {}
-            for schema, channel, message in half:
-                assert schema is not None
-                if channel.topic not in channels:
-                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[channel.topic] = writer.register_channel(
-                        channel.topic, channel.message_encoding, number, channel.metadata
-                    )
-                number = channels[channel.topic]
-                writer.add_message(number, message.log_time, message.data, message.publish_time)
-            writer.finish()
+    middle = 17 * 10**9
+    altered(FLIGHT, folder / "flight_0.mcap", end_ns=middle)
+    # Numbers of channels differ between the files.
+    altered(FLIGHT, folder / "flight_1.mcap", begin_ns=middle)
     files = {"relative_file_paths": ["flight_0.mcap", "flight_1.mcap"]}
     text = yaml.safe_dump({"rosbag2_bagfile_information": files})
     (folder / "metadata.yaml").write_text(text)
@@ -209,7 +185,7 @@ def test_a_compressed_file_is_read(tmp_path: Path) -> None:
     file.write_bytes(zstandard.compress(bytes(40_000_000)))
     with pytest.raises(RecordingError, match=r"inflates to .*more than the 32000000 allowed"):
         read_bag(file)
-    refused = CliRunner().invoke(main, ["salvage", str(file)]).stderr
+    refused = spacerobot("salvage", file, code=2).stderr
     assert_one_sentence(refused, "is compressed: unpack it with 'zstd -d'")
 
 
@@ -262,7 +238,7 @@ def test_topics_that_cannot_be_read_are_named_and_the_rest_is_written(
     )
     bag = read_bag(mixed)
     assert bag.to_pandas().keys() == bag.to_xarray().keys() == {"/joint_states"}
-    refused = CliRunner().invoke(main, ["export", str(mixed), "--topic", "chatter"]).stderr
+    refused = spacerobot("export", mixed, "--topic", "chatter", code=2).stderr
     assert_one_sentence(refused, "'cdr' defined by 'ros2idl'")
 
 
@@ -377,14 +353,6 @@ def test_a_sentence_names_the_place(tmp_path: Path) -> None:
         read_bag(path)
 
 
-def make_pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def make_folder(path: Path) -> None:
-    path.mkdir()
-
-
 def make_socket(path: Path) -> None:
     home = os.getcwd()
     try:
@@ -402,10 +370,10 @@ def make_device(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (make_pipe, "it is a pipe"),
+        (os.mkfifo, "it is a pipe"),
         (make_socket, "it is a socket"),
         (make_device, "it is a device"),
-        (make_folder, "it is a folder|contains no bag"),
+        (Path.mkdir, "it is a folder|contains no bag"),
     ],
 )
 def test_what_is_no_file_is_neither_read_nor_written(
@@ -425,8 +393,7 @@ def test_what_is_no_file_is_neither_read_nor_written(
         with pytest.raises(RecordingError, match=words):
             act(path)
     for name in ("verify", "report", "salvage"):
-        result = CliRunner().invoke(main, [name, str(path)])
-        assert result.exit_code == 2
+        result = spacerobot(name, path, code=2)
         assert len(result.output.splitlines()) == 1
 
 

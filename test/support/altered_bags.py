@@ -31,6 +31,7 @@ def altered(
     urdf: tuple[bytes, bytes] = (b"", b""),
     injected: dict[int, str] | None = None,
     begin_ns: int = 0,
+    end_ns: int = 2**63,
     node: str = "plant",
     log_time: Callable[[int], int] = lambda time_ns: time_ns,
 ) -> Path:
@@ -38,8 +39,8 @@ def altered(
 
     The message of that number on a topic, some of the parameters of a ``node``, or one text in the
     URDF that another takes the place of. ``injected`` adds messages on /fault_injection, by log
-    time; what was logged before ``begin_ns`` is left out. ``log_time`` gives messages other log
-    times, ns.
+    time; messages are kept from ``begin_ns`` to before ``end_ns``. ``log_time`` gives messages
+    other log times, ns.
     """
     count = 0
     with bag.open("rb") as source, out.open("wb") as target:
@@ -59,7 +60,7 @@ def altered(
                 writer.add_metadata(metadata.name, values)
         for schema, channel, message in reader.iter_messages(log_time_order=False):
             assert schema is not None
-            if message.log_time < begin_ns:
+            if not begin_ns <= message.log_time < end_ns:
                 continue
             if channel.id not in channels:
                 schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)

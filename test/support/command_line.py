@@ -8,6 +8,8 @@ from typing import Any
 from click import testing
 from click.testing import Result as Result
 
+from spacerobot_ros.cli.main import main
+
 _OLD = "mix_stderr" in inspect.signature(testing.CliRunner.__init__).parameters
 """Before 8.2 both are one, or else the output is the standard output alone."""
 
@@ -32,3 +34,10 @@ class CliRunner(testing.CliRunner):
         if _OLD:
             result.__class__ = _Both
         return result
+
+
+def spacerobot(*words: object, code: int | None = 0) -> Result:
+    """Call the command with some words, which is to end with an exit code; None: with any."""
+    result = CliRunner().invoke(main, [str(word) for word in words])
+    assert code is None or result.exit_code == code, result.output
+    return result

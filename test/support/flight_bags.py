@@ -8,15 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from support.made_bags import array, joint_states, made_bag, odometry, pose, status
 
-from spacerobot_ros.bag import BagWriter
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 
@@ -86,14 +80,10 @@ def tell(path: Path, story: Story) -> Path:
     rates = rates_of(story.shapes)
     share = np.linspace(0, 1, count) if count > 1 else np.ones(1)
     names = [f"{story.name}{i}" for i in range(n)]
-    with BagWriter(path) as bag:
+    with made_bag(path) as (bag, say_at):
 
         def say(topic: str, message: Any, time: float) -> None:
-            kind = type(message)
-            package = kind.__module__.split(".")[0]
-            channel = bag.add_topic(f"{story.prefix}/{topic}", f"{package}/msg/{kind.__name__}")
-            now = round(time * 1e9)
-            bag.write(channel, bytes(serialize_message(message)), now, now)
+            say_at(f"{story.prefix}/{topic}", message, time)
 
         for name, values in story.metadata.items():
             bag.add_metadata(name, values)
@@ -101,47 +91,28 @@ def tell(path: Path, story: Story) -> Path:
             text = story.urdf or urdf_of(n)
             bag.add_attachment("robot_description.urdf", text.encode(), "application/xml", 0)
         for time, r, rotvec in story.goals:
-            say("goal_pose", pose_message(time, r, rotvec), time)
+            say("goal_pose", pose(time, *r, *quaternion_from_rotvec(rotvec)), time)
         for time, sentence, values in story.statuses:
-            pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-            say("planner/status", DiagnosticStatus(message=sentence, values=pairs), time)
+            say("planner/status", status(values, sentence), time)
         for time, values in story.events:
-            pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-            say("events", DiagnosticStatus(name="/node", message="It is so.", values=pairs), time)
+            say("events", status(values, "It is so.", "/node"), time)
         for k in range(count):
-            time = k * TICK
-            pose = pose_message(time, share[k] * np.array(FINAL[0]), share[k] * np.array(FINAL[1]))
-            joints = JointState(
-                header=pose.header,
-                name=names,
-                position=story.shapes[k].tolist(),
-                velocity=rates[k].tolist(),
-            )
-            odometry = Odometry(header=pose.header)
-            odometry.pose.pose = pose.pose
+            time, rotvec = k * TICK, share[k] * np.array(FINAL[1])
+            at = (*(share[k] * np.array(FINAL[0])), *quaternion_from_rotvec(rotvec))
             ledger = [1e-16 * k, 0.0, 0.0, 0.0, -2e-16 * k, 0.0, 0.5 * share[k]]
             messages = {
-                "odom": odometry,
-                "joint_states": joints,
-                "momentum": Float64MultiArray(data=[float(x) for x in ledger]),
+                "odom": odometry(time, *at),
+                "joint_states": joint_states(
+                    time, names, story.shapes[k].tolist(), rates[k].tolist()
+                ),
+                "momentum": array(*ledger),
             }
             for topic in story.topics:
                 say(topic, messages[topic], time)
         if story.goals:
-            path_message = PathMessage(poses=[pose_message(0.0, [0.0] * 3, [0.0] * 3), pose])
+            path_message = PathMessage(poses=[pose(0.0, 0, 0, 0, 0, 0, 0, 1), pose(time, *at)])
             say("planned_path", path_message, 0.0)
     return path
-
-
-def pose_message(time: float, r: Any, rotvec: Any) -> PoseStamped:
-    message = PoseStamped()
-    message.header.frame_id = "world"
-    sec, nanosec = divmod(round(time * 1e9), 10**9)
-    message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
-    position, o = message.pose.position, message.pose.orientation
-    position.x, position.y, position.z = (float(x) for x in r)
-    o.x, o.y, o.z, o.w = (float(x) for x in quaternion_from_rotvec(rotvec))
-    return message
 
 
 def goal_value(r: Sequence[float] = GOAL[0], rotvec: Sequence[float] = GOAL[1]) -> dict[str, str]:

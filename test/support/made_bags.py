@@ -2,34 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from support.hostile.records import string
 
 from spacerobot_ros.bag import BagWriter
+
+STRING = "std_msgs/msg/String"
 
 Say = Callable[[str, Any, float], None]
 """Writes a message on a topic at a log time in s."""
 
 
+def bag_of_strings(path: Path, times: Sequence[float], **options: Any) -> Path:
+    """Write the numbers 0, 1, ... on /a at some times in s, a chunk each; /silent says nothing."""
+    with BagWriter(path, chunk_size=1, **options) as writer:
+        writer.add_topic("/silent", STRING)
+        channel = writer.add_topic("/a", STRING)
+        for n, time in enumerate(times):
+            writer.write(channel, string(f"{n}"), round(time * 1e9), round(time * 1e9))
+    return path
+
+
+def write_message(bag: BagWriter, topic: str, message: Any, time_ns: int) -> None:
+    """Write a message on a topic of its type."""
+    kind = type(message)
+    channel = bag.add_topic(topic, f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}")
+    bag.write(channel, bytes(serialize_message(message)), time_ns, time_ns)
+
+
 @contextmanager
-def made_bag(path: Path) -> Iterator[tuple[BagWriter, Say]]:
-    """Open a new bag; yield it, and what writes messages into it."""
-    with BagWriter(path) as bag:
+def made_bag(path: Path, **options: Any) -> Iterator[tuple[BagWriter, Say]]:
+    """Open a new bag with options of its writer; yield it, and what writes messages into it."""
+    with BagWriter(path, **options) as bag:
 
         def say(topic: str, message: Any, time: float) -> None:
-            kind = type(message)
-            package = kind.__module__.split(".")[0]
-            channel = bag.add_topic(topic, f"{package}/msg/{kind.__name__}")
-            now = round(time * 1e9)
-            bag.write(channel, bytes(serialize_message(message)), now, now)
+            write_message(bag, topic, message, round(time * 1e9))
 
         yield bag, say
 
@@ -55,11 +73,12 @@ def pose(time: float, *numbers: float) -> PoseStamped:
 
 
 def odometry(time: float, *numbers: float) -> Odometry:
-    """Return an odometry message of seven numbers of pose and six of twist."""
+    """Return an odometry message of seven numbers of pose and six, or none, of twist."""
     message = stamped(Odometry(), time, "world")
     _fill(message.pose.pose, numbers[:7])
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
-    linear.x, linear.y, linear.z, angular.x, angular.y, angular.z = map(float, numbers[7:])
+    twist = numbers[7:] or np.zeros(6)
+    linear.x, linear.y, linear.z, angular.x, angular.y, angular.z = map(float, twist)
     return message
 
 
@@ -68,6 +87,12 @@ def joint_states(
 ) -> JointState:
     """Return a message of joints without efforts."""
     return stamped(JointState(name=names, position=position, velocity=velocity), time)
+
+
+def status(values: Mapping[str, str], message: str = "", name: str = "") -> DiagnosticStatus:
+    """Return a status of a node with values by key."""
+    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+    return DiagnosticStatus(name=name, message=message, values=pairs)
 
 
 def array(*numbers: float) -> Float64MultiArray:

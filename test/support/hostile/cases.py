@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from io import BytesIO
 from pathlib import Path
 
@@ -75,10 +75,9 @@ for _size in (MOST, 2**63, 2**63 - 1, 2**40):
         ("lz4", lz4.frame.compress(TEXT)),
         ("", TEXT),
     ):
-        title = f"{_name or 'no compression'}: a chunk claims {_size} bytes"
-        CHUNKS[title] = Part(_name, _data, _size)
-for _title, _part in CHUNKS.items():
-    CASES[_title] = lambda part=_part: bag(part)  # type: ignore[misc]
+        _title = f"{_name or 'no compression'}: a chunk claims {_size} bytes"
+        CHUNKS[_title] = Part(_name, _data, _size)
+CASES |= {title: partial(bag, part) for title, part in CHUNKS.items()}
 
 
 def nested() -> bytes:
@@ -215,8 +214,7 @@ SCHEMAS: dict[str, tuple[str | bytes, str]] = {
     "a type with a control character": ("int32 x\n", "a/msg/\x1b[31mB\x00"),
     "a type of 100 kB": ("int32 x\n", "a/msg/" + "B" * 100_000),
 }
-for _title, (_text, _type) in SCHEMAS.items():
-    CASES[f"schema: {_title}"] = lambda text=_text, name=_type: of_type(text, name)  # type: ignore[misc]
+CASES |= {f"schema: {title}": partial(of_type, *given) for title, given in SCHEMAS.items()}
 
 
 LIST = f"C[] x\n{INNER}"
@@ -257,10 +255,10 @@ QOS = {
     "a megabyte": "- history: keep_last\n" * 50_000,
     "a tab and a zero": "-\t\0",
 }
-for _title, _text in QOS.items():
-    CASES[f"QoS: {_title}"] = lambda text=_text: bag(  # type: ignore[misc]
-        GOOD, channels=[channel(offered_qos_profiles=text)]
-    )
+CASES |= {
+    f"QoS: {title}": partial(bag, GOOD, channels=[channel(offered_qos_profiles=text)])
+    for title, text in QOS.items()
+}
 
 REFERENCE = Path(__file__).parents[3] / "bags" / "sliding_masses.mcap"
 
@@ -444,5 +442,4 @@ URDFS = {
         b'<joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>'
     ),
 }
-for _title, _urdf in URDFS.items():
-    CASES[f"URDF: {_title}"] = lambda urdf=_urdf: flight(urdf=urdf)  # type: ignore[misc]
+CASES |= {f"URDF: {title}": partial(flight, urdf=urdf) for title, urdf in URDFS.items()}
