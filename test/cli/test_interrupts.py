@@ -16,12 +16,11 @@ from pathlib import Path
 import pytest
 import yaml
 from support.campaigns import section
-from support.command_line import CliRunner, Result
+from support.command_line import Result, spacerobot
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.campaign.config import load_campaign
 from spacerobot_ros.campaign.dataset import Dataset
-from spacerobot_ros.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 PATIENCE = 60.0
@@ -135,8 +134,7 @@ def test_a_sentence_is_wrapped_on_a_terminal_and_one_line_elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("plan", "sliding_masses", "--goal", *"9000001")
-    elsewhere = CliRunner().invoke(main, list(words))
-    assert elsewhere.exit_code == 1
+    elsewhere = spacerobot(*words, code=1)
     (sentence,) = elsewhere.stderr.splitlines()
     ours, theirs = pty.openpty()
     monkeypatch.setenv("COLUMNS", "50")
@@ -165,9 +163,7 @@ def test_options_of_a_campaign_its_report_and_its_flights(
         Path(f"{name}.yaml").write_text(yaml.safe_dump(given))
 
     def call(line: str) -> Result:
-        result = CliRunner().invoke(main, ["campaign", *line.split()])
-        assert result.exit_code == 0, result.output
-        return result
+        return spacerobot("campaign", *line.split())
 
     words = "--flights 2 --engine flights --workers 0"
     said = call(f"fly first.yaml {words} --out there --report r.html").output
@@ -201,8 +197,7 @@ def test_a_campaign_of_errors_or_refused_goals_alone_fails(tmp_path: Path) -> No
         file.write_text(yaml.safe_dump(given), "utf-8")
         words = ["campaign", str(file), "--workers", "0", "--out", str(tmp_path / file.stem)]
         for _ in ("flown", "nothing left to fly"):
-            result = CliRunner().invoke(main, words)
-            assert result.exit_code == code, result.output
+            result = spacerobot(*words, code=code)
             assert ("None of the 2 draws could be flown" in result.output) == bool(code)
 
 

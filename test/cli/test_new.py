@@ -9,7 +9,6 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,15 +18,14 @@ import pytest
 import yaml
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from support.command_line import CliRunner
+from support.command_line import spacerobot
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.bag import RecordedRobot, read_bag
-from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.trials import PlanningProblem, try_method
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.model import SpaceRobot, parse_robot
-from spacerobot_ros.model.description import JointLimits
+from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
@@ -54,10 +52,14 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
+def new(*words: str, code: int = 0) -> str:
+    """Run `spacerobot new`, and return what it prints."""
+    return spacerobot("new", *words, code=code).output
+
+
 def test_a_new_robot_gets_a_scenario_that_reaches_its_goal(robot: Path) -> None:
-    result = CliRunner().invoke(main, ["new", robot.name])
-    assert result.exit_code == 0, result.output
-    assert result.output.splitlines()[-1] == "  spacerobot run mine.yaml"
+    printed = new(robot.name)
+    assert printed.splitlines()[-1] == "  spacerobot run mine.yaml"
     scenario = load_scenario("mine.yaml")
     problem = PlanningProblem.of(scenario)
     turned = Rotation.from_quat(problem.goal.quaternion).as_rotvec()
@@ -69,16 +71,14 @@ def test_a_new_robot_gets_a_scenario_that_reaches_its_goal(robot: Path) -> None:
 def test_the_scenario_stands_where_it_is_wanted_and_finds_its_robot(robot: Path) -> None:
     out = robot.parent / "scenarios" / "turn.yaml"
     out.parent.mkdir()
-    result = CliRunner().invoke(main, ["new", robot.name, "--out", str(out)])
-    assert result.exit_code == 0, result.output
+    new(robot.name, "--out", str(out))
     assert load_scenario(str(out)).parameters("plant")["robot"] == str(robot)
     assert not (robot.parent / "mine.yaml").exists()
 
 
 def test_no_scenario_is_overwritten(robot: Path) -> None:
     Path("mine.yaml").write_text("of the user", "utf-8")
-    result = CliRunner().invoke(main, ["new", str(robot), "--out", "mine.yaml"])
-    assert result.exit_code == 0, result.output
+    new(str(robot), "--out", "mine.yaml")
     assert Path("mine.yaml").read_text("utf-8") == "of the user"
     assert PlanningProblem.of(load_scenario("mine-1.yaml")).robot.n == 2
 
@@ -91,13 +91,11 @@ def test_a_robot_whose_collision_meshes_are_missing_flies_without_them(
     robot.write_text(text, "utf-8")
     turn = ["plan", robot.name, "--goal-rotvec", "0", "0", "0.02"]
     for words, code in (([], 0), (["--method", "optimal"], 1)):
-        plan = CliRunner().invoke(main, [*turn, *words])
-        assert plan.exit_code == code, plan.output
+        plan = spacerobot(*turn, *words, code=code)
         said = plan.output + caplog.text
         assert len(re.findall("cannot be checked: .*'package://gone/", said)) == 1
         caplog.clear()
-    result = CliRunner().invoke(main, ["new", robot.name])
-    assert result.exit_code == 0, result.output
+    new(robot.name)
     assert "clearance: 0.0   # m; contacts are not detected" in Path("mine.yaml").read_text("utf-8")
     scenario = load_scenario("mine.yaml")
     assert try_method(PlanningProblem.of(scenario), scenario.planner.method).reached
@@ -113,11 +111,8 @@ def test_an_impossible_inertia_becomes_the_nearest_possible_one_if_asked_for(rob
     )
     text = re.sub(r"<inertia [^>]*/>", f"<inertia {entries}/>", robot.read_text("utf-8"), count=1)
     robot.write_text(text, "utf-8")
-    refused = CliRunner().invoke(main, ["new", robot.name])
-    assert refused.exit_code == 2
-    assert "`spacerobot new URDF --nearest-inertia` writes" in refused.output
-    result = CliRunner().invoke(main, ["new", robot.name, "--nearest-inertia"])
-    assert result.exit_code == 0, result.output
+    assert "`spacerobot new URDF --nearest-inertia` writes" in new(robot.name, code=2)
+    printed = new(robot.name, "--nearest-inertia")
     best = minimize(
         lambda x: float(np.sum((x - given) ** 2)),
         [1.0, 1.0, 1.0],
@@ -128,7 +123,7 @@ def test_an_impossible_inertia_becomes_the_nearest_possible_one_if_asked_for(rob
     entry = [[float(found.get(f"i{''.join(sorted(a + b))}", "")) for b in "xyz"] for a in "xyz"]
     np.testing.assert_allclose(entry, turned @ np.diag(best) @ turned.T, atol=1e-6)
     change = np.linalg.norm(best - given) / np.linalg.norm(given)
-    assert f"is changed by {100 * change:.2g} %" in result.output
+    assert f"is changed by {100 * change:.2g} %" in printed
     mujoco.MjModel.from_xml_path("mine_possible.urdf")
     assert (
         Path(str(load_scenario("mine.yaml").parameters("plant")["robot"])).name
@@ -145,28 +140,9 @@ def test_a_robot_that_cannot_turn_its_base_is_told_so(robot: Path) -> None:
         '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>',
         "utf-8",
     )
-    result = CliRunner().invoke(main, ["new", str(robot)])
-    assert result.exit_code == 1, result.output
-    assert "rotate its base not at all" in result.output
+    printed = new(str(robot), code=1)
+    assert "rotate its base not at all" in printed
     assert not Path("mine.yaml").exists()
-
-
-def limited(limits: JointLimits) -> SpaceRobot:
-    """Return the planar chain with these limits of its first joint."""
-    text = robot_file("planar_chain").read_text("utf-8")
-    numbers = f'lower="{limits.lower}" upper="{limits.upper}" '
-    numbers += f'velocity="{limits.velocity}" effort="{limits.effort}"'
-    text = text.replace("continuous", "revolute", 1)
-    return SpaceRobot(parse_robot(re.sub("<limit [^>]*/>", f"<limit {numbers}/>", text, count=1)))
-
-
-@pytest.mark.parametrize(
-    ("lower", "upper", "first"),
-    [(-2.0, 2.0, 0.0), (-1.0, 1.9, 0.0), (-3.0, -1.0, -2.0), (0.0, 2.0, 1.0), (-0.1, 2.0, 0.95)],
-)
-def test_the_first_shape_has_room_to_all_sides(lower: float, upper: float, first: float) -> None:
-    shape = first_shape(limited(JointLimits(lower, upper, 1.0, 1.0)))
-    assert shape[0] == pytest.approx(first)
 
 
 @pytest.mark.parametrize("name", ["free_flyer", "surveyor", "planar_chain", "sliding_masses"])
@@ -207,6 +183,15 @@ PLATE = """
 </robot>"""
 
 
+def changed(changes: list[tuple[str, str]]) -> RobotDescription:
+    """Return the planar chain with texts of its URDF replaced."""
+    text = robot_file("planar_chain").read_text("utf-8")
+    for before, after in changes:
+        assert before in text
+        text = text.replace(before, after, -1 if "visual" in before else 1)
+    return parse_robot(text)
+
+
 def meshes(*names: str) -> tuple[str, str]:
     """Return the change that gives the base pictures of files that are not there."""
     drawn = "".join(f'<visual><geometry><mesh filename="{n}"/></geometry></visual>' for n in names)
@@ -235,7 +220,7 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
         ([(RATES, '<limit velocity="51" effort="1"/>')], "'pin_1' moves at up to 51 rad/s"),
         ([(RATES, '<limit velocity="2" effort="0"/>')], "'pin_1' has an effort limit of 0"),
         (to_stops(-12.5, 1.0), None),
-        (to_stops(-12.6, 1.0), "'pin_1' ranges from -12.6 to 1 rad"),
+        (to_stops(-12.6, 1.0), "-12.6 to 1 rad: URDF limits are in rad, not in degrees."),
         (to_stops(-1.0, 12.6), "'pin_1' ranges from -1 to 12.6 rad"),
         (to_stops(-1.0, 20.0, "prismatic"), None),
         ([("</robot>", PLATE)], "The inertia of link 'plate' is not physical"),
@@ -248,15 +233,20 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
 def test_unusual_values_are_remarked_and_usual_ones_are_not(
     changes: list[tuple[str, str]], remark: str | None
 ) -> None:
-    text = robot_file("planar_chain").read_text("utf-8")
-    for before, after in changes:
-        assert before in text
-        text = text.replace(before, after, -1 if "visual" in before else 1)
-    remarks = list(urdf_remarks(parse_robot(text)))
+    remarks = list(urdf_remarks(changed(changes)))
     wanted = [PLAIN] if remark is None else [PLAIN, remark]
     assert len(remarks) == len(wanted), remarks
     for part in wanted:
         assert any(part in each for each in remarks), remarks
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "first"),
+    [(-2.0, 2.0, 0.0), (-1.0, 1.9, 0.0), (-3.0, -1.0, -2.0), (0.0, 2.0, 1.0), (-0.1, 2.0, 0.95)],
+)
+def test_the_first_shape_has_room_to_all_sides(lower: float, upper: float, first: float) -> None:
+    shape = first_shape(SpaceRobot(changed(to_stops(lower, upper))))
+    assert shape[0] == pytest.approx(first)
 
 
 def test_a_body_alone_carries_no_load_and_may_have_an_end_effector() -> None:
@@ -311,16 +301,8 @@ def test_the_tolerance_of_a_small_first_goal_is_a_fiftieth_of_it() -> None:
     assert problem.config.robot == "x.urdf"
 
 
-def test_limits_in_degrees_are_remarked() -> None:
-    text = robot_file("surveyor").read_text("utf-8").replace('lower="-2.9"', 'lower="-166"')
-    found = [each for each in urdf_remarks(parse_robot(text)) if "not in degrees" in each]
-    assert len(found) == 1
-    assert "'shoulder_yaw' ranges from -166 to 2.9 rad" in found[0]
-
-
 def test_robots_are_listed_in_columns_that_are_apart() -> None:
-    result = CliRunner().invoke(main, ["robots"])
-    assert result.exit_code == 0, result.output
+    result = spacerobot("robots")
     lines = result.output.splitlines()
     assert lines[0].split() == ["robot", "joints", "mass", "base"]
     for line in lines[1:]:
@@ -342,17 +324,11 @@ def test_robots_are_listed_in_columns_that_are_apart() -> None:
         (RATES.replace("2", "60"), 0, "velocity limit. The same applies to 1 other joint."),
     ],
 )
-def test_joints_of_a_new_robot_are_remarked(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, code: int, said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SPACEROBOT_COMPILE", "0")
-    text = robot_file("planar_chain").read_text("utf-8")
+def test_joints_of_a_new_robot_are_remarked(robot: Path, limit: str, code: int, said: str) -> None:
+    text = robot.read_text("utf-8")
     assert RATES in text
-    Path("mine.urdf").write_text(text.replace(RATES, limit), "utf-8")
-    result = CliRunner().invoke(main, ["new", "mine.urdf"])
-    assert result.exit_code == code, result.output
-    assert said in " ".join(result.output.split())
+    robot.write_text(text.replace(RATES, limit), "utf-8")
+    assert said in " ".join(new(robot.name, code=code).split())
 
 
 ROOT = Path(__file__).parents[2]
@@ -363,17 +339,8 @@ ROBOTS = (
 _FIVE_MINUTES = 300.0
 
 
-@dataclass(frozen=True)
-class Done:
-    """What a command has printed, and the time it took, wall and processor, s."""
-
-    output: str
-    wall: float
-    cpu: float
-
-
-def run(line: str, folder: Path) -> Done:
-    """Run a line of the terminal as a user does whose home is empty."""
+def run(line: str, folder: Path) -> str:
+    """Run a line of the terminal as a user does whose home is empty; return what it prints."""
     home = folder / "home"
     home.mkdir(exist_ok=True)
     environment = {
@@ -386,7 +353,6 @@ def run(line: str, folder: Path) -> Done:
         "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),
     }
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     done = subprocess.run(
         ["sh", "-e", "-c", line],
         cwd=folder,
@@ -396,10 +362,14 @@ def run(line: str, folder: Path) -> Done:
         timeout=1800,
         check=False,
     )
-    wall, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
     assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Done(done.stdout, wall, cpu)
+    return done.stdout
+
+
+def processor_time() -> float:
+    """Return the time that ended children have taken, s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 @pytest.fixture
@@ -418,10 +388,13 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.usefixtures("own_domain")
 def test_a_robot_of_others_is_at_a_goal_in_two_commands(name: str, folder: Path) -> None:
     shutil.copy2(robot_file(name), folder / "theirs.urdf")
+    began, used = time.monotonic(), processor_time()
     made = run("spacerobot new theirs.urdf", folder)
-    printed = [line.strip() for line in made.output.splitlines() if line.startswith("  spacerobot")]
-    assert printed, made.output
-    flown = [run(line, folder) for line in printed]
+    printed = [line.strip() for line in made.splitlines() if line.startswith("  spacerobot")]
+    assert printed, made
+    for line in printed:
+        run(line, folder)
+    wall, cpu = time.monotonic() - began, processor_time() - used
 
     bag = folder / "out" / "theirs.mcap"
     result = verify_bag(bag)
@@ -446,8 +419,6 @@ def test_a_robot_of_others_is_at_a_goal_in_two_commands(name: str, folder: Path)
         expected = oracle.base_twist(shapes[k], rates[k])[3:]
         np.testing.assert_allclose(turned[k], expected, atol=1e-9)
 
-    wall = made.wall + sum(each.wall for each in flown)
-    cpu = made.cpu + sum(each.cpu for each in flown)
     print(f"\n{name:<16} {wall / 60:6.2f} min, {cpu:6.1f} s of CPU  ({'; '.join(printed)})")
     assert cpu < _FIVE_MINUTES
 
@@ -461,7 +432,6 @@ FILE = Path(__file__).resolve().parents[2] / "examples" / "campaigns" / "first.y
 @pytest.mark.slow
 def test_most_flights_of_the_first_campaign_succeed(tmp_path: Path) -> None:
     words = ["campaign", str(FILE), "--flights", "12", "--workers", "0", "--out", str(tmp_path)]
-    result = CliRunner().invoke(main, words)
-    assert result.exit_code == 0, result.output
+    result = spacerobot(*words)
     (successes,) = re.findall(r"^success .*\((\d+) of 12;", result.output, re.MULTILINE)
     assert 8 <= int(successes) < 12, "some are to fail, for a report worth looking at"
