@@ -6,25 +6,22 @@ Euclidean norm, angle the rotation angle, from the last true pose of the base to
 
 from __future__ import annotations
 
+import json
 import math
-import os
 import re
-import subprocess
-import sys
-from dataclasses import dataclass, replace
-from html.parser import HTMLParser
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.command_line import CliRunner
-from support.html_page import Page
+from support.command_line import spacerobot
+from support.html_page import Page, present
 from support.slow import some_fast
 
 from spacerobot_ros import fly, read_run
-from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
 from spacerobot_ros.measures import Outcome, metrics_of_each
@@ -44,17 +41,7 @@ from spacerobot_ros.viewer.state import StackState
 pytest.importorskip("mcap_ros2")
 
 ROOT = Path(__file__).parents[2]
-BAGS, SCENARIOS = ROOT / "bags", ROOT / "config"
-
-
-@dataclass
-class Truth:
-    """What another library finds in a bag: m, rad, and the last pose (7,)."""
-
-    distance: float
-    angle: float
-    pose: np.ndarray
-    goal: np.ndarray
+BAGS = ROOT / "bags"
 
 
 def _vector(message: Any) -> np.ndarray:
@@ -64,74 +51,60 @@ def _vector(message: Any) -> np.ndarray:
     )
 
 
-def truth_in(bag: Path) -> Truth:
-    """Return the errors of the base at the end of a bag with one goal."""
+def decoded(bag: Path, *topics: str) -> Iterator[tuple[str, Any]]:
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    first: dict[str, np.ndarray] = {}
-    last: dict[str, np.ndarray] = {}
     with bag.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages(
-            ["/odom", "/odom_true", "/goal_pose"]
-        ):
-            of_goal = channel.topic == "/goal_pose"
-            last[channel.topic] = _vector(message.pose if of_goal else message.pose.pose)
-            first.setdefault(channel.topic, last[channel.topic])
+        for _, channel, _, message in reader.iter_decoded_messages(topics):
+            yield channel.topic, message
+
+
+def apart(pose: np.ndarray, goal: np.ndarray) -> tuple[float, float]:
+    """Return the distance, m, and the angle, rad, between two poses (7,)."""
+    turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
+    return float(np.linalg.norm(goal[:3] - pose[:3])), float(turn.magnitude())
+
+
+def errors_in(bag: Path) -> tuple[float, float]:
+    """Return distance, m, and angle, rad, of the base at the end of a bag with one goal."""
+    first: dict[str, np.ndarray] = {}
+    last: dict[str, np.ndarray] = {}
+    for topic, message in decoded(bag, "/odom", "/odom_true", "/goal_pose"):
+        last[topic] = _vector(message.pose if topic == "/goal_pose" else message.pose.pose)
+        first.setdefault(topic, last[topic])
     goal, pose = last["/goal_pose"], last.get("/odom_true", last["/odom"])
     goal = np.where(np.isnan(goal), first["/odom"], goal)  # NaN: as at the start.
-    turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
-    distance = float(np.linalg.norm(goal[:3] - pose[:3]))
-    return Truth(distance, float(turn.magnitude()), pose, goal)
+    return apart(pose, goal)
+
+
+HAND = ("/end_effector_pose", "/end_effector/goal_pose")
 
 
 def end_effector_errors_in(bag: Path) -> tuple[float, float] | None:
     """Return distance, m, and angle, rad, of a controller's end-effector from its goal at the end
     of a bag; None: it has no such goal.
     """
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    last: dict[str, np.ndarray] = {}
-    topics = ["/end_effector_pose", "/end_effector/goal_pose"]
-    with bag.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages(topics):
-            last[channel.topic] = _vector(message.pose)
-    if len(last) < 2:
-        return None
-    pose, goal = (last[topic] for topic in topics)
-    turn = Rotation.from_quat(pose[3:]).inv() * Rotation.from_quat(goal[3:])
-    return float(np.linalg.norm(goal[:3] - pose[:3])), float(turn.magnitude())
+    last = {topic: _vector(message.pose) for topic, message in decoded(bag, *HAND)}
+    return apart(*(last[topic] for topic in HAND)) if len(last) == 2 else None
 
 
 def shape_error_in(bag: Path) -> np.ndarray:
     """Return the errors of the joints (n,) at the end of a bag with one shape to end in."""
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    last: dict[str, dict[str, float]] = {}
-    with bag.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        topics = ["/joint_states", "/joint_states_true", "/goal_joint_states"]
-        for _, channel, _, message in reader.iter_decoded_messages(topics):
-            last[channel.topic] = dict(zip(message.name, message.position, strict=True))
+    topics = ("/joint_states", "/joint_states_true", "/goal_joint_states")
+    last = {
+        topic: dict(zip(message.name, message.position, strict=True))
+        for topic, message in decoded(bag, *topics)
+    }
     shape = last.get("/joint_states_true", last["/joint_states"])
     return np.array([value - shape[name] for name, value in last["/goal_joint_states"].items()])
 
 
-class Cells(HTMLParser):
-    """The texts of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-        # A number with an exponent is an element of its own, and no end of the text.
-        self.feed(re.sub(r'<span class="unbroken">([^<]*)</span>', r"\1", text))
-
-    def handle_data(self, data: str) -> None:
-        self.texts.append(data)
+def texts_of(page: str) -> list[str]:
+    """Return the texts of a page, in their order."""
+    # A number with an exponent is an element of its own, and no end of the text.
+    return Page(re.sub(r'<span class="unbroken">([^<]*)</span>', r"\1", page)).texts
 
 
 def shown(text: str, pattern: str) -> float:
@@ -149,19 +122,19 @@ def printed_lines(summary: dict[str, Any]) -> list[str]:
     result = RunResult(summary | {"plan_time_s": 0.0, "wall_time_s": 1.0})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "run_scenario", lambda *_, **__: result)
-        return CliRunner().invoke(main, ["run", "sliding_masses"]).stdout.splitlines()
+        return spacerobot("run", "sliding_masses", code=None).stdout.splitlines()
 
 
 def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     """Compare what terminal, JSON, report, live page, campaign and ``repr`` say with the truth."""
-    truth = truth_in(bag)
+    off, turned_off = errors_in(bag)
 
     def same(distance: float, angle: float, digits: int) -> None:
         slack = 0.51 * 10 ** (1 - digits)
         # An angle near zero is the difference of numbers near one.
         least = 1e-6 if digits == 3 else 1e-12
-        assert distance == pytest.approx(truth.distance, rel=slack, abs=least)
-        assert angle == pytest.approx(truth.angle, rel=slack, abs=max(least, 1e-8))
+        assert distance == pytest.approx(off, rel=slack, abs=least)
+        assert angle == pytest.approx(turned_off, rel=slack, abs=max(least, 1e-8))
 
     summary = flight.summary() | {"bag": str(bag), "messages_recorded": 0}
     same(summary["position_error_m"], summary["attitude_error_rad"], 9)
@@ -171,18 +144,18 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     position, attitude = (next(x for x in lines if x.startswith(y)) for y in ("posi", "atti"))
     same(shown(position, r"m, # m from the goal"), shown(attitude, r"rad, # rad ="), 3)
     degrees = shown(attitude, r"= # deg from")
-    assert degrees == pytest.approx(math.degrees(truth.angle), rel=0.006, abs=6e-4)
+    assert degrees == pytest.approx(math.degrees(turned_off), rel=0.006, abs=6e-4)
     assert ("(not controlled)" in position) is not position_counts
 
     left = repr(flight)
     same(shown(left, r", # m"), shown(left, r"and # rad from the goal"), 3)
 
-    assert flight.robot is not None
-    (metrics,) = metrics_of_each([flight.measured(clearance=False)], flight.robot)
+    robot = flight.required_robot()
+    (metrics,) = metrics_of_each([flight.measured(clearance=False)], robot)
     same(metrics["position_error_m"], metrics["attitude_error_rad"], 9)
 
     report = read_report(bag)
-    texts = Cells(page(report, PagePart(""), [])).texts
+    texts = texts_of(page(report, PagePart(""), []))
     cards = texts[texts.index("Position error") :], texts[texts.index("Attitude error") :]
     near, turned = (" ".join(x.strip() for x in card[:5]) for card in cards)
     same(shown(near, r" # m\b"), shown(turned, r" # rad"), 3)
@@ -196,10 +169,10 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
     assert lines[0].endswith(verdict)
     if flight.outcome is not Outcome.ABORTED:
         assert bool(re.search(r"[mµ]?m and [^,]* [mµ]?rad from", verdict)) is position_counts
-        off = shown(verdict, "(?:: |is )# m") if position_counts else truth.distance
-        same(off, shown(verdict, "# rad"), 3)
+        distance = shown(verdict, "(?:: |is )# m") if position_counts else off
+        same(distance, shown(verdict, "# rad"), 3)
 
-    distance, angle = goal_errors(state_of(flight), ForwardKinematics(flight.robot))["base"]
+    distance, angle = goal_errors(state_of(flight), ForwardKinematics(robot))["base"]
     same(distance, angle, 9)
     head = live_head(flight, bag)
     line = next(text for text in head if text.startswith("base is "))
@@ -212,16 +185,14 @@ def assert_all_say(bag: Path, flight: Flight, *, position_counts: bool) -> None:
 
 def assert_all_say_of_the_end_effector(bag: Path, flight: Flight) -> None:
     """Compare the errors of a controller's end-effector likewise."""
-    found = end_effector_errors_in(bag)
-    assert found is not None
+    found = present(end_effector_errors_in(bag))
     distance, angle = found
     summary = flight.summary() | {"bag": str(bag), "messages_recorded": 0}
     assert summary["end_effector_position_error_m"] == pytest.approx(distance, rel=1e-9)
-    assert flight.robot is not None
-    (metrics,) = metrics_of_each([flight.measured(clearance=False)], flight.robot)
+    (metrics,) = metrics_of_each([flight.measured(clearance=False)], flight.required_robot())
     assert metrics["end_effector_position_error_m"] == pytest.approx(distance, rel=1e-9)
     report = read_report(bag)
-    texts = Cells(page(report, PagePart(""), [])).texts
+    texts = texts_of(page(report, PagePart(""), []))
     card = " ".join(texts[texts.index("End-effector error") :][:3])
     lines = printed_lines(summary)
     printed = next(line for line in lines if line.startswith("end-effector"))
@@ -251,22 +222,13 @@ def assert_all_say_of_the_end_effector(bag: Path, flight: Flight) -> None:
 
 def live_head(flight: Flight, bag: Path) -> list[str]:
     """Return the lines of the live page at the end of a flight, while its goal is pursued."""
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    assert flight.robot is not None
     state = state_of(flight)
-    with bag.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, _, message in reader.iter_decoded_messages(
-            ["/end_effector_pose", "/end_effector/goal_pose"]
-        ):
-            pose = _vector(message.pose)
-            if channel.topic == "/end_effector_pose":
-                state = replace(state, tool=pose)
-            else:
-                goals = {**state.goals, "end_effector": Goal(pose[:3], pose[3:])}
-                state = replace(state, goals=goals)
+    last = {topic: _vector(message.pose) for topic, message in decoded(bag, *HAND)}
+    tool, goal = (last.get(topic) for topic in HAND)
+    state = replace(state, tool=tool)
+    if goal is not None:
+        goals = {**state.goals, "end_effector": Goal(goal[:3], goal[3:])}
+        state = replace(state, goals=goals)
     if isinstance(flight.status, PlannerStatus):
         # Planners of earlier versions, and of their bags, did not name the parts.
         left_out = flight.not_controlled
@@ -277,8 +239,8 @@ def live_head(flight: Flight, bag: Path) -> list[str]:
     position, attitude = flight.tolerance("position"), flight.tolerance("attitude")
     assert position is not None
     assert attitude is not None
-    errors = goal_errors(state, ForwardKinematics(flight.robot))
-    return Cells(status_html(state, errors, Tolerance(position, attitude))).texts
+    errors = goal_errors(state, ForwardKinematics(flight.required_robot()))
+    return texts_of(status_html(state, errors, Tolerance(position, attitude)))
 
 
 def state_of(flight: Flight) -> StackState:
@@ -317,10 +279,8 @@ def test_a_goal_of_the_end_effector_alone_is_judged_by_its_error(tmp_path: Path)
     read = read_flight(open_flight_bag(bag))
     assert read.verdict == flight.verdict
     hand = read.signal("end_effector_pose").values[-1]
-    distance = float(np.linalg.norm(goal[:3] - hand[:3]))
-    angle = float((Rotation.from_quat(goal[3:]) * Rotation.from_quat(hand[3:]).inv()).magnitude())
     numbers = [shown(read.verdict.sentence, f"# {unit}") for unit in ("m and", "rad from the goal")]
-    assert numbers == pytest.approx([distance, angle], rel=6e-3)
+    assert numbers == pytest.approx(apart(hand, goal), rel=6e-3)
 
 
 def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_path: Path) -> None:
@@ -328,7 +288,7 @@ def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_pa
     flight, bag = fly("faults/biased_pose"), tmp_path / "biased.mcap"
     assert (flight.succeeded, flight.succeeded_by_measurement) == (False, True)
     flight.save(bag)
-    assert truth_in(bag).distance == pytest.approx(0.1, abs=1e-3)
+    assert errors_in(bag)[0] == pytest.approx(0.1, abs=1e-3)
     read = read_flight(open_flight_bag(bag))
     for each in (flight, read):
         assert not each.verdict.complete
@@ -337,8 +297,8 @@ def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_pa
     report = page(read_report(bag), PagePart(""), [])
     outcome = "<b>Reached according to the measured pose</b>"
     assert f'<p class="outcome reached partly">{outcome}' in report
-    command = CliRunner().invoke(main, ["run", "faults/biased_pose", "--bag", f"{bag}.again"])
-    assert (command.exit_code, command.stderr) == (1, "")
+    command = spacerobot("run", "faults/biased_pose", "--bag", f"{bag}.again", code=1)
+    assert command.stderr == ""
     assert command.stdout.splitlines()[0].endswith(f": {flight.verdict.sentence}")
     # With sensors that do not err the same goal is reached.
     believed = fly(load_scenario("faults/biased_pose").with_overrides("plant", {"faults": [""]}))
@@ -356,10 +316,11 @@ campaign:
 """
 
 
-TOO_WEAK = (
-    "{coordinated_control.error_margin.position: 0.01, coordinated_control.max_force: 1.0, "
-    "plant.disturbances: base_link force -30 0 20 torque 0 0 -3}"
-)
+TOO_WEAK = {
+    "coordinated_control.error_margin.position": 0.01,
+    "coordinated_control.max_force": 1.0,
+    "plant.disturbances": ["base_link force -30 0 20 torque 0 0 -3"],
+}
 """Settings of thrusters that are too weak for a load, and lose control of the base."""
 
 
@@ -375,23 +336,12 @@ CAMPAIGNS = [
 
 
 @pytest.mark.parametrize(("name", "disperse", "engine"), some_fast(CAMPAIGNS, slow=CAMPAIGNS[2:]))
-def test_errors_of_campaigns(
-    name: str, disperse: str, engine: str, tmp_path: Path, ros_domain: int
-) -> None:
+def test_errors_of_campaigns(name: str, disperse: str, engine: str, tmp_path: Path) -> None:
     """Rows as pandas reads them, the page and the terminal, against the bags of the same draws."""
     pandas = pytest.importorskip("pandas")
-    scenario, settings = name, "{}"
-    if name == "aborted":
-        scenario, settings = "coordinated_control", TOO_WEAK
-
-    def spacerobot(*words: str) -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "spacerobot_ros", "campaign", *words],
-            env={**os.environ, "ROS_DOMAIN_ID": str(ros_domain), "PYTHONPATH": str(ROOT)},
-            capture_output=True, text=True, check=False, cwd=tmp_path,
-        )  # fmt: skip
-        assert done.returncode == 0, (done.stdout, done.stderr)
-        return done.stdout
+    aborted = name == "aborted"
+    scenario = "coordinated_control" if aborted else name
+    settings = json.dumps(TOO_WEAK if aborted else {})
 
     def text(limit: float) -> str:
         given = {"scenario": scenario, "settings": settings, "disperse": disperse}
@@ -399,7 +349,7 @@ def test_errors_of_campaigns(
 
     file, folder = tmp_path / "draws.yaml", tmp_path / "draws"
     file.write_text(text(1.0))
-    spacerobot(str(file), "--out", str(folder), "--workers", "0")
+    spacerobot("campaign", file, "--out", folder, "--workers", "0")
     rows = pandas.read_parquet(folder / "flights").sort_values("flight")
     assert rows["flight"].tolist() == [0, 1, 2]
     assert set(rows["engine"]) == {engine}
@@ -407,21 +357,19 @@ def test_errors_of_campaigns(
     hands = {f"end_effector_{each}": list[float]() for each in truths}
     for number in range(3):
         bag = tmp_path / f"{number}.mcap"
-        spacerobot("rerun", str(folder), str(number), "--bag", str(bag))
-        truth = truth_in(bag)
-        truths["position_error_m"].append(truth.distance)
-        truths["attitude_error_rad"].append(truth.angle)
-        hand = end_effector_errors_in(bag)
-        for each, value in zip(hands, hand or (math.nan, math.nan), strict=True):
-            hands[each].append(value)
-    if name == "aborted":  # The law leaves the attitude of the end-effector alone.
+        spacerobot("campaign", "rerun", folder, number, "--bag", bag)
+        for each, value in zip(truths.values(), errors_in(bag), strict=True):
+            each.append(value)
+        hand = end_effector_errors_in(bag) or (math.nan, math.nan)
+        for each, value in zip(hands.values(), hand, strict=True):
+            each.append(value)
+    if aborted:  # The law leaves the attitude of the end-effector alone.
         hands["end_effector_attitude_error_rad"] = [math.nan] * 3
     if name == "planar_chain":
         del truths["position_error_m"]  # Its goal has no position.
     for column, values in (truths | hands).items():
         assert rows[column].tolist() == pytest.approx(values, rel=1e-6, abs=1e-9, nan_ok=True)
-    outcomes = {"aborted": "aborted"}
-    assert set(rows["outcome"]) == {outcomes.get(name, "reached")}
+    assert set(rows["outcome"]) == {"aborted" if aborted else "reached"}
     if name == "faults/wrong_masses":
         assert (rows["corrections"] > 0).all()
 
@@ -430,10 +378,10 @@ def test_errors_of_campaigns(
     limit = (middle + largest) / 2
     file.write_text(text(limit))
     asked = tmp_path / "asked"
-    printed = spacerobot(str(file), "--out", str(asked), "--workers", "0")
+    printed = spacerobot("campaign", file, "--out", asked, "--workers", "0").stdout
     required = next(line for line in printed.splitlines() if line.startswith("required"))
     assert "66.67 % (2 of 3" in required
-    passed = 0 if name == "aborted" else 2
+    passed = 0 if aborted else 2
     success = next(line for line in printed.splitlines() if line.startswith("success"))
     assert f"({passed} of 3;" in success
     tables = Page((asked / "report.html").read_text()).tables
@@ -453,25 +401,17 @@ def test_errors_of_campaigns(
 
 @pytest.mark.slow
 def test_errors_of_a_flight_with_corrections(tmp_path: Path) -> None:
-    scenario = load_scenario(str(SCENARIOS / "faults" / "wrong_masses.yaml"))
-    flight = fly(scenario)
+    flight, bag = fly("faults/wrong_masses"), tmp_path / "corrected.mcap"
     assert flight.corrections > 0
-    flight.save(tmp_path / "corrected.mcap")
-    read = read_flight(open_flight_bag(tmp_path / "corrected.mcap"))
-    assert_all_say(tmp_path / "corrected.mcap", read, position_counts=True)
+    flight.save(bag)
+    assert_all_say(bag, read_flight(open_flight_bag(bag)), position_counts=True)
 
 
 @pytest.mark.slow
 def test_errors_of_a_flight_that_is_aborted(tmp_path: Path) -> None:
-    """Thrusters that are too weak for a load lose control of the base."""
-    scenario = (
-        load_scenario("coordinated_control")
-        .with_overrides("coordinated_control", {"error_margin.position": 0.01, "max_force": 1.0})
-        .with_overrides("plant", {"disturbances": "base_link force -30 0 20 torque 0 0 -3"})
-    )
-    flight = fly(scenario)
+    flight, bag = fly("coordinated_control", parameters=TOO_WEAK), tmp_path / "aborted.mcap"
     assert flight.outcome is Outcome.ABORTED
-    flight.save(tmp_path / "aborted.mcap")
-    read = read_flight(open_flight_bag(tmp_path / "aborted.mcap"))
-    assert_all_say(tmp_path / "aborted.mcap", read, position_counts=True)
-    assert_all_say_of_the_end_effector(tmp_path / "aborted.mcap", read)
+    flight.save(bag)
+    read = read_flight(open_flight_bag(bag))
+    assert_all_say(bag, read, position_counts=True)
+    assert_all_say_of_the_end_effector(bag, read)

@@ -17,6 +17,7 @@ from spacerobot_ros.session.run import run_scenario
 
 pytestmark = [
     pytest.mark.study,
+    pytest.mark.usefixtures("own_domain"),
     pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with"),
 ]
 
@@ -36,11 +37,6 @@ FAULTS = {
     "killed_nodes": {"node silent", "node back"},
 }
 """What must stand below the charts of some: the fault, what found it, its end."""
-
-
-@pytest.fixture(autouse=True)
-def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from support.chromium import Browser, browser, chromium
 from support.flight_bags import FINAL, GOAL, Story, cyclic_shapes, tell, urdf_of
-from support.html_page import leave_blank
+from support.html_page import leave_blank, present, write_blank_report
+from support.oracles import PinocchioOracle
 
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, Pose, Shape
@@ -20,7 +20,7 @@ from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_fr
 from spacerobot_ros.model.visuals import solid_mesh
 from spacerobot_ros.report import player, write_report
 from spacerobot_ros.report.flight import FlightReport, read_report
-from spacerobot_ros.report.player import WORLD, View3D, key_frames, view_of_flight
+from spacerobot_ros.report.player import WORLD, key_frames, view_of_flight
 from spacerobot_ros.report.scene import bodies_of
 from spacerobot_ros.report.signals import Cycles
 
@@ -89,12 +89,9 @@ def test_fast_cycles_are_shown_at_one_phase() -> None:
 
 
 def test_links_are_where_pinocchio_has_them(flight: FlightReport) -> None:
-    view = view_of_flight(flight)
-    assert isinstance(view, View3D)
+    view = present(view_of_flight(flight))
     (animation,) = [each for each in view.commands if each["type"] == "set_animation"]
-    model = pin.buildModelFromXML(urdf_of(N), pin.JointModelFreeFlyer())
-    data = model.createData()
-    order = [model.joints[model.getJointId(f"joint_{i}")].idx_q for i in range(N)]
+    oracle = PinocchioOracle(urdf_of(N), flight.joint_names)
     moved = {each["path"]: each["clip"]["tracks"] for each in animation["animations"]}
     assert moved.keys() == {f"{WORLD}/base_link", *(f"{WORLD}/link_{i}" for i in range(N))}
     for path, (position, quaternion) in moved.items():
@@ -103,21 +100,15 @@ def test_links_are_where_pinocchio_has_them(flight: FlightReport) -> None:
         turns = np.reshape(quaternion["values"], (-1, 4))
         for time, r, attitude in zip(position["times"], places, turns, strict=True):
             index = int(np.argmin(np.abs(flight.time - time)))
-            q = pin.neutral(model)
-            q[:3], q[3:7] = flight.pose[index, :3], flight.pose[index, 3:]
-            q[order] = flight.q[index]
-            pin.framesForwardKinematics(model, data, q)
-            expected = data.oMf[model.getFrameId(path.rpartition("/")[2])]
-            np.testing.assert_allclose(r, expected.translation, atol=2e-5)
-            np.testing.assert_allclose(
-                matrix_from_quaternion(attitude), expected.rotation, atol=5e-5
-            )
+            link = path.rpartition("/")[2]
+            R_WL, r_WL_W = oracle.link_pose(link, flight.q[index], flight.pose[index])
+            np.testing.assert_allclose(r, r_WL_W, atol=2e-5)
+            np.testing.assert_allclose(matrix_from_quaternion(attitude), R_WL, atol=5e-5)
 
 
 def test_a_gait_can_be_looked_at_in_parts(tmp_path: Path) -> None:
     shapes = cyclic_shapes(slide=100, cycles=40)
-    view = view_of_flight(read_report(tell(tmp_path / "flight.mcap", Story(shapes))))
-    assert isinstance(view, View3D)
+    view = present(view_of_flight(read_report(tell(tmp_path / "flight.mcap", Story(shapes)))))
     names = [name for name, _, _ in view.parts]
     assert names == ["whole flight", "first 5 s", "first 3 cycles", "last 3 cycles"]
     assert [end - start for _, start, end in view.parts[2:]] == pytest.approx([4.5, 4.5])
@@ -134,8 +125,7 @@ def test_meshes_that_a_bag_carries_are_drawn(tmp_path: Path) -> None:
     drawn = []
     for each in (bare, carried):
         bodies = bodies_of(each, [0], 10_000)
-        view = view_of_flight(each)
-        assert isinstance(view, View3D)
+        view = present(view_of_flight(each))
         objects = [c["object"] for c in view.commands if c["type"] == "set_object"]
         geometries = [o["geometries"][0] for o in objects if o["object"]["type"] == "Mesh"]
         drawn.append((sum(len(body.visuals) for body in bodies), geometries))
@@ -168,11 +158,7 @@ with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to loo
 
 @pytest.fixture(scope="module")
 def page(bag: Path) -> Path:
-    html = bag.with_suffix(".html")
-    with pytest.MonkeyPatch.context() as patch:
-        leave_blank(patch)
-        write_report(bag, html)
-    return html
+    return write_blank_report(bag)
 
 
 @pytest.fixture

@@ -16,14 +16,12 @@ import numpy as np
 import pypdf
 import pytest
 from support.chromium import Browser, browser, chromium
-from support.command_line import CliRunner
+from support.command_line import spacerobot
 from support.flight_bags import GOAL, TICK, Story, goal_value, tell
-from support.html_page import leave_blank
+from support.html_page import leave_blank, present, write_blank_report
 
-from spacerobot_ros.cli.main import main
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report import write_report
-from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page import charts_of
@@ -67,10 +65,7 @@ def flight(bag: Path) -> FlightReport:
 @pytest.fixture(scope="module")
 def window(bag: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     """One browser for all these tests, on the page."""
-    html = bag.with_suffix(".html")
-    with pytest.MonkeyPatch.context() as patch:
-        leave_blank(patch)
-        write_report(bag, html)
+    html = write_blank_report(bag)
     with browser(tmp_path_factory.mktemp("profile")) as opened:
         opened.open(html, 1280, 900)
         opened.wait_for("document.getElementById('animation').className === 'ready'")
@@ -139,16 +134,13 @@ def test_events_of_one_kind_at_once_are_counted(tmp_path: Path) -> None:
 
 
 def test_charts_have_the_traces_of_a_flight_beside(
-    flight: FlightReport, bag: Path, tmp_path: Path
+    flight: FlightReport, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    leave_blank(monkeypatch)
     shapes = 0.3 * np.cos(np.linspace(0.0, 5.0, COUNT // 2))[:, np.newaxis] * np.ones((1, 3))
     other = tell(tmp_path / "other.mcap", Story(shapes))
-    with pytest.MonkeyPatch.context() as patch:
-        leave_blank(patch)
-        result = CliRunner().invoke(
-            main, ["report", str(bag), str(other), "--out", str(tmp_path / "both.html")]
-        )
-    assert result.exit_code == 0, result.output
+    words = ["report", str(bag), str(other), "--out", str(tmp_path / "both.html")]
+    spacerobot(*words)
     text = (tmp_path / "both.html").read_text("utf-8")
     (data,) = re.findall(r'<script[^>]*id="charts"[^>]*>(.*?)</script>', text, re.DOTALL)
     given = json.loads(data)
@@ -182,10 +174,7 @@ def test_labels_of_events_stay_in_their_strip_and_apart(tmp_path: Path, width: i
     ended = {"event": "goal_reached", "time": "9.95"}
     events = sorted([*plans, *begun, (9.6, fault), (9.95, ended)], key=lambda event: event[0])
     bag = tell(tmp_path / "late.mcap", Story(np.zeros((200, 3)), events=events))
-    html = bag.with_suffix(".html")
-    with pytest.MonkeyPatch.context() as patch:
-        leave_blank(patch)
-        write_report(bag, html)
+    html = write_blank_report(bag)
     with browser(tmp_path / "profile") as opened:
         opened.open(html, width, 900)
         opened.wait_for("document.querySelector('.lane') !== null")
@@ -306,8 +295,7 @@ def test_dark_and_light(window: Browser) -> None:
 
 @with_browser
 def test_on_a_phone_what_is_wide_says_so(window: Browser) -> None:
-    size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    window.call("Emulation.setDeviceMetricsOverride", **size)
+    window.resize(390, 800)
     window.wait_for("document.querySelector('.hint.needed') !== null")
     assert window.evaluate("document.documentElement.scrollWidth") <= 390
     shown = window.evaluate(
@@ -362,8 +350,7 @@ def test_every_licence_is_there_once_with_its_words() -> None:
 
 def test_a_break_is_wide_enough_to_be_seen(flight: FlightReport) -> None:
     """uPlot draws a line across a break between samples of one time."""
-    figure = shape_figure(flight)
-    assert isinstance(figure, ReportFigure)
+    figure = present(shape_figure(flight))
     group = figure.groups[0]
     at = float(group.signal.time[len(group.signal) // 3])
     broken = replace(group, signal=group.signal.broken_at([at]))

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation, Slerp
-from support.command_line import CliRunner
+from support.command_line import spacerobot
 from support.flight_bags import GOAL, TICK, Story, goal_value, still, tell
+from support.html_page import present
 
 from spacerobot_ros.bag import read_bag
-from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError, shortened
 from spacerobot_ros.flight.captures import momentum_budget_over_time
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
@@ -125,8 +125,7 @@ def test_figures_for_papers_show_events_only_if_asked(tmp_path: Path) -> None:
     words = ["figures", str(story(tmp_path)), "--only", "position", "--format", "svg"]
     for option in ([], ["--events"]):
         folder = tmp_path / "_".join(["figures", *option])
-        result = CliRunner().invoke(main, [*words, *option, "-o", str(folder)])
-        assert result.exit_code == 0, result.output
+        spacerobot(*words, *option, "-o", str(folder))
         text = (folder / "position.svg").read_text("utf-8")
         for label in LABELS - {"goal"}:  # That is in the legend of the figure itself.
             assert (f">{label}<" in text) == bool(option), (label, option)
@@ -144,8 +143,7 @@ def figure_of(name: str) -> ReportFigure | str | None:
 
 
 def test_a_robot_with_wheels_has_four_traces() -> None:
-    figure = figure_of("wheels")
-    assert isinstance(figure, ReportFigure)
+    figure = present(figure_of("wheels"))
     assert (figure.name, figure.heading) == ("momentum_budget", "Momentum budget")
     (group,) = figure.groups
     assert list(group.names) == ["base", "arm", "wheels", "sum"]
@@ -157,8 +155,7 @@ def test_a_robot_with_wheels_has_four_traces() -> None:
 
 
 def test_a_robot_that_captures_has_no_trace_of_wheels_that_it_lacks() -> None:
-    figure = figure_of("capture")
-    assert isinstance(figure, ReportFigure)
+    figure = present(figure_of("capture"))
     (group,) = figure.groups
     assert list(group.names) == ["base", "arm", "sum"]
     assert "wheels" not in figure.caption
@@ -214,10 +211,6 @@ def test_waypoints_are_listed_before_the_goal() -> None:
     assert rows[3][0] == "Goal position"
 
 
-def test_other_flights_have_none() -> None:
-    assert figure_of("planar_chain") is None
-
-
 def test_a_robot_without_inertia_has_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise RobotDescriptionError("The robot has no inertia.")
@@ -229,14 +222,13 @@ def test_a_robot_without_inertia_has_a_sentence(monkeypatch: pytest.MonkeyPatch)
 # -- the target of a capture in the 3D view of a report: its solids, and its motion by -----------
 
 
-BAG = Path(__file__).parents[2] / "bags" / "capture.mcap"
+BAG = BAGS / "capture.mcap"
 TARGET = f"{WORLD}/target"
 
 
 @pytest.fixture(scope="module")
 def scene() -> View3D:
-    made = view_of_flight(read_report(BAG))
-    assert isinstance(made, View3D)
+    made = present(view_of_flight(read_report(BAG)))
     return made
 
 
@@ -295,19 +287,19 @@ def test_the_target_moves_as_its_odometry_says(scene: View3D, odometry: Any) -> 
     np.testing.assert_allclose(matrix[:3, :3], attitudes[0].as_matrix(), atol=1e-8)
 
 
-def test_other_flights_have_no_target() -> None:
-    report = read_report(BAG.with_name("planar_chain.mcap"))
+def test_other_flights_have_neither_budget_nor_target() -> None:
+    assert figure_of("planar_chain") is None
+    report = read_report(BAGS / "planar_chain.mcap")
     assert report.target is None
     assert len(report.target_pose) == 0
-    made = view_of_flight(report)
-    assert isinstance(made, View3D)
+    made = present(view_of_flight(report))
     assert "target" not in made.caption
     assert not any(command.get("path") == TARGET for command in made.commands)
 
 
 def test_pictures_draw_the_target_where_it_is_held() -> None:
     """Corners of its solids about its odometry, as the corners of its URDF about its origin."""
-    bag = BAG.with_name("servicing.mcap")
+    bag = BAGS / "servicing.mcap"
     report, (times, positions, attitudes) = read_report(bag), odometry_in(bag)
     assert report.target is not None
     corners = np.concatenate(
@@ -325,16 +317,15 @@ def test_pictures_draw_the_target_where_it_is_held() -> None:
         drawn = corner_points(placed_solids(target, instant))
         wanted = positions[k] + attitudes[k].apply(corners)
         assert np.abs(drawn[:, None] - wanted[None]).max(axis=2).min(axis=1).max() < 1e-9
-    figure = configurations_figure(report)
-    assert isinstance(figure, ReportFigure)
+    figure = present(configurations_figure(report))
     assert "free or held" in figure.caption
 
 
 def test_reaction_wheels_have_rates_and_no_angles() -> None:
-    report = read_report(BAG.with_name("servicing.mcap"))
+    report = read_report(BAGS / "servicing.mcap")
     wheels = {"wheel_plus_x", "wheel_plus_y", "wheel_minus_x", "wheel_minus_y"}
     assert {report.joint_names[i] for i in report.wheel_columns} == wheels
-    bag = read_bag(BAG.with_name("servicing.mcap"))
+    bag = read_bag(BAGS / "servicing.mcap")
     recorded = [message for _, message in bag["/joint_states"].messages()]
     angles = {name: [m.position[list(m.name).index(name)] for m in recorded] for name in wheels}
     assert max(abs(x) for each in angles.values() for x in each) > 1000
@@ -348,7 +339,6 @@ def test_reaction_wheels_have_rates_and_no_angles() -> None:
         assert np.abs(groups[1].signal.values[:, k]).max() == pytest.approx(np.abs(rates).max())
     # Pictures hold them still: at any angle they look the same.
     assert np.abs(report.joints).max() < np.pi
-    table = joint_table(report)
-    assert table is not None
+    table = present(joint_table(report))
     ends = {row[0]: row[3:5] for row in table.rows}
     assert all((ends[name] == ("–", "–")) is (name in wheels) for name in ends)

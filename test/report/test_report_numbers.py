@@ -8,17 +8,16 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from matplotlib.figure import Figure
 from sensor_msgs.msg import JointState
 from support.flight_bags import Story, cyclic_shapes, tell
-from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped
+from support.html_page import Page, present
+from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped, status
 
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
@@ -37,7 +36,7 @@ from spacerobot_ros.report.figures_over_time import (
 from spacerobot_ros.report.figures_space import cycles_figure
 from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors, read_report
 from spacerobot_ros.report.page import page
-from spacerobot_ros.report.page_parts import PagePart, table, tiles
+from spacerobot_ros.report.page_parts import PagePart, tiles
 from spacerobot_ros.report.tables import (
     headline,
     joint_table,
@@ -108,9 +107,8 @@ def flight(path: Path, statuses: Any = FLOWN, **options: Any) -> FlightReport:
             bag.add_attachment("robot_description.urdf", urdf.encode(), "application/xml", 0)
         for n, goal in enumerate(goals):
             say("/goal_pose", pose(5.0 + n, *goal), 5.0 + n)
-        for topic, status, time in statuses:
-            pairs = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
-            say(f"/{topic}", DiagnosticStatus(message=status.message, values=pairs), time)
+        for topic, told, time in statuses:
+            say(f"/{topic}", status(told.to_values(), told.message), time)
         for k in range(4):
             time, last = 5.0 + 0.5 * k, k == 3
             swing = (0.0, 3e-9, -4e-9, 0.0)[k]
@@ -162,8 +160,7 @@ def test_traces_break_and_totals_begin_anew_at_a_reset(tmp_path: Path) -> None:
     def more(say: Any, time: float, k: int) -> None:
         if k == 2:
             event = Event(EventKind.RESET, "It is back.", time_s=time)
-            pairs = [KeyValue(key=k, value=v) for k, v in event.to_values(None).items()]
-            say("/events", DiagnosticStatus(message=event.message, values=pairs), time)
+            say("/events", status(event.to_values(None), event.message), time)
 
     found = flight(tmp_path, more=more)
     assert found.resets == [1.0]
@@ -171,8 +168,7 @@ def test_traces_break_and_totals_begin_anew_at_a_reset(tmp_path: Path) -> None:
     times = np.array([0.0, 0.5, 1.5])
     commands = {"base_wrench": Commands(times, np.outer([1.0, 1.0, 2.0], [0, 1, 0, 0, 0, 0]))}
     assert replace(found, commands=commands).thrust_impulse == pytest.approx(2.0 * period)
-    figure = position_figure(found)
-    assert isinstance(figure, ReportFigure)
+    figure = present(position_figure(found))
     (group,) = figure.groups
     at = np.flatnonzero(np.isnan(group.signal.values).all(axis=1))
     assert group.signal.time[at].tolist() == [1.5]
@@ -214,8 +210,7 @@ def test_a_position_that_is_not_controlled_is_called_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_joints_beside_their_limits(tmp_path: Path, order: int) -> None:
     names = NAMES[::order]
-    table = joint_table(flight(tmp_path, names=names))
-    assert table is not None
+    table = present(joint_table(flight(tmp_path, names=names)))
     assert table.head == (
         *("Joint", "Type", "Unit", "Start", "Final"),
         *("Limits", "Peak velocity", "Limit", "Used"),
@@ -234,8 +229,7 @@ def test_the_joints_beside_their_limits(tmp_path: Path, order: int) -> None:
 
 def test_joints_without_a_description_have_no_limits(tmp_path: Path) -> None:
     found = flight(tmp_path, urdf="")
-    table = joint_table(found)
-    assert table is not None
+    table = present(joint_table(found))
     assert table.rows[0] == (
         *("slide", "–", "m or rad", "0.12500", "-0.62500"),
         *("–", "0.20000 m or rad/s", "–", "–"),
@@ -258,8 +252,7 @@ PRINTED: list[dict[str, Any]] = [
 
 def test_published_figures_have_as_many_decimals_as_were_printed(tmp_path: Path) -> None:
     scenario = {"name": "test", "published": json.dumps(PRINTED)}
-    table = published_table(flight(tmp_path, metadata={"scenario": scenario}))
-    assert table is not None
+    table = present(published_table(flight(tmp_path, metadata={"scenario": scenario})))
     assert table.rows == [
         # The rest of what the first schedule has, with the most decimals.
         ("zf", "1.2346", "1.2346, 2.0000", "planner", "a note"),
@@ -345,8 +338,7 @@ def test_the_time_is_that_of_the_schedules_for_the_last_goal(tmp_path: Path) -> 
     found = flight(tmp_path, statuses, goals=(first, second))
     assert found.time_flown == 1.0
     assert found.flown_method == "optimal"
-    assert found.base_goal is not None
-    assert found.base_goal.position.tolist() == [1.0, 2.0, 3.0]
+    assert present(found.base_goal).position.tolist() == [1.0, 2.0, 3.0]
     spans = [(t.start, t.end, t.goal.position[2]) for t in found.targets]
     assert spans == [(0.0, 0.25, 1.0), (0.25, 0.75, 3.0), (0.75, 1.5, 3.0)]
     goals = position_group(found).goals
@@ -388,6 +380,8 @@ def test_a_flight_that_was_cut_off_has_not_flown_the_rest_of_its_schedule(tmp_pa
     # In the middle of planning nothing is left of the first.
     found = flight(tmp_path, statuses[:2], name="planning.mcap")
     assert found.time_flown == 0.5
+    one_schedule = "1.5 s from the first schedule to the end"
+    assert ("Manoeuvre", "0.5 s", one_schedule) in headline(found)
     # And what was flown to its end counts in full.
     reached = planner(PlannerState.REACHED, 6.5, manoeuvre_time_s=40.0, ends_at_s=45.5)
     found = flight(tmp_path, [*statuses, reached], name="reached.mcap")
@@ -401,8 +395,7 @@ def test_a_goal_that_is_refused_in_flight_is_not_the_one_flown_to(tmp_path: Path
         planner(PlannerState.REFUSED, 6.0, "Too far.", goal_id="6.000000000"),
     ]
     found = flight(tmp_path, statuses, goals=(GOAL, other))
-    assert found.base_goal is not None
-    assert found.base_goal.position.tolist() == [1.0, 2.0, 3.0]
+    assert present(found.base_goal).position.tolist() == [1.0, 2.0, 3.0]
     assert "Goal position" in [row[0] for row in result_table(found).rows]
     # Where nothing was flown, the goal was refused, and is said to be.
     found = flight(tmp_path, statuses[1:], goals=(GOAL, other), name="refused.mcap")
@@ -469,13 +462,11 @@ def test_where_sensors_err_the_numbers_are_true_and_the_measured_ones_beside_the
     np.testing.assert_array_equal(found.pose[:, 0], [0.7, 0.95, 0.95, 0.95])
     np.testing.assert_allclose(found.q[:, 1], [-0.5, 0.35, 1.1, 1.85])
     assert found.qdot[:, 1].tolist() == [0.0, 0.6, 0.6, 0.6]
-    assert found.error is not None
-    assert found.error.distance == pytest.approx(math.hypot(0.05, 0.4))
+    assert present(found.error).distance == pytest.approx(math.hypot(0.05, 0.4))
     top = {label: (value, note) for label, value, note in headline(found)}
     assert top["Position error"] == ("0.403 m", "measured: 0.5 m")
     assert top["Attitude error"][1].endswith("; measured: 0.3 rad")
-    figure = sensors_figure(found)
-    assert isinstance(figure, ReportFigure)
+    figure = present(sensors_figure(found))
     position, attitude, turn = figure.groups
     np.testing.assert_allclose(position.signal.values, [[-0.25, 0, 0]] * 3, atol=1e-15)
     np.testing.assert_allclose(position.signal.time, [0.5, 1.0, 1.5])
@@ -515,28 +506,23 @@ def test_joints_of_one_unit_share_a_panel_with_their_limits(tmp_path: Path) -> N
     np.testing.assert_allclose(groups[1].signal.values[:, 0], [-0.5, 0.25, 1.0, 1.75])
 
 
-def test_efforts_are_those_of_the_joints_by_their_names(tmp_path: Path) -> None:
-    def more(say: Any, time: float, k: int) -> None:
-        command = JointState(name=NAMES[::-1], position=[], velocity=[], effort=[2.0 * k, 1.0 * k])
-        say("/joint_commands", stamped(command, time), time)
-
-    found = flight(tmp_path, more=more, metadata={"parameters/plant": {"actuation": '"effort"'}})
-    np.testing.assert_array_equal(found.efforts.values[-1], [3.0, 6.0])
-    velocities = {"parameters/plant": {"actuation": '"velocity"'}}
-    found = flight(tmp_path, more=more, metadata=velocities, name="velocity.mcap")
-    assert len(found.efforts) == 0
-
-
 @pytest.mark.parametrize("urdf", [URDF, ""])
-def test_efforts_are_read_from_a_bag_without_parameters(tmp_path: Path, urdf: str) -> None:
-    """As other recorders write it; joints without states are those of the description."""
+def test_efforts_are_those_of_the_joints_by_their_names(tmp_path: Path, urdf: str) -> None:
+    """Without parameters, as other recorders write bags, and under efforts."""
 
     def more(say: Any, time: float, k: int) -> None:
         command = JointState(name=NAMES[::-1], effort=[2.0 * k, 1.0 * k])
         say("/joint_commands", stamped(command, time), time)
 
-    found = flight(tmp_path, more=more, urdf=urdf)
-    np.testing.assert_array_equal(found.efforts.values[-1], [3.0, 6.0])
+    for word, metadata in (
+        ("none", {}),
+        ("effort", {"parameters/plant": {"actuation": '"effort"'}}),
+        ("velocity", {"parameters/plant": {"actuation": '"velocity"'}}),
+    ):
+        found = flight(tmp_path, more=more, urdf=urdf, metadata=metadata, name=f"{word}.mcap")
+        last = found.efforts.values[-1:].tolist()
+        assert last == ([] if word == "velocity" else [[3.0, 6.0]]), word
+    # Joints without states are those of the description.
     with made_bag(tmp_path / "stateless.mcap") as (bag, say):
         if urdf:
             bag.add_attachment("robot_description.urdf", urdf.encode(), "application/xml", 0)
@@ -550,24 +536,6 @@ def test_efforts_are_read_from_a_bag_without_parameters(tmp_path: Path, urdf: st
 # -- the page ---------------------------------------------------------------------------------
 
 
-class Reader(HTMLParser):
-    """The text of a page, and the tags in it."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.text, self.tags = "", set[str]()
-        self.values: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        self.values += [value for _, value in attrs if value is not None]
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-
 def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
     metadata = {
         "scenario": {"name": "a_scenario", "description": "What it is."},
@@ -579,7 +547,7 @@ def test_what_the_page_says_of_a_flight(tmp_path: Path) -> None:
     text = page(
         found, PagePart("<p>player</p>"), [ReportFigure("a", "Heading", "Caption.", Figure())]
     )
-    content = Reader(text)
+    content = Page(text)
     for words in (
         "a_scenario",
         "What it is.",
@@ -631,21 +599,15 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
         tmp_path, statuses, metadata=metadata, urdf=urdf, names=[odd(2), "turn"], name="<i>13&.mcap"
     )
     figures: list[ReportFigure | str] = [ReportFigure("a", odd(14), odd(15), Figure()), odd(16)]
-    content = Reader(page(found, PagePart(""), figures, [found]))
-    assert "i" not in content.tags
-    read = content.text + " ".join(content.values)
-    for n in (*range(1, 13), 14, 15, 16):
+    text = page(found, PagePart(""), figures, [found]) + tiles([(odd(17), odd(18), odd(19))])
+    content = Page(text)
+    assert "i" not in {tag for tag, _, _ in content.attributes}
+    values = [value for *_, value in content.attributes]
+    read = content.text + " ".join(values)
+    for n in (*range(1, 13), *range(14, 20)):
         assert odd(n) in read, n
     assert "<i>13&.mcap" in content.text
-    assert odd(14) in content.values, "the picture's other text"
-
-
-def test_tiles_and_tables_hold_text_alone() -> None:
-    odd = [f"<i title='{n}'>&amp;\"{n}" for n in range(6)]
-    content = Reader(tiles([(odd[0], odd[1], odd[2])]) + table("a", [odd[3]], [[odd[4], odd[5]]]))
-    assert "i" not in content.tags
-    for text in odd:
-        assert text in content.text
+    assert odd(14) in values, "the picture's other text"
 
 
 # -- thrusters, and parts without measurements ------------------------------------------------
@@ -668,12 +630,10 @@ def test_propellant_is_what_the_plant_counted() -> None:
         assert used == pytest.approx(value, rel=1e-6, abs=1e-9)
     # All thrusters of this robot push with 10 N: the impulse is that times how long they were on.
     on = bag["thrusters"].field("position")
-    figure = thrusters_figure(found)
-    assert isinstance(figure, ReportFigure)
+    figure = present(thrusters_figure(found))
     impulse = next(each.signal for each in figure.groups if each.label == "impulse given")
     assert impulse.values[-1, 0] == pytest.approx(10.0 * float((on[-1] - on[0]).sum()))
-    figure = thrusters_figure(found)
-    assert isinstance(figure, ReportFigure)
+    figure = present(thrusters_figure(found))
     fired = int((on[-1] > on[0]).sum())
     assert [len(group.names) for group in figure.groups] == [fired, 1, 1]
     assert f"{24 - fired} of 24 thrusters were never on" in figure.caption
@@ -686,12 +646,10 @@ def looping(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_flight_that_was_not_measured_at_its_end_is_drawn(looping: Path) -> None:
     whole = read_report(looping)
-    assert whole.cycles is not None
     early = whole.signal("pose").between(0.0, 0.5 * whole.end)
     cut = replace(whole, series={**whole.series, "pose": early})
-    figure = position_figure(cut)
-    assert isinstance(figure, ReportFigure)
-    assert figure.groups[0].signal.time[-1] < whole.cycles.last(3)[0]
+    figure = present(position_figure(cut))
+    assert figure.groups[0].signal.time[-1] < present(whole.cycles).last(3)[0]
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import base64
 from html.parser import HTMLParser
-from typing import Any, BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
 
 import pytest
 from matplotlib.figure import Figure
 
-from spacerobot_ros.report import figures_space
+from spacerobot_ros.report import figures_space, write_report
+
+T = TypeVar("T")
 
 
 def leave_blank(patch: pytest.MonkeyPatch) -> None:
@@ -20,6 +23,22 @@ def leave_blank(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(Figure, "savefig", savefig)
     patch.setattr(figures_space, "PIXELS", 20)
+
+
+def write_blank_report(bag: Path) -> Path:
+    """Write a report with blank figures beside a bag, and return its path."""
+    html = bag.with_suffix(".html")
+    with pytest.MonkeyPatch.context() as patch:
+        leave_blank(patch)
+        write_report(bag, html)
+    return html
+
+
+def present(part: T | str | None) -> T:
+    """Return a figure or a view, in place of which there is no sentence."""
+    assert part is not None
+    assert not isinstance(part, str), part
+    return part
 
 
 class Page(HTMLParser):
@@ -37,6 +56,7 @@ class Page(HTMLParser):
         self.figures: dict[str, bytes] = {}
         self.scripts: list[str] = []
         self.text = ""
+        self.texts: list[str] = []
         self.tiles: dict[str, str] = {}
         self._table = self._figure = self._tile = ""
         self.feed(text)
@@ -74,6 +94,7 @@ class Page(HTMLParser):
         if {"style", "script"} & set(self.open):
             return
         self.text += data
+        self.texts.append(data)
         if self.open[-1:] == ["dt"]:
             self._tile = data
             self.tiles[data] = ""

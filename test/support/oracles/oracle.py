@@ -215,9 +215,12 @@ class Oracle(ABC):
         self.set_configuration(q)
         return self.center_of_mass_W()
 
-    def link_pose(self, link: str, q: Array) -> tuple[Array, Array]:
-        """Return ``(R_BL, r_BL_B)`` of a link's frame."""
-        self.set_configuration(q)
+    def link_pose(
+        self, link: str, q: Array, pose: npt.ArrayLike = (0, 0, 0, 0, 0, 0, 1)
+    ) -> tuple[Array, Array]:
+        """Return ``(R_WL, r_WL_W)`` of a link's frame, with the base at the origin by default."""
+        at = np.asarray(pose, dtype=float)
+        self.set_configuration(q, at[3:], at[:3])
         return self.frame_W(link)
 
     def jacobian(self, link: str, motion: Motion) -> Array:
