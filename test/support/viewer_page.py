@@ -7,8 +7,8 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -86,16 +86,6 @@ class Processes:
                 process.wait()
             if process.stdout is not None:
                 process.stdout.close()
-
-
-@contextmanager
-def processes(folder: Path, domain: int) -> Iterator[Processes]:
-    """Processes that end with the block."""
-    started = Processes(folder, domain)
-    try:
-        yield started
-    finally:
-        started.close()
 
 
 CUT = """
@@ -248,13 +238,13 @@ class Page:
             "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
         )
 
-    def frames_per_s(self, seconds: float, clock: Callable[[], float]) -> float:
+    def frames_per_s(self, seconds: float) -> float:
         """Return how many messages of the viewer come a second."""
         self.text()
-        before, began = self._window.frames, clock()
-        while clock() - began < seconds:
+        before, began = self._window.frames, time.monotonic()
+        while time.monotonic() - began < seconds:
             self.text()
-        return (self._window.frames - before) / (clock() - began)
+        return (self._window.frames - before) / (time.monotonic() - began)
 
     def requests_outside(self) -> list[str]:
         """Return what was asked of anybody but the viewer."""

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from itertools import product
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 from support.accessibility import AXE, ROOT, focus_order, press, problems
 from support.chromium import browser, chromium, keep_picture
-from support.viewer_page import CUT, Page, Processes, processes
+from support.command_line import spacerobot
+from support.viewer_page import CUT, Page, Processes
 
-from spacerobot_ros.cli.main import main
 from spacerobot_ros.report import write_report
 
 pytestmark = [
@@ -28,7 +28,7 @@ LOOK_BACK = '[role=slider][aria-label="Look back to (s)"]'
 
 @pytest.fixture
 def nodes(tmp_path: Path, ros_domain: int) -> Iterator[Processes]:
-    with processes(tmp_path, ros_domain) as started:
+    with closing(Processes(tmp_path, ros_domain)) as started:
         yield started
 
 
@@ -110,8 +110,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     )
     words = ["campaign", str(ROOT / "examples" / "campaigns" / "first.yaml")]
     words += ["--flights", "12", "--workers", "0", "--out", str(folder / "first")]
-    result = CliRunner().invoke(main, [*words, "--report", str(found["campaign"])])
-    assert result.exit_code == 0, result.output
+    spacerobot(*words, "--report", str(found["campaign"]))
     return found
 
 

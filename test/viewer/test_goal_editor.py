@@ -7,9 +7,9 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
 from support.page_elements import Element, Server
 
 from spacerobot_ros.model import load_robot
@@ -73,6 +73,13 @@ class Editor:
         shown = {each.shown.get("hint"): each for each in self.server.gui.elements}
         return [shown[name] for name in joints if name in shown]
 
+    @property
+    def shape(self) -> Array:
+        """The joint positions that the goal of the base asks for."""
+        shape = self.editor.goals()["base"].joint_positions
+        assert shape is not None
+        return shape
+
     def says(self, words: str) -> bool:
         found = self.server.gui.elements
         return any(words in each.content for each in found if each.kind == "add_html")
@@ -100,17 +107,13 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for() -> None:
     page.editor.update_robot(POSE, q + 0.02)
     page.set(FINAL, True)
     assert page.field("At the end").visible
-    shape = page.editor.goals()["base"].joint_positions
-    assert shape is not None
-    np.testing.assert_allclose(shape, q + 0.02)
+    np.testing.assert_allclose(page.shape, q + 0.02)
     assert page.editor.moving, "another goal is to be checked"
     page.editor.show_check(GoalCheck(Verdict.REACHABLE, shape=q))
     page.editor.settled_goals(LATER)
     at_rest = page.ghost()
     page.set(page.ends[2].label, -0.2)
-    shape = page.editor.goals()["base"].joint_positions
-    assert shape is not None
-    np.testing.assert_allclose(shape, [0.07, -0.08, -0.2])
+    np.testing.assert_allclose(page.shape, [0.07, -0.08, -0.2])
     checked = page.editor.settled_goals(LATER)
     assert checked is not None
     assert checked["base"].joint_positions is not None
@@ -164,9 +167,7 @@ def test_fields_of_joints_stay_within_their_limits() -> None:
     page.editor.show_parts(tool=False, planned=True)
     page.editor.place(POSE, None, np.full(6, 100.0), 0.0)
     page.set(FINAL, True)
-    shape = page.editor.goals()["base"].joint_positions
-    assert shape is not None
-    upper = page.robot.limits("upper")
+    shape, upper = page.shape, page.robot.limits("upper")
     assert np.all(shape[np.isfinite(upper)] <= upper[np.isfinite(upper)])
     assert np.all(shape > 0.9 * np.minimum(upper, 100.0)), "nearly at them"
     labels = [field.label for field in page.ends]
@@ -229,18 +230,9 @@ def two_hands() -> Editor:
 
 def where(page: Editor, link: str) -> Array:
     """Return the pose (7,) of a link by Pinocchio."""
-    model = pin.buildModelFromXML(page.robot.urdf, pin.JointModelFreeFlyer())
-    data, full = model.createData(), pin.neutral(model)
-    full[:7] = STANDING
-    for name, position in zip(page.robot.joint_names, np.linspace(0.1, 0.7, 14), strict=True):
-        full[model.joints[model.getJointId(name)].idx_q] = position
-    pin.framesForwardKinematics(model, data, full)
-    pose: Array = pin.SE3ToXYZQUAT(data.oMf[model.getFrameId(link)])
-    return pose
-
-
-def choose(page: Editor, part: str, asked: str) -> None:
-    page.set(part, asked)
+    oracle = PinocchioOracle(page.robot.urdf, page.robot.joint_names)
+    R, r = oracle.link_pose(link, np.linspace(0.1, 0.7, 14), STANDING)
+    return np.concatenate([r, Rotation.from_matrix(R).as_quat()])
 
 
 def gizmo(page: Editor, link: str) -> Any:
@@ -254,7 +246,7 @@ def test_a_goal_of_a_hand_begins_where_the_hand_is_and_leaves_the_base_free(
     assert page.field("Goal for").visible
     assert all(page.field(part).visible for part in ("base", *HANDS))
     assert set(page.editor.goals()) == {"base"}
-    choose(page, HANDS[1], "position")
+    page.set(HANDS[1], "position")
     goals = page.editor.goals()
     assert set(goals) == {HANDS[1]}
     assert goals[HANDS[1]].base == frozenset()
@@ -274,7 +266,7 @@ def test_a_goal_of_a_hand_begins_where_the_hand_is_and_leaves_the_base_free(
     (aim,) = page.editor.goals()[HANDS[1]].end_effectors
     np.testing.assert_allclose(aim.position, (0.5, 0.25, -0.75))
     # With an attitude, and where the gizmo is.
-    choose(page, HANDS[1], "pose")
+    page.set(HANDS[1], "pose")
     assert page.field(ANGLES).visible
     assert not hand.disable_rotations
     page.set(ANGLES, (10.0, -20.0, 30.0))
@@ -284,22 +276,22 @@ def test_a_goal_of_a_hand_begins_where_the_hand_is_and_leaves_the_base_free(
     wanted = Rotation.from_euler("xyz", (10.0, -20.0, 30.0), degrees=True).as_quat()
     np.testing.assert_allclose(aim.quaternion, wanted, atol=1e-12)
     # No goal of the hand: that of the base again.
-    choose(page, HANDS[1], "free")
+    page.set(HANDS[1], "free")
     assert set(page.editor.goals()) == {"base"}
     assert not hand.visible
     assert not base.disable_axes
     assert page.field(ANGLES).visible
     np.testing.assert_allclose(page.field(POSITION).value, STANDING[:3])
     # Asked for again it begins at the hand.
-    choose(page, HANDS[1], "position")
+    page.set(HANDS[1], "position")
     np.testing.assert_allclose(hand.position, at[:3], atol=1e-12)
 
 
 def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
     page = two_hands
-    choose(page, HANDS[0], "pose")
+    page.set(HANDS[0], "pose")
     assert not page.field("Numbers of").visible, "one part has numbers"
-    choose(page, HANDS[1], "position")
+    page.set(HANDS[1], "position")
     goals = page.editor.goals()
     assert set(goals) == set(HANDS)
     left, right = (goals[link].end_effectors[0] for link in HANDS)
@@ -310,7 +302,7 @@ def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
     assert (numbers.options, numbers.value) == (HANDS, HANDS[1])
     page.set("Numbers of", HANDS[0])
     np.testing.assert_allclose(page.field(POSITION).value, left.position, atol=1e-4)
-    choose(page, "base", "pose")
+    page.set("base", "pose")
     assert set(page.editor.goals()) == {"base", *HANDS}
     assert numbers.value == "base"
     goal = planned_goal(page.editor.goals())
@@ -318,17 +310,17 @@ def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
     assert [each.link for each in goal.end_effectors] == list(HANDS)
     np.testing.assert_array_equal(goal.position, STANDING[:3])
     # A change of a hand leaves the base as users chose.
-    choose(page, HANDS[0], "position")
+    page.set(HANDS[0], "position")
     assert set(page.editor.goals()) == {"base", *HANDS}
     # The base moves alone: hands are in the world.
     page.drag("/goal", STANDING + np.eye(7)[1])
     np.testing.assert_allclose(gizmo(page, HANDS[0]).position, left.position)
-    choose(page, "base", "free")
+    page.set("base", "free")
     assert set(page.editor.goals()) == set(HANDS)
     for link in HANDS:
-        choose(page, link, "free")
+        page.set(link, "free")
     assert page.refusals == []
-    choose(page, "base", "free")
+    page.set("base", "free")
     assert page.refusals == ["A goal is for the base or for an end-effector: choose one of them."]
     assert set(page.editor.goals()) == {"base"}
 
@@ -336,7 +328,7 @@ def test_a_goal_may_be_of_both_hands_and_of_the_base(two_hands: Editor) -> None:
 def test_the_ghost_of_a_free_base_is_where_the_plan_ends(two_hands: Editor) -> None:
     page, q = two_hands, np.linspace(0.1, 0.7, 14)
     ghost = page.node("/goal/ghost")
-    choose(page, HANDS[0], "position")
+    page.set(HANDS[0], "position")
     # Off the robot, so that the ghost's place in the gizmo is not the place in the world.
     turn = Rotation.from_euler("xyz", [40.0, -20.0, 70.0], degrees=True)
     page.drag("/goal", np.array([5.0, 5.0, 5.0, *turn.as_quat()]))
@@ -355,7 +347,7 @@ def test_the_ghost_of_a_free_base_is_where_the_plan_ends(two_hands: Editor) -> N
     # Where the robot is then, it is not drawn; and a base with a goal is drawn there.
     page.editor.update_robot(end, q + 0.1)
     assert not ghost.visible
-    choose(page, "base", "pose")
+    page.set("base", "pose")
     page.editor.update_robot(end, q + 0.1)
     assert ghost.visible
     np.testing.assert_allclose(ghost.position, 0.0, atol=1e-12)
@@ -363,7 +355,7 @@ def test_the_ghost_of_a_free_base_is_where_the_plan_ends(two_hands: Editor) -> N
 
 def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     page = two_hands
-    choose(page, HANDS[0], "position")
+    page.set(HANDS[0], "position")
     shape = np.full(14, 0.5)
     page.editor.show_parts(tool=False, planned=True)
     page.set(FINAL, True)

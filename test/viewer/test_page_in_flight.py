@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from support.chromium import browser, chromium
 from support.ros_harness import Harness, Probe
-from support.up import PATIENCE, Up
-from support.viewer_page import ROOT, Page, Processes, processes
+from support.viewed import PATIENCE, Viewed
+from support.viewer_page import ROOT, Page, Processes
 
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
@@ -33,10 +32,9 @@ pytestmark = [
 
 
 @pytest.fixture
-def up(tmp_path: Path, ros_domain: int) -> Iterator[Up]:
-    stack = Up(tmp_path, ros_domain, "reach", "--processes")
-    yield stack
-    stack.close()
+def up(tmp_path: Path, ros_domain: int) -> Iterator[Viewed]:
+    with closing(Viewed(tmp_path, ros_domain, "up", "reach", "--processes")) as stack:
+        yield stack
 
 
 _SCENE = """
@@ -62,7 +60,7 @@ _SCENE = """
 """
 
 
-def test_paths_are_in_front_and_the_sun_casts_shadows(up: Up, tmp_path: Path) -> None:
+def test_paths_are_in_front_and_the_sun_casts_shadows(up: Viewed, tmp_path: Path) -> None:
     with browser(tmp_path / "profile") as window:
         page = Page(window, up.url)
         page.wait_for_text("Waiting for a goal pose.")
@@ -100,31 +98,30 @@ _FROM_ROBOT = """
 
 
 def test_the_goal_of_the_scenario_is_flown_by_a_press(ros_domain: int, tmp_path: Path) -> None:
-    up = Up(tmp_path, ros_domain, "coordinated_control", "--rate", "4")
-    try:
-        with browser(tmp_path / "profile") as window:
-            page = Page(window, up.url)
-            page.wait_for_text("coordinated_control, 4 times real time", "Drag", "holding")
-            page.tick("Follow the robot")
-            start, aside = window.evaluate(_FROM_ROBOT)
-            page.press("Fly the scenario's goal")
-            page.wait_for_text("The goal is accepted.", "tracking")
-            arrow = "!!window.__viserMutable.nodeRefFromName['/end_effector_goal']?.visible"
-            window.wait_for(f"!{arrow}")  # The arrows of the goal that is flown to.
-            page.wait_for_text("The goal is reached", without="Drag the arrows")
-            scenario = load_scenario("coordinated_control")
-            np.testing.assert_allclose(page.numbers(POSITION), scenario.goal.position, atol=1e-4)
-            window.wait_for(arrow)
-            # The camera has followed the robot, and no step of it was lost.
-            end, still = window.evaluate(_FROM_ROBOT)
-            assert np.linalg.norm(np.subtract(end, start)) > 0.1
-            np.testing.assert_allclose(still, aside, atol=1e-3)
-            assert window.complaints == []
-    finally:
-        up.close()
+    with (
+        closing(Viewed(tmp_path, ros_domain, "up", "coordinated_control", "--rate", "4")) as up,
+        browser(tmp_path / "profile") as window,
+    ):
+        page = Page(window, up.url)
+        page.wait_for_text("coordinated_control, 4 times real time", "Drag", "holding")
+        page.tick("Follow the robot")
+        start, aside = window.evaluate(_FROM_ROBOT)
+        page.press("Fly the scenario's goal")
+        page.wait_for_text("The goal is accepted.", "tracking")
+        arrow = "!!window.__viserMutable.nodeRefFromName['/end_effector_goal']?.visible"
+        window.wait_for(f"!{arrow}")  # The arrows of the goal that is flown to.
+        page.wait_for_text("The goal is reached", without="Drag the arrows")
+        scenario = load_scenario("coordinated_control")
+        np.testing.assert_allclose(page.numbers(POSITION), scenario.goal.position, atol=1e-4)
+        window.wait_for(arrow)
+        # The camera has followed the robot, and no step of it was lost.
+        end, still = window.evaluate(_FROM_ROBOT)
+        assert np.linalg.norm(np.subtract(end, start)) > 0.1
+        np.testing.assert_allclose(still, aside, atol=1e-3)
+        assert window.complaints == []
 
 
-def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path: Path) -> None:
+def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Viewed, tmp_path: Path) -> None:
     with browser(tmp_path / "profile") as window:
         page = Page(window, up.url)
         page.wait_for_text("Waiting for a goal pose.")
@@ -158,8 +155,7 @@ def test_nodes_that_die_are_started_again_and_the_page_says_so(up: Up, tmp_path:
 
 
 def test_the_page_of_a_viewer_that_is_killed_is_grey(ros_domain: int, tmp_path: Path) -> None:
-    up = Up(tmp_path, ros_domain, "sliding_masses", "--restarts", "0")
-    try:
+    with closing(Viewed(tmp_path, ros_domain, "up", "sliding_masses", "--restarts", "0")) as up:
         with browser(tmp_path / "profile") as window:
             page = Page(window, up.url)
             page.wait_for_text("Waiting for a goal pose.")
@@ -173,8 +169,6 @@ def test_the_page_of_a_viewer_that_is_killed_is_grey(ros_domain: int, tmp_path: 
         up.process.send_signal(signal.SIGINT)
         assert up.process.wait(PATIENCE) == 0
         up.wait_for("Node 'viewer' was ended by SIGKILL.")
-    finally:
-        up.close()
 
 
 # -- the page in a real browser: what its users do, against what the robot then does -------------
@@ -191,7 +185,7 @@ POSITION, ANGLES = "Goal (m)", "Roll, pitch, yaw (deg)"
 
 @pytest.fixture
 def nodes(tmp_path: Path, ros_domain: int) -> Iterator[Processes]:
-    with processes(tmp_path, ros_domain) as started:
+    with closing(Processes(tmp_path, ros_domain)) as started:
         yield started
 
 
@@ -331,7 +325,7 @@ def test_a_mission_is_flown_from_the_page(
         watched.hear()
         np.testing.assert_allclose(watched.joints, [0.1, 0, 0], atol=5e-3)
 
-        assert page.frames_per_s(3.0, time.monotonic) > 1.0
+        assert page.frames_per_s(3.0) > 1.0
         assert window.complaints == []
         assert page.requests_outside() == []
     assert "Traceback" not in nodes.log("viewer")

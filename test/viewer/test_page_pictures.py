@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from support.chromium import Browser, browser, chromium, keep_picture
-from support.up import PATIENCE, Up
+from support.viewed import PATIENCE, Viewed
 from support.viewer_page import CUT, Page
 
 pytestmark = [
@@ -71,10 +71,7 @@ class Looked:
     def keep(self, name: str, *, tab: str = "Goal") -> None:
         """Check and keep the page in both sizes and both themes."""
         for size, (width, height) in SIZES.items():
-            self.window.call(
-                "Emulation.setDeviceMetricsOverride",
-                width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
-            )  # fmt: skip
+            self.window.resize(width, height)
             self.page.draw()
             self.page.press(tab)  # Another size begins with the first one.
             self.page.press("Look at the robot")
@@ -94,23 +91,17 @@ class Looked:
                 assert self.window.evaluate(CUT) == [], (name, size, theme)
                 keep_picture(self.window, f"{name}-{theme}-{size}")
                 self.page.press("Dark or light")
-        self.window.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=SIZES["desktop"][0], height=SIZES["desktop"][1],
-            deviceScaleFactor=1, mobile=False,
-        )  # fmt: skip
+        self.window.resize(*SIZES["desktop"])
 
 
 @contextmanager
-def flying(folder: Path, domain: int, *words: str) -> Iterator[tuple[Up, Looked]]:
-    """A stack and its page."""
-    up = Up(folder, domain, *words, *RATE)
-    try:
-        with browser(folder / "profile") as window:
-            yield up, Looked(window, up.url)
-            assert window.complaints == []
-    finally:
-        up.close()
+def flying(folder: Path, domain: int, *words: str) -> Iterator[tuple[Viewed, Looked]]:
+    with (
+        closing(Viewed(folder, domain, "up", *words, *RATE)) as up,
+        browser(folder / "profile") as window,
+    ):
+        yield up, Looked(window, up.url)
+        assert window.complaints == []
 
 
 def ghost_color(looked: Looked) -> list[float]:
@@ -261,31 +252,30 @@ def test_a_planar_robot(scenario: str, tmp_path: Path, ros_domain: int) -> None:
 
 def test_a_slow_phone(tmp_path: Path, ros_domain: int) -> None:
     """A processor four times slower behind 1.6 Mbit/s with 150 ms: the page is usable."""
-    up = Up(tmp_path, ros_domain, "sliding_masses", *RATE)
-    try:
-        with browser(tmp_path / "profile") as window:
-            window.call("Emulation.setCPUThrottlingRate", rate=4)
-            window.call(
-                "Network.emulateNetworkConditions",
-                offline=False, latency=150, downloadThroughput=2e5, uploadThroughput=9e4,
-            )  # fmt: skip
-            began = time.monotonic()
-            page = Page(window, up.url, *SIZES["phone"])
-            page.wait_for_text("Goal reachable")
-            window.wait_for("!!window.__viserMutable?.nodeRefFromName?.['/robot']")
-            print(f"slow phone: robot and status after {time.monotonic() - began:.1f} s")
-            window.evaluate("document.querySelector('.mantine-Notification-root button')?.click()")
-            page.type("Goal (m)", [0.3, -0.25, 0.1])
-            page.wait_for_text("Goal reachable", without="being moved")
-            page.press("Fly")
-            page.wait_for_text("executing", "s to go", "base is ")
-            page.press("Look at the robot")
-            window.wait_for(f"({_UNDER}({_NODE}('/robot')))[2] === 'CANVAS'")
-            assert window.evaluate("document.documentElement.scrollWidth") <= SIZES["phone"][0]
-            keep_picture(window, "slow-phone")
-            assert window.complaints == []
-    finally:
-        up.close()
+    with (
+        closing(Viewed(tmp_path, ros_domain, "up", "sliding_masses", *RATE)) as up,
+        browser(tmp_path / "profile") as window,
+    ):
+        window.call("Emulation.setCPUThrottlingRate", rate=4)
+        window.call(
+            "Network.emulateNetworkConditions",
+            offline=False, latency=150, downloadThroughput=2e5, uploadThroughput=9e4,
+        )  # fmt: skip
+        began = time.monotonic()
+        page = Page(window, up.url, *SIZES["phone"])
+        page.wait_for_text("Goal reachable")
+        window.wait_for("!!window.__viserMutable?.nodeRefFromName?.['/robot']")
+        print(f"slow phone: robot and status after {time.monotonic() - began:.1f} s")
+        window.evaluate("document.querySelector('.mantine-Notification-root button')?.click()")
+        page.type("Goal (m)", [0.3, -0.25, 0.1])
+        page.wait_for_text("Goal reachable", without="being moved")
+        page.press("Fly")
+        page.wait_for_text("executing", "s to go", "base is ")
+        page.press("Look at the robot")
+        window.wait_for(f"({_UNDER}({_NODE}('/robot')))[2] === 'CANVAS'")
+        assert window.evaluate("document.documentElement.scrollWidth") <= SIZES["phone"][0]
+        keep_picture(window, "slow-phone")
+        assert window.complaints == []
 
 
 def test_nodes_that_die_and_the_end_of_the_stack(tmp_path: Path, ros_domain: int) -> None:

@@ -10,14 +10,14 @@ from dataclasses import replace
 from threading import Event
 
 import numpy as np
-import pinocchio as pin
 import psutil
 import pytest
+from scipy.spatial.transform import Rotation
+from support.oracles import PinocchioOracle
 
 from spacerobot_ros import plan
 from spacerobot_ros.errors import GoalError
 from spacerobot_ros.model import load_robot
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning import Goal, RobotState
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
@@ -109,12 +109,11 @@ def test_a_base_whose_position_is_not_controlled_ends_where_the_centre_of_mass_s
     assert answer.base is not None
     assert answer.shape is not None
     np.testing.assert_allclose(answer.base[3:], turned.quaternion, atol=1e-12)
-    model = pin.buildModelFromXML(asked.urdf, pin.JointModelFreeFlyer())
-    data = model.createData()
-    start = np.concatenate([state.position, state.quaternion, state.q])
-    end = np.concatenate([answer.base, answer.shape])
-    before, after = (pin.centerOfMass(model, data, each).copy() for each in (start, end))
-    np.testing.assert_allclose(after, before, atol=1e-9)
+    oracle = PinocchioOracle(asked.urdf, load_robot(robot_file("three_joint_arm")).joint_names)
+    oracle.set_configuration(state.q, state.quaternion, state.position)
+    before = oracle.center_of_mass_W()
+    oracle.set_configuration(answer.shape, answer.base[3:], answer.base[:3])
+    np.testing.assert_allclose(oracle.center_of_mass_W(), before, atol=1e-9)
     left = np.linalg.norm(turned.position - answer.base[:3])
     assert left > 0.1
     assert f"does not control the position: it ends {left:.3g} m off." in answer.message
@@ -152,13 +151,8 @@ def test_goals_of_links_are_planned_for_and_the_base_ends_where_the_plan_has_it(
     assert answer.shape is not None
     assert answer.base is not None
     # By Pinocchio the link is at its goal then, with the base off its place.
-    model = pin.buildModelFromXML(robot.urdf, pin.JointModelFreeFlyer())
-    data, full = model.createData(), pin.neutral(model)
-    full[:7] = answer.base
-    for name, position in zip(robot.joint_names, answer.shape, strict=True):
-        full[model.joints[model.getJointId(name)].idx_q] = position
-    pin.framesForwardKinematics(model, data, full)
-    at = data.oMf[model.getFrameId(link)].translation
+    oracle = PinocchioOracle(robot.urdf, robot.joint_names)
+    _, at = oracle.link_pose(link, answer.shape, answer.base)
     np.testing.assert_allclose(at, aim.position, atol=5e-3)
     assert np.linalg.norm(answer.base[:3]) > 0.01
     far = Goal.of_end_effectors([replace(aim, position=np.array([9.0, 0.0, 0.0]))])
@@ -263,30 +257,24 @@ def test_the_last_goal_is_the_one_that_is_answered(checker: GoalChecker) -> None
 def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
     robot = load_robot(robot_file("servicer"))
     urdf, link = robot.urdf, robot.end_effector()
-    model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
-    data, frame = model.createData(), model.getFrameId(link)
+    oracle = PinocchioOracle(urdf, robot.joint_names)
     rng = np.random.default_rng(5)
     lower, upper = robot.limits("lower"), robot.limits("upper")
     for _ in range(3):
         # Where Pinocchio has the end-effector in some shape, it can be.
         q = rng.uniform(0.9 * lower, 0.9 * upper)
-        full = pin.neutral(model)
-        full[:3], full[3:7] = rng.normal(size=3), _unit(rng.normal(size=4))
-        for name, position in zip(robot.joint_names, q, strict=True):
-            full[model.joints[model.getJointId(name)].idx_q] = position
-        pin.framesForwardKinematics(model, data, full)
-        pose = pin.SE3ToXYZQUAT(data.oMf[frame])
-        base, tool = (Goal(each[:3], each[3:7]) for each in (full, pose))
+        turned = Rotation.from_rotvec(rng.normal(size=3)).as_quat()
+        at = np.concatenate([rng.normal(size=3), turned])
+        R, r = oracle.link_pose(link, q, at)
+        base, tool = Goal(at[:3], turned), Goal(r, Rotation.from_matrix(R).as_quat())
         start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
         near = GoalQuestion(urdf, {}, start, base, tool, link)
         answer = Planner().answer(near, Cancellation())
         assert answer.verdict == Verdict.REACHABLE, answer
         shape = np.array(answer.shape)
         assert np.all((lower - 1e-6 <= shape) & (shape <= upper + 1e-6))
-        for name, position in zip(robot.joint_names, shape, strict=True):
-            full[model.joints[model.getJointId(name)].idx_q] = position
-        pin.framesForwardKinematics(model, data, full)
-        np.testing.assert_allclose(data.oMf[frame].translation, tool.position, atol=1e-3)
+        _, reached = oracle.link_pose(link, shape, at)
+        np.testing.assert_allclose(reached, tool.position, atol=1e-3)
     far = Goal(tool.position + np.array([9.0, 0.0, 0.0]), tool.quaternion)
     answer = Planner().answer(replace(near, tool=far), Cancellation())
     assert answer.verdict == Verdict.REFUSED
@@ -311,11 +299,6 @@ def test_an_attitude_that_the_law_leaves_free_refuses_no_goal() -> None:
         "x y": Verdict.REACHABLE,
         "x y rz": Verdict.REFUSED,
     }
-
-
-def _unit(quaternion: Array) -> Array:
-    unit: Array = quaternion / np.linalg.norm(quaternion)
-    return unit
 
 
 # -- the checks of goals with a stand-in for their process, their time, and the schedules --------

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import re
 import time
+from collections.abc import Sequence
 from html import unescape
 from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log as RosoutLog
@@ -19,6 +20,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
+from support.made_bags import status
 from support.page_elements import Element, Server
 from support.ros_harness import LATCHED, Harness, Probe
 
@@ -34,7 +36,8 @@ from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.viewer.reachability import GoalCheck, GoalChecker, GoalQuestion, Verdict
 from spacerobot_ros.viewer.state import Measured
 
-URDF = load_robot(robot_file("sliding_masses")).urdf
+ROBOT = load_robot(robot_file("sliding_masses"))
+URDF, SLIDERS = ROBOT.urdf, ROBOT.joint_names
 GOAL = Goal.checked([1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 HERE = Measured(0.0, np.eye(7)[6], *np.zeros((3, 3)))
 ARM = load_robot(robot_file("three_joint_arm"))
@@ -118,10 +121,9 @@ class Stack:
 
     def report(self, state: PlantState, message: str) -> None:
         plant = PlantStatus(state, message)
-        values = [KeyValue(key=k, value=v) for k, v in plant.to_values().items()]
-        self.status.publish(DiagnosticStatus(name="/robot", values=values, message=plant.message))
+        self.status.publish(status(plant.to_values(), message, "/robot"))
 
-    def move(self, x: float, names: tuple[str, ...]) -> bool:
+    def move(self, x: float, names: Sequence[str] = SLIDERS) -> bool:
         odom = Odometry()
         odom.pose.pose.position.x = x
         odom.pose.pose.orientation.w = 1.0
@@ -151,7 +153,6 @@ class Stack:
         return self.node("/goal") is not None
 
     def said(self) -> str:
-        """Return all texts of the page."""
         return said_on(self.page)
 
     def until(self, predicate: Any, what: str) -> None:
@@ -200,10 +201,6 @@ def said_on(page: Server) -> str:
     return unescape(" | ".join(found))
 
 
-def names_of(urdf_robot: Any) -> tuple[str, ...]:
-    return tuple(urdf_robot.joint_names)
-
-
 def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness) -> None:
     stack = Stack(harness)
     stack.until(lambda: "No state received yet" in stack.said(), "the page says so")
@@ -211,14 +208,13 @@ def test_a_viewer_shows_the_stack_and_sends_what_its_users_want(harness: Harness
     stack.until(lambda: "no goal to send" in stack.said(), "nothing is sent")
     stack.describe()
     stack.until(lambda: stack.robot is not None, "the robot")
-    names = names_of(load_robot(robot_file("sliding_masses")))
 
     def drawn() -> Element:
         assert stack.robot is not None
         return stack.robot
 
     def moved() -> bool:
-        stack.move(0.25, names)
+        stack.move(0.25)
         return bool(stack.placed and drawn().visible)
 
     stack.until(moved, "the robot is where it is")
@@ -273,9 +269,8 @@ def test_the_page_is_as_its_parameters_say(harness: Harness) -> None:
     assert [theme["dark_mode"] for theme in stack.gui.themes] == [True]
     assert "drawn 40 times a second" in stack.viewer.start_message()
     assert 25_000_000 in {timer.timer_period_ns for timer in stack.viewer.timers}
-    names = names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
-    stack.until(lambda: stack.move(0.25, names) or stack.placed, "a goal is shown")
+    stack.until(lambda: stack.move(0.25) or stack.placed, "a goal is shown")
     stack.drag(np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]))
     stack.press("Fly")
     stack.until(lambda: stack.probe.count("/goal_pose") == 1, "a goal")
@@ -285,13 +280,11 @@ def test_the_page_is_as_its_parameters_say(harness: Harness) -> None:
 
 def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) -> None:
     stack = Stack(harness)
-    names = names_of(load_robot(robot_file("sliding_masses")))
     shapes: list[JointState] = []
     stack.probe.create_subscription(JointState, "/goal_joint_states", shapes.append, 10)
     planner = stack.probe.create_publisher(DiagnosticStatus, "/planner/status", LATCHED)
-    status = PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose.")
-    values = [KeyValue(key=k, value=v) for k, v in status.to_values().items()]
-    planner.publish(DiagnosticStatus(name="/planner", values=values, message=status.message))
+    idle = PlannerStatus(PlannerState.IDLE, "Waiting for a goal pose.")
+    planner.publish(status(idle.to_values(), idle.message, "/planner"))
     harness.connect()
     stack.describe()
     ends, fields = stack.gui.named("Final joint positions"), stack.gui.named("At the end")
@@ -300,19 +293,19 @@ def test_a_goal_has_the_joint_positions_that_the_page_shows(harness: Harness) ->
         stack.press("Fly")
         stack.until(lambda: stack.probe.count("/goal_pose") == count, "a goal")
 
-    stack.until(lambda: stack.move(0.0, names) or ends.visible, "a planner is there")
-    stack.until(lambda: stack.move(0.0, names) or stack.placed, "a goal is shown")
+    stack.until(lambda: stack.move(0.0) or ends.visible, "a planner is there")
+    stack.until(lambda: stack.move(0.0) or stack.placed, "a goal is shown")
     # Somebody may have had an earlier goal end in joint positions, which the page does not show.
     fly(1)
     stack.until(lambda: len(shapes) == 1, "any")
     assert list(shapes[0].name) == []
     ends.use(stack.page, True)
     stack.until(lambda: fields.visible, "the fields")
-    (second,) = (each for each in stack.gui.elements if each.shown.get("hint") == names[1])
+    (second,) = (each for each in stack.gui.elements if each.shown.get("hint") == SLIDERS[1])
     second.use(stack.page, -0.25)
     fly(2)
     stack.until(lambda: len(shapes) == 2, "its shape")
-    assert list(shapes[1].name) == list(names)
+    assert list(shapes[1].name) == list(SLIDERS)
     assert list(shapes[1].position) == [0.0, -0.25, 0.0]
     ends.use(stack.page, False)
     stack.until(lambda: not fields.visible, "no fields")
@@ -327,33 +320,33 @@ def test_a_viewer_survives_what_is_wrong(clock: Clock, harness: Harness) -> None
     stack.describe("<robot name='broken'><link")
     stack.until(lambda: "robot_description:" in stack.said(), "a refusal")
     assert stack.robot is None
-    sliders = names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
     stack.until(lambda: stack.robot is not None, "the robot")
-    stack.until(lambda: stack.move(0.1, sliders) or stack.placed, "its state")
+    stack.until(lambda: stack.move(0.1) or stack.placed, "its state")
     # Numbers and messages that are none.
     strange = Odometry()
     strange.pose.pose.position.x = float("nan")
     stack.odom.publish(strange)
     stack.odom.publish(Odometry())  # No attitude.
     stack.joints.publish(JointState(name=["other"], position=[1.0]))
-    stack.joints.publish(JointState(name=list(sliders), position=[float("inf")] * 3))
+    stack.joints.publish(JointState(name=list(SLIDERS), position=[float("inf")] * 3))
     stack.momentum.publish(Float64MultiArray(data=[1.0]))
     stack.momentum.publish(Float64MultiArray(data=[float("nan")] * 7))
     stack.status.publish(DiagnosticStatus(name="/robot"))
-    stack.until(lambda: stack.move(0.2, sliders) or stack.at == 0.2, "the next state")
+    stack.until(lambda: stack.move(0.2) or stack.at == 0.2, "the next state")
     # Another robot comes in its place; its joints are others.
     before = stack.robot
     stack.describe(ARM.urdf)
     stack.until(lambda: stack.robot not in (before, None), "another robot")
     assert not stack.placed
-    arm = names_of(ARM)
-    stack.until(lambda: stack.move(0.3, arm) or stack.placed, "its state")
+    stack.until(lambda: stack.move(0.3, ARM.joint_names) or stack.placed, "its state")
     stack.drag(np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
     # Time goes by.
     clock.ahead += 5.0
     stack.until(lambda: "No state for 5 s." in stack.said(), "silence is said")
-    stack.until(lambda: stack.move(0.4, arm) or "No state" not in stack.said(), "and its end")
+    stack.until(
+        lambda: stack.move(0.4, ARM.joint_names) or "No state" not in stack.said(), "and its end"
+    )
     assert stack.viewer.is_active
 
 
@@ -364,32 +357,29 @@ def test_a_foreign_robot_goes_with_its_plant(clock: Clock, harness: Harness) -> 
     own = stack.robot
     stranger = harness.probe({}, name="stranger")
     described = stranger.create_publisher(String, "/robot_description", LATCHED)
-    status = stranger.create_publisher(DiagnosticStatus, "/plant/status", LATCHED)
+    told = stranger.create_publisher(DiagnosticStatus, "/plant/status", LATCHED)
     harness.matched(described)
-    harness.matched(status)
+    harness.matched(told)
     described.publish(String(data=ARM.urdf))
     stack.until(lambda: stack.robot not in (own, None), "the foreign robot")
     ended = PlantStatus(PlantState.INACTIVE, "It has ended.")
-    values = [KeyValue(key=k, value=v) for k, v in ended.to_values().items()]
-    status.publish(DiagnosticStatus(name="/stranger", values=values, message=ended.message))
+    told.publish(status(ended.to_values(), ended.message, "/stranger"))
     stack.until(lambda: "It has ended." in stack.said(), "its status")
     foreign = stack.robot
     harness.remove(stranger)
     stack.until(lambda: stack.robot not in (foreign, None), "the own robot again")
     stack.until(lambda: "A command is active." in stack.said(), "its plant's status")
-    sliders = names_of(load_robot(robot_file("sliding_masses")))
-    stack.until(lambda: stack.move(0.1, sliders) or stack.placed, "its state")
+    stack.until(lambda: stack.move(0.1) or stack.placed, "its state")
 
 
 def test_a_replay_has_a_time_line(harness: Harness) -> None:
     stack = Stack(harness)
-    status = stack.probe.create_publisher(DiagnosticStatus, "/replay/status", LATCHED)
-    harness.matched(status)
+    told = stack.probe.create_publisher(DiagnosticStatus, "/replay/status", LATCHED)
+    harness.matched(told)
 
     def tell(position: float) -> bool:
         replay = ReplayStatus(position, 20.0, state="playing", rate=1.0)
-        values = [KeyValue(key=k, value=v) for k, v in replay.to_values().items()]
-        status.publish(DiagnosticStatus(name="/replay", values=values))
+        told.publish(status(replay.to_values(), name="/replay"))
         return False
 
     slider = stack.gui.named("Time (s)")
@@ -471,18 +461,17 @@ def test_a_robot_that_changes_after_a_check_is_shown(
 
     monkeypatch.setattr("spacerobot_ros.nodes.viewer.node.GoalChecker", Checker)
     stack = Stack(harness)
-    sliders = names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
-    stack.until(lambda: stack.move(0.1, sliders) or "Reachable in 1 s." in stack.said(), "a check")
+    stack.until(lambda: stack.move(0.1) or "Reachable in 1 s." in stack.said(), "a check")
     # A plan for the robot of before is not to be answered any more.
     answers.clear()
     cancelled.clear()
-    stack.describe(load_robot(robot_file("servicer")).urdf)
-    servicer = names_of(load_robot(robot_file("servicer")))
+    servicer = load_robot(robot_file("servicer"))
+    stack.describe(servicer.urdf)
     stack.until(lambda: not stack.placed, "its scene is empty")
     assert cancelled
-    stack.until(lambda: stack.move(0.3, servicer) or stack.placed, "its state")
-    stack.until(lambda: stack.move(0.4, servicer) or stack.at == 0.4, "and the next")
+    stack.until(lambda: stack.move(0.3, servicer.joint_names) or stack.placed, "its state")
+    stack.until(lambda: stack.move(0.4, servicer.joint_names) or stack.at == 0.4, "and the next")
     assert stack.viewer.is_active
 
 
@@ -502,9 +491,8 @@ def test_a_commander_that_is_busy_is_waited_for(clock: Clock, harness: Harness) 
     stack = Stack(harness)
     heart = stack.probe.create_publisher(DiagnosticStatus, "/heartbeat", 20)
     harness.connect()
-    names = names_of(load_robot(robot_file("sliding_masses")))
     stack.describe()
-    stack.until(lambda: stack.move(0.0, names) or stack.placed, "a goal is shown")
+    stack.until(lambda: stack.move(0.0) or stack.placed, "a goal is shown")
     stack.press("Fly")
     stack.until(lambda: "Goal sent." in stack.said(), "it is sent")
 

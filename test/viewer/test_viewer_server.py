@@ -8,7 +8,7 @@ import logging
 import socket
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from http.client import HTTPConnection, RemoteDisconnected
+from http.client import HTTPConnection, HTTPResponse, RemoteDisconnected
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,16 @@ def server() -> Iterator[Any]:
     server = start_server("127.0.0.1", 0, "Reach <2>, real time")
     yield server
     stop_server(server)
+
+
+def asked(server: Any, path: str, **headers: str) -> tuple[HTTPResponse, bytes]:
+    """Return the answer to a request, and its content."""
+    connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
+    connection.request("GET", path, headers=headers)
+    response = connection.getresponse()
+    content = response.read()
+    connection.close()
+    return response, content
 
 
 @pytest.mark.parametrize(
@@ -72,22 +82,15 @@ def test_a_websocket_of_another_page_is_refused(server: Any) -> None:
 
 @pytest.mark.parametrize("path", ["/", "/assets/no_such_file.js"])
 def test_no_page_may_frame_this_one(server: Any, path: str) -> None:
-    connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
-    connection.request("GET", path)
-    response = connection.getresponse()
+    response, content = asked(server, path)
     assert response.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
     assert response.getheader("X-Frame-Options") == "DENY"
-    assert (b"<html" in response.read().lower()) == (path == "/")
-    connection.close()
+    assert (b"<html" in content.lower()) == (path == "/")
 
 
 @pytest.mark.parametrize("encoding", ["gzip", "identity"])
 def test_the_page_has_its_own_script_before_that_of_viser(server: Any, encoding: str) -> None:
-    connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
-    connection.request("GET", "/", headers={"Accept-Encoding": encoding})
-    response = connection.getresponse()
-    body = response.read()
-    connection.close()
+    response, body = asked(server, "/", **{"Accept-Encoding": encoding})
     assert response.headers.get_all("Content-Length") == [str(len(body))]
     html = gzip.decompress(body) if encoding == "gzip" else body
     own = Path(viewer.__file__).with_name("page.js").read_bytes()
@@ -114,16 +117,10 @@ def test_a_head_request_leaves_no_traceback(
 
 
 def test_pages_learn_whether_their_viewer_still_runs(server: Any) -> None:
-    answers = []
-    for _ in range(2):
-        connection = HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
-        connection.request("GET", "/alive")
-        response = connection.getresponse()
-        answers.append((response.status, response.read()))
-        connection.close()
-    assert answers[0] == answers[1]
-    assert answers[0][0] == 200
-    assert len(answers[0][1]) == 16
+    (first, name), (second, again) = asked(server, "/alive"), asked(server, "/alive")
+    assert first.status == second.status == 200
+    assert name == again
+    assert len(name) == 16
 
 
 def test_the_page_is_never_shared(server: Any, monkeypatch: pytest.MonkeyPatch) -> None:

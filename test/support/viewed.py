@@ -1,4 +1,4 @@
-"""`spacerobot up` in a process of its own, with goals for it and signals to its nodes."""
+"""A command with a page in a process of its own, with goals for it and signals to its nodes."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ COMMAND = (sys.executable, "-m", "spacerobot_ros.cli.main")
 PATIENCE = 60.0
 
 
-class Up:
-    """`spacerobot up`, and the lines that it prints."""
+class Viewed:
+    """`spacerobot up` or `replay` with `--view`, and the lines that it prints."""
 
     def __init__(self, folder: Path, domain: int, *words: str) -> None:
         self._domain = domain
         self.environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT)}
+        port = ("--set", "viewer.port=0") if words[0] == "up" else ()
         self.process = subprocess.Popen(
-            [*COMMAND, "up", *words, "--view", "--set", "viewer.port=0"],
+            [*COMMAND, *words, "--view", *port],
             env=self.environment,
             cwd=folder,
             stdout=subprocess.PIPE,
@@ -57,9 +58,10 @@ class Up:
             subprocess.Popen(command, env=self.environment, stdout=nothing, stderr=nothing)
         )
 
-    def kill(self, name: str, number: int = signal.SIGKILL) -> None:
+    def kill(self, name: str, signal_number: int = signal.SIGKILL) -> None:
         """Send a signal to the latest process of a node."""
-        os.kill(max(self._pids(f"__node:={name}")), number)
+        lines = self.left().items()
+        os.kill(max(number for number, line in lines if f"__node:={name}" in line), signal_number)
 
     def kill_until(self, name: str, words: str) -> None:
         """Kill a node whenever it has begun again, until there is a line with some words.
@@ -73,15 +75,29 @@ class Up:
                 self.kill(name)
             self._reader.join(0.5)
 
-    def _pids(self, word: str) -> list[int]:
-        found = []
+    def left(self) -> dict[int, str]:
+        """Return the command lines of what runs in the ROS domain, by process."""
+        found = {}
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
                 state = (folder / "stat").read_text().rpartition(")")[2].split()[0]
                 ours = f"ROS_DOMAIN_ID={self._domain}\0" in (folder / "environ").read_text()
-                if ours and state != "Z" and word in (folder / "cmdline").read_text():
-                    found.append(int(folder.name))
+                if ours and state != "Z" and int(folder.name) != os.getpid():
+                    found[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ")
         return found
+
+    def wait_until_nothing_is_left(self) -> float:
+        """Return how long it takes until no process is left in the domain, s."""
+        began = time.monotonic()
+        self.process.wait(20)
+        while left := self.left():
+            assert time.monotonic() - began < 20.0, left
+        return time.monotonic() - began
+
+    def end(self) -> float:
+        """Send Ctrl-C, and return how long it takes until no process is left, s."""
+        self.process.send_signal(signal.SIGINT)
+        return self.wait_until_nothing_is_left()
 
     def close(self) -> None:
         for goal in self._goals:
