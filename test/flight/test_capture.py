@@ -47,6 +47,11 @@ def parameters_of(body: Inertia) -> Array:
     return np.array([mass, *(mass * com), *six])
 
 
+def released(flight: Flight, time_s: float) -> Flight:
+    event = Event(EventKind.RELEASED, "The target is released.", 0, time_s)
+    return replace(flight, events=(*flight.events, event))
+
+
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     return fly_scenario(load_scenario("capture"))
@@ -113,8 +118,7 @@ def test_without_a_capture_the_nearest_distance_is_measured(flight: Flight) -> N
     series = {**flight.series, "true_target_pose": Signal(flight.time, shifted)}
     apart = replace(missed, series=series).measures.capture["capture_distance_m"]
     assert apart == pytest.approx(math.hypot(0.7, nearest), abs=1e-6)
-    released = Event(EventKind.RELEASED, "The target is released.", 0, 0.5)
-    let_go = replace(flight, events=(*flight.events, released)).measures.capture
+    let_go = released(flight, 0.5).measures.capture
     assert (let_go["captured"], let_go["placed"]) == (1.0, 0.0)
 
 
@@ -275,18 +279,12 @@ def norms(values: Array) -> Array:
     return np.linalg.norm(values, axis=1)
 
 
-def released(flight: Flight, time_s: float) -> Flight:
-    event = Event(EventKind.RELEASED, "The target is released.", 0, time_s)
-    return replace(flight, events=(*flight.events, event))
-
-
 def test_the_held_body_is_where_the_target_is_seen(capture: Flight) -> None:
     (held,) = held_bodies(capture)
     assert (held.start, held.end, held.payload.link) == (0.0, math.inf, "end_effector")
     assert held.payload.inertia.mass == 10.0
     # Its centre at the end of the flight, by the recorded pose of the target and by the arm.
-    assert capture.robot is not None
-    kinematics = ForwardKinematics(capture.robot)
+    kinematics = ForwardKinematics(capture.required_robot())
     R_BL, r_BL = kinematics.link_poses(capture.q[-1:])
     link = list(kinematics.links).index("end_effector")
     turn, base = Rotation.from_quat(capture.pose[-1, 3:]), capture.pose[-1, :3]
@@ -335,16 +333,16 @@ def test_wheels_base_and_arm_add_up_to_the_recorded_momentum() -> None:
     rows = np.searchsorted(flight.time, budget.time)
     np.testing.assert_allclose(budget.values[:, 3], norms(flight.momentum[rows, 3:6]), atol=1e-11)
     # Wheels alone: each spins at its own rate, and the base turns slowly.
-    assert flight.robot is not None
-    spinning = [list(flight.joint_names).index(name) for name in flight.robot.wheel_names]
-    bodies = {b.joint.name: b for b in flight.robot.bodies if b.joint is not None}
+    robot = flight.required_robot()
+    spinning = [list(flight.joint_names).index(name) for name in robot.wheel_names]
+    bodies = {b.joint.name: b for b in robot.bodies if b.joint is not None}
     axes = np.array(
-        [bodies[n].origin.R @ bodies[n].joint.axis for n in flight.robot.wheel_names]  # type: ignore[union-attr]
+        [bodies[n].origin.R @ bodies[n].joint.axis for n in robot.wheel_names]  # type: ignore[union-attr]
     )
     moments = np.array(
         [
             bodies[n].joint.axis @ bodies[n].inertia.about_com @ bodies[n].joint.axis  # type: ignore[union-attr]
-            for n in flight.robot.wheel_names
+            for n in robot.wheel_names
         ]
     )
     rates = flight.qdot[rows][:, spinning] + flight.twist[rows, 3:] @ axes.T
@@ -379,9 +377,7 @@ def test_a_planar_flight_determines_seven_parameters_of_the_block(capture: Fligh
     """Thrusters fire all the time: their impulse is part of the balance."""
     (found,) = payload_estimates(capture, 80)
     assert found.undetermined == ("Ixx", "Iyy", "Ixy")
-    (held,) = held_bodies(capture)
-    shown = ~np.isnan(found.parameters)
-    true = parameters_of(held.payload.inertia)
+    shown, true = ~np.isnan(found.parameters), true_parameters(capture)
     # Normal equations square what rounding does, and it differs between processors.
     np.testing.assert_allclose(found.parameters[shown], true[shown], atol=1e-4)
     # Without the thrust it would be another body.
@@ -391,6 +387,11 @@ def test_a_planar_flight_determines_seven_parameters_of_the_block(capture: Fligh
     )
     (other,) = payload_estimates(replace(capture, commands=still), 80)
     assert abs(other.parameters[0] - 10.0) > 1.0
+
+
+def true_parameters(flight: Flight) -> Array:
+    (held,) = held_bodies(flight)
+    return parameters_of(held.payload.inertia)
 
 
 @pytest.fixture(scope="module")
@@ -434,9 +435,7 @@ def test_the_mass_follows_from_a_flight_without_noise(servicing: Flight) -> None
 @pytest.mark.parametrize("size", [0.0, 1e-11, 1e-8, 1e-6])
 def test_deviations_are_those_of_the_errors(servicing: Flight, size: float, seeds: int) -> None:
     """Without noise, where it is like the error of the impulses, and where it is larger."""
-    (held,) = held_bodies(servicing)
-    true = parameters_of(held.payload.inertia)
-    errors = []
+    true, errors = true_parameters(servicing), []
     for seed in range(seeds if size else 1):
         (found,) = payload_estimates(noisy(servicing, size, seed) if size else servicing)
         assert not found.corrected
@@ -445,8 +444,7 @@ def test_deviations_are_those_of_the_errors(servicing: Flight, size: float, seed
 
 
 def test_an_estimate_from_noisy_sensors_knows_its_errors(servicing: Flight) -> None:
-    (held,) = held_bodies(servicing)
-    true = parameters_of(held.payload.inertia)
+    true = true_parameters(servicing)
     (found,) = payload_estimates(noisy(servicing, 1e-6), 240)
     assert found.undetermined == ()
     error = np.abs(found.parameters - true)

@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Path as PathMessage
 from std_msgs.msg import String
 from support.crossing import LINKS, URDF, distance
+from support.html_page import present
 from support.made_bags import joint_states, made_bag, odometry, pose
 
 from spacerobot_ros import fly, read_bag
@@ -24,7 +25,6 @@ from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.report.events import event_text
-from spacerobot_ros.report.figures import ReportFigure
 from spacerobot_ros.report.figures_over_time import clearance_figure
 from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.tables import result_table
@@ -131,8 +131,7 @@ def test_its_bag_and_its_report_show_the_contacts(through: Flight, tmp_path: Pat
     assert shown == [
         f"contact: {pair}" for pair in ("mass_2, mass_3", "mass_1, mass_2", "mass_1, mass_3")
     ]
-    figure = clearance_figure(report)
-    assert isinstance(figure, ReportFigure)
+    figure = present(clearance_figure(report))
     assert "Links 'mass_1' and 'mass_2' touch, 0.186 m deep at " in figure.caption
     (group,) = figure.groups
     assert group.limits == [(0, 0.0)]
@@ -161,10 +160,8 @@ def test_a_flight_that_does_not_measure_it_has_no_clearance(
 
 
 @pytest.mark.slow
-def test_the_nodes_report_what_a_flight_without_ros_does(
-    through: Flight, tmp_path: Path, ros_domain: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
+@pytest.mark.usefixtures("own_domain")
+def test_the_nodes_report_what_a_flight_without_ros_does(through: Flight, tmp_path: Path) -> None:
     summary = run_scenario(through.scenario, tmp_path / "ros.mcap", nodes=True).summary
     assert summary["clearance_m"] == pytest.approx(through.measures.clearance, abs=1e-9)
     through.save(tmp_path / "alone.mcap")
@@ -203,7 +200,7 @@ def world(name: str) -> String:
 
 
 def bag_with(path: Path, *obstacles: tuple[float, String]) -> FlightBag:
-    """Return a bag with states from 1 s on, a path at 1.5 s, and obstacles at some times."""
+    """Return a bag with states from 1 s on, and obstacles at some times."""
     with made_bag(path) as (_, say):
         say("/robot_description", String(data=ROBOT), 0.25)
         for time in (1.0, 1.5, 2.0):
@@ -211,11 +208,6 @@ def bag_with(path: Path, *obstacles: tuple[float, String]) -> FlightBag:
             say("/clearance", DiagnosticStatus(), time)
         for time, text in obstacles:
             say("/obstacles", text, time)
-        given = PathMessage(poses=[pose(0.0, 7, 8, 9, 0, 0, 0, 1), pose(0.0, 4, 5, 6, 0, 0, 0, 0)])
-        given.header.stamp.sec = 5
-        say("/end_effector/path", given, 1.5)
-        say("/end_effector/path", PathMessage(), 1.75)
-        say("/end_effector/goal_pose", pose(9.0, 1, 2, 3, 0, 0, 0, 1), 1.25)
     return open_flight_bag(path)
 
 
@@ -244,17 +236,10 @@ def test_a_robot_is_among_the_last_obstacles_and_distances_are_to_one_set(
     assert read_flight(bag).measures_clearance is not change
 
 
-def test_the_last_pose_of_a_path_is_a_goal(tmp_path: Path) -> None:
-    sent = read_flight(bag_with(tmp_path / "made.mcap")).end_effector_goals
-    assert [each.time for each in sent] == [1.25, 1.5]
-    assert [each.goal_id for each in sent] == ["9.000000000", "5.000000000"]
-    assert [each.goal.position.tolist() for each in sent] == [[1, 2, 3], [4, 5, 6]]
-    assert sent[1].goal.quaternion.tolist() == [0, 0, 0, 1]
-
-
 def test_goals_have_the_frame_of_their_pose_and_the_shape_that_was_sent_before(
     tmp_path: Path,
 ) -> None:
+    """The last pose of a path is a goal, named by the stamp of the path."""
     names, path = ["pin_1", "pin_2"], tmp_path / "made.mcap"
     with made_bag(path) as (_, say):
         say("/robot_description", String(data=ROBOT), 0.25)
@@ -262,18 +247,25 @@ def test_goals_have_the_frame_of_their_pose_and_the_shape_that_was_sent_before(
             say("/odom", odometry(time, time, 2, 3, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0), time)
             say("/joint_states", joint_states(time, names, [0.0, 0.0], [0.0, 0.0]), time)
         for x, header, frame in ((1, "map", "world"), (2, "world", "map"), (3, "world", "")):
-            last = pose(0.0, x, 0, 0, 0, 0, 0, 1)
+            last = pose(0.0, x, 5, 6, 0, 0, 0, 0)
             last.header.frame_id = frame
             sent = PathMessage(poses=[pose(0.0, 7, 8, 9, 0, 0, 0, 1), last])
-            sent.header.frame_id = header
+            sent.header.frame_id, sent.header.stamp.sec = header, x
             say("/end_effector/path", sent, 1.0 + x / 10)
+        say("/end_effector/path", PathMessage(), 1.75)
+        say("/end_effector/goal_pose", pose(9.0, 1, 2, 3, 0, 0, 0, 1), 1.25)
         for time, shape in ((1.15, [0.3, -0.4]), (1.35, [])):
             given = joint_states(time, names[: len(shape)], shape, [])
             say("/goal_joint_states", given, time)
         for time in (1.1, 1.2, 1.3, 1.4):
             say("/goal_pose", pose(time, 10 * time, 0, 0, 0, 0, 0, 1), time)
     bag = open_flight_bag(path)
-    assert [each.goal.position[0] for each in bag.goals("end_effector")] == [1.0, 3.0]
+    hand = bag.goals("end_effector")
+    assert [each.time for each in hand] == [1.1, 1.25, 1.3]
+    assert [each.goal_id for each in hand] == ["1.000000000", "9.000000000", "3.000000000"]
+    places = [each.goal.position.tolist() for each in hand]
+    assert places == [[1, 5, 6], [1, 2, 3], [3, 5, 6]]
+    assert hand[0].goal.quaternion.tolist() == [0, 0, 0, 1]
     shapes = [each.goal.joint_positions for each in bag.goals()]
     assert [None if each is None else each.tolist() for each in shapes] == [
         *(None, [0.3, -0.4], [0.3, -0.4], None)

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import JointState
 from support.flight_bags import urdf_of
-from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped
+from support.made_bags import array, joint_states, made_bag, odometry, pose, stamped, status
 
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.flight.flight import Flight
@@ -31,11 +30,6 @@ from spacerobot_ros.measures import Outcome
 TURNED = (0.5, -0.1, 0.7, 0.5)
 LATE = 0.25
 """From the stamp of a state to its arrival at the recorder, s."""
-
-
-def status(name: str, message: str, **values: str) -> DiagnosticStatus:
-    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-    return DiagnosticStatus(name=name, message=message, values=pairs)
 
 
 def wrench(time: float, *numbers: float) -> WrenchStamped:
@@ -93,9 +87,9 @@ def write(path: Path, late: float = LATE, parameters: dict[str, Any] | None = No
             ("It is late.", {"state": "failed", "goal_id": last}),
             ("It rests.", {"state": "idle"}),
         ):
-            sent("planner/status", status("/a/planner", text, **about), 1.5)
-        sent("events", status("/a/planner", "Of a later version.", event="unheard"), 1.5)
-        sent("events", status("/a/plant", "It runs.", event="running", time="1.5"), 1.5)
+            sent("planner/status", status(about, text, "/a/planner"), 1.5)
+        sent("events", status({"event": "unheard"}, "Of a later version.", "/a/planner"), 1.5)
+        sent("events", status({"event": "running", "time": "1.5"}, "It runs.", "/a/plant"), 1.5)
         names = ["j0", "j1"]
         for time in (1.0, 1.5):
             command = JointState(name=names, velocity=[time, 7.0], effort=[8.0, 9.0])
@@ -171,21 +165,21 @@ def test_reports_of_a_flight_are_those_of_its_last_goal(bag: FlightBag, flight: 
     assert flight.scenario.published == ()
 
 
-def test_commands_are_in_the_order_of_the_joints(folder: Path) -> None:
-    path = write(folder / "velocities.mcap", parameters={"actuation": json.dumps("velocity")})
-    flight = read_flight(open_flight_bag(path, "/a/"))
-    assert sorted(flight.commands) == ["base_wrench", "joint_commands"]
-    assert flight.commands["joint_commands"].time.tolist() == [1.0, 1.5]
-    # In the order of the joint states, j1 before j0, whatever that of the commands is.
-    assert flight.commands["joint_commands"].values.tolist() == [[7.0, 1.0], [7.0, 1.5]]
-    assert flight.commands["base_wrench"].values[:, 5].tolist() == [1.0, 1.5]
-    assert flight.commands["base_wrench"].values[0].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 1.0]
-
-
-def test_commands_of_a_plant_under_efforts_are_efforts(folder: Path) -> None:
-    path = write(folder / "efforts.mcap", parameters={"actuation": json.dumps("effort")})
+@pytest.mark.parametrize(
+    ("actuation", "values"),
+    [("velocity", [[7.0, 1.0], [7.0, 1.5]]), ("effort", [[9.0, 8.0], [9.0, 8.0]])],
+)
+def test_commands_are_of_the_actuation_and_in_the_order_of_the_joints(
+    folder: Path, actuation: str, values: list[list[float]]
+) -> None:
+    """That of the joint states, j1 before j0, whatever that of the commands is."""
+    path = write(folder / f"{actuation}.mcap", parameters={"actuation": json.dumps(actuation)})
     commands = read_flight(open_flight_bag(path, "/a/")).commands
-    assert commands["joint_commands"].values.tolist() == [[9.0, 8.0], [9.0, 8.0]]
+    assert sorted(commands) == ["base_wrench", "joint_commands"]
+    assert commands["joint_commands"].time.tolist() == [1.0, 1.5]
+    assert commands["joint_commands"].values.tolist() == values
+    wrenches = [[1.0, 2.0, 3.0, 4.0, 5.0, 1.0], [1.0, 2.0, 3.0, 4.0, 5.0, 1.5]]
+    assert commands["base_wrench"].values.tolist() == wrenches
 
 
 @pytest.mark.parametrize(
@@ -221,21 +215,6 @@ def test_the_robot_of_a_namespace_is_read(folder: Path, bag: FlightBag) -> None:
     assert empty.scenario.name == "none"
     assert empty.scenario.goal.position.tolist() == [0.0, 0.0, 0.0]
     assert empty.scenario.goal.quaternion.tolist() == [0.0, 0.0, 0.0, 1.0]
-
-
-def test_the_parts_of_a_split_recording_are_one_flight(folder: Path) -> None:
-    for part in range(3):
-        with made_bag(folder / f"split_{part}.mcap") as (writer, say):
-            writer.add_attachment("robot_description.urdf", urdf_of(3).encode(), "", 0)
-            for time in (part + 0.0, part + 0.5):
-                say("/odom", odometry(time, time, 0, 0, *TURNED, *[0] * 6), time)
-    bag = open_flight_bag(folder / "split.mcap")
-    flight = read_flight(bag)
-    assert flight.pose[:, 0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
-    assert (bag.message_count, flight.duration) == (6, 2.5)
-    assert flight.joint_names == ("joint_0", "joint_1", "joint_2"), "those of its description"
-    with pytest.raises(RecordingError, match=r"missing\.mcap"):
-        open_flight_bag(folder / "missing.mcap")
 
 
 def records(**changed: str | None) -> Iterator[tuple[str, dict[str, str]]]:
@@ -289,8 +268,7 @@ def test_a_run_has_the_goal_with_all_digits_as_it_was_sent(tmp_path: Path) -> No
     assert flight.scenario.commanders == ("coordinated_control",)
     (published,) = flight.scenario.published
     assert (published.quantity, published.printed, published.note) == ("time", [1.0, 2.0], "far")
-    assert flight.robot is not None
-    assert flight.robot.joint_names == ("joint_0",)
+    assert flight.required_robot().joint_names == ("joint_0",)
     assert flight.propellant is None
     assert flight.outcome is Outcome.INTERRUPTED
 

@@ -384,21 +384,16 @@ def test_files_without_sections(tmp_path: Path) -> None:
         (("kills: 3",), "'kills' in the file FILE is 3, not a list of lines NODE at SECONDS."),
         (("world: none.urdf",), "The world in the scenario file FILE is invalid: "),
         (("end_effector_goals: 3",), "The goal in the scenario file FILE is invalid: "),
+        (
+            (),
+            "The scenario file FILE has no 'scenario: ros__parameters:' section with a goal.",
+        ),
     ],
 )
 def test_scenarios_that_are_refused(goal: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
     with pytest.raises(ParameterError) as refused:
-        written(tmp_path, text_of(*goal))
+        written(tmp_path, text_of(*goal) if goal else "plant: {ros__parameters: {}}")
     assert sentence.replace("FILE", str(tmp_path / "own.yaml")) in str(refused.value)
-
-
-def test_a_scenario_without_a_section_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError) as refused:
-        written(tmp_path, "plant: {ros__parameters: {}}")
-    assert str(refused.value) == (
-        f"The scenario file {tmp_path / 'own.yaml'} has no 'scenario: ros__parameters:' section "
-        "with a goal."
-    )
 
 
 def test_a_scenario_is_read_and_written(tmp_path: Path) -> None:

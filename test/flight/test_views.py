@@ -286,7 +286,9 @@ def test_pictures_of_an_animation_are_spread_over_the_flight(films: list[Film]) 
     assert [film.interval for film in films] == pytest.approx([500.0, 1000.0 / 3, 8000.0])
     films[0].draw(1)
     assert films[0].axes.get_title() == "1.75 s"
-    for wrong in ({"frames": 1001}, {"frames": 0}, {"seconds": math.inf}, {"seconds": 0}):
+    wrongs: list[dict[str, Any]] = [{"frames": 1001}, {"frames": 0}, {"frames": 2.5}]
+    wrongs += [{"seconds": math.inf}, {"seconds": math.nan}, {"seconds": 0}]
+    for wrong in wrongs:
         with pytest.raises(ParameterError, match="An animation"):
             FLIGHT.animate(**wrong)
     with pytest.raises(RecordingError) as refused:
