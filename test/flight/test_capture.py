@@ -204,16 +204,6 @@ def test_a_block_that_passes_is_missed() -> None:
     np.testing.assert_allclose(flight.momentum[:, :6], 0.0, atol=1e-6)
 
 
-def test_a_flight_without_a_target_has_no_capture() -> None:
-    scenario = load_scenario("coordinated_control").with_overrides(
-        "coordinated_control", {"time_limit": 0.05}
-    )
-    flight = fly_scenario(scenario)
-    assert flight.target is None
-    assert flight.capture == {}
-    assert "capture" not in flight.summary()
-
-
 # -- A planar arm approaches a block, captures it, comes to rest and carries it, in few ----------
 
 
