@@ -82,6 +82,12 @@ def offset(found: Layout, path: str) -> int:
     return leaf.offset + int(index) * leaf.dtype.itemsize
 
 
+def bytes_of(found: Layout, path: str, typename: str) -> range:
+    """Return the places of the bytes of a number."""
+    start = offset(found, path)
+    return range(start, start + struct.calcsize("<" + FORMATS[typename]))
+
+
 def template(message: Any) -> MessageTemplate:
     return MessageTemplate(type_name(type(message)), serialize_message(message))
 
@@ -126,10 +132,9 @@ def test_what_is_neither_number_nor_fixed_is_padding(message_type: Any) -> None:
         for start, end in found.fixed:
             used[start:end] = b"\1" * (end - start)
         for path, typename, _ in numbers_of(message):
-            start = offset(found, path)
-            size = struct.calcsize("<" + FORMATS[typename])
-            assert not any(used[start : start + size]), f"{path} overlaps something"
-            used[start : start + size] = b"\1" * size
+            for place in bytes_of(found, path, typename):
+                assert not used[place], f"{path} overlaps something"
+                used[place] = 1
         for place, taken in enumerate(used):
             if not taken:
                 raw[place] = filler
@@ -240,8 +245,6 @@ def test_what_a_template_has_given_out_does_not_change() -> None:
 
 
 QUANTITIES = ("position", "velocity", "effort")
-
-
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
@@ -263,10 +266,7 @@ joint_states = st.builds(
         frame_id=st.sampled_from(["", "base_link"]),
     ),
     name=st.sampled_from([[], ["a"], ["b"], ["a", "b"], ["ab", ""], ["elbow", "wrist"]]),
-    **{
-        quantity: st.lists(st.floats(allow_nan=False), max_size=2)
-        for quantity in ("position", "velocity", "effort")
-    },
+    **{quantity: st.lists(st.floats(allow_nan=False), max_size=2) for quantity in QUANTITIES},
 )
 
 
@@ -302,8 +302,7 @@ def test_a_reader_learns_a_layout_once(
         # Padding may hold anything, and other clients leave other things there.
         taken = {b for start, end in found.fixed for b in range(start, end)} | set(range(12))
         for path, typename, _ in numbers_of(message):
-            start = offset(found, path)
-            taken |= set(range(start, start + struct.calcsize("<" + FORMATS[typename])))
+            taken |= set(bytes_of(found, path, typename))
         for place in set(range(len(raw))) - taken:
             raw[place] = random.randrange(256)
         assert not reader.accept(bytes(raw))

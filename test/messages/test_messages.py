@@ -18,7 +18,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
-from support.random_messages import few as few_trajectories
+from support.random_messages import few
 from trajectory_msgs.msg import JointTrajectory
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
@@ -56,13 +56,14 @@ from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.times import LATEST_NS, stamp_bytes
 
 JOINTS = ("slider_1", "elbow", "slider_3")
-few = settings(derandomize=True, deadline=None, max_examples=30)
 numbers = st.floats(allow_nan=True)
 
 
-def message(names: list[str], time_ns: int = 0, **quantities: list[float]) -> JointState:
+def message(
+    names: list[str], time_ns: int = 0, frame: str = "", **quantities: list[float]
+) -> JointState:
     stamp = Time(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-    return JointState(header=Header(stamp=stamp), name=names, **quantities)
+    return JointState(header=Header(stamp=stamp, frame_id=frame), name=names, **quantities)
 
 
 @st.composite
@@ -103,7 +104,7 @@ def expected(sent: JointState, quantities: list[str]) -> dict[str, list[float]] 
     "quantities", [["velocity"], ["position", "velocity"], ["effort", "position", "velocity"]]
 )
 def test_whatever_comes_is_read_by_name_or_refused(quantities: list[Any]) -> None:
-    @few
+    @settings(few, max_examples=30)
     @given(st.lists(joint_states(), min_size=1, max_size=10))
     def check(series: list[JointState]) -> None:
         reader = JointReader(JOINTS, quantities)
@@ -122,14 +123,6 @@ def test_whatever_comes_is_read_by_name_or_refused(quantities: list[Any]) -> Non
                     np.testing.assert_array_equal(reader.values[quantity], values)
 
     check()
-
-
-def test_a_repeated_layout_is_read_anew_each_time() -> None:
-    reader = JointReader(JOINTS, ["velocity"])
-    for k in range(5):
-        sent = message(["slider_3", "slider_1", "elbow"], k, velocity=[0.1 * k, -0.2 * k, 0.3 * k])
-        assert reader.accept(serialize_message(sent)) == k
-        np.testing.assert_array_equal(reader.values["velocity"], [-0.2 * k, 0.3 * k, 0.1 * k])
 
 
 def test_a_quantity_that_is_no_longer_given_is_zero() -> None:
@@ -155,14 +148,6 @@ def test_a_refused_message_leaves_nothing_behind() -> None:
     np.testing.assert_array_equal(reader.values["velocity"], [6.0, 5.0, 4.0])
 
 
-def test_a_message_that_is_refused_is_refused_again() -> None:
-    reader = JointReader(JOINTS, ["velocity"])
-    raw = serialize_message(message(["rudder"], velocity=[1.0]))
-    for _ in range(3):
-        with pytest.raises(CommandError, match="rudder"):
-            reader.accept(raw)
-
-
 @pytest.mark.parametrize(
     ("sent", "mentions"),
     [
@@ -179,10 +164,11 @@ def test_a_message_that_is_refused_is_refused_again() -> None:
 )
 def test_a_refusal_says_what_is_wrong(sent: JointState, mentions: list[str]) -> None:
     reader = JointReader(JOINTS, ["velocity", "position"])
-    with pytest.raises(CommandError) as refusal:
-        reader.accept(serialize_message(sent))
-    for mention in mentions:
-        assert mention in str(refusal.value)
+    for _ in range(2):
+        with pytest.raises(CommandError) as refusal:
+            reader.accept(serialize_message(sent))
+        for mention in mentions:
+            assert mention in str(refusal.value)
 
 
 def test_a_robot_without_joints_takes_an_empty_message() -> None:
@@ -343,7 +329,7 @@ def check_trajectory(message: Any, schedule: GaitSchedule, stamp_ns: int, frame:
 THREE = schedule_of(("slider_1", "slider_2", "slider_3"), np.arange(12.0).reshape(4, 3), 0.05)
 
 
-@settings(few_trajectories, max_examples=80)
+@settings(few, max_examples=80)
 @given(schedules(), st.integers(0, 2**31 * 10**9 - 1), st.text("lmnop", max_size=9))
 @example(THREE, 0, "base_link")
 @example(THREE, 3, "base")
@@ -416,10 +402,9 @@ def test_types_are_nested_at_most_32_deep_and_never_in_themselves() -> None:
 # -- messages -----------------------------------------------------------------------------------
 
 
-def state(names: list[str], sec: int = 0, nanosec: int = 0, frame: str = "", **more: Any) -> bytes:
-    values: dict[str, Any] = {"position": [float(i + 1) for i in range(len(names))], **more}
-    header = Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=frame)
-    return serialize_message(JointState(header=header, name=names, **values))
+def state(names: list[str], time_ns: int = 0, **more: Any) -> bytes:
+    values = {"position": [float(i + 1) for i in range(len(names))], **more}
+    return serialize_message(message(names, time_ns, **values))
 
 
 def test_a_measured_state_may_be_as_long_as_that_of_a_machine_with_other_joints() -> None:
@@ -439,7 +424,7 @@ def test_a_measured_state_may_be_as_long_as_that_of_a_machine_with_other_joints(
 @pytest.mark.parametrize("measured", [False, True])
 def test_the_stamp_of_a_measured_state_is_one_of_an_answer(measured: bool) -> None:
     reader = JointReader(["a"], ["position"], measured=measured)
-    last = state(["a"], 2**31 - 1, 999_999_999)
+    last = state(["a"], LATEST_NS)
     assert reader.accept(last) == LATEST_NS
     late = last[:8] + (1_000_000_000).to_bytes(4, "little") + last[12:]
     if not measured:
@@ -476,7 +461,7 @@ def test_what_a_measured_state_says_beyond_the_robot_is_counted_with_its_reason(
 
 
 def test_messages_in_another_encoding_are_refused() -> None:
-    little = state(["a"], 3, 4, position=[0.5])
+    little = state(["a"], 3 * S + 4, position=[0.5])
     for start in (b"\0\0", b"\0\2"):
         with pytest.raises(UnreadableError, match="its bytes are not a JointState"):
             JointReader(["a"], ["position"]).accept(start + little[2:])
