@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,9 +17,9 @@ import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
+from support.slow import some_fast
 
 import spacerobot_ros
-from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight import api
 from spacerobot_ros.model.description import Array
@@ -30,8 +29,6 @@ from spacerobot_ros.report.figures import ReportFigure, TraceGroup
 from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.writing import FIGURES
 from spacerobot_ros.scenario import CONFIGS
-
-FILE = Path(__file__).resolve().parents[1] / "passage" / "parameters.yaml"
 
 FLIGHTS: dict[str, dict[str, Any]] = {
     "slide": {
@@ -121,46 +118,44 @@ class Case:
     parameter: str
     flight: str
     value: Any
-    beside: Mapping[str, Any]
+    beside: dict[str, Any]
     changes: tuple[str, ...]
 
     def found(self) -> tuple[str, ...]:
         """Return the quantities that differ between the flights with and without the value."""
-        before = _prints(self.flight, json.dumps(dict(self.beside), sort_keys=True))
-        after = prints(self.flight, {**self.beside, self.parameter: self.value})
+        before = prints(self.flight, json.dumps(self.beside))
+        after = prints(self.flight, json.dumps({**self.beside, self.parameter: self.value}))
         names = before.keys() | after.keys()
         return tuple(sorted(name for name in names if before.get(name) != after.get(name)))
 
 
-def cases() -> list[Case]:
-    """Return the entries that are tried in flights."""
-    return [
-        Case(
-            parameter,
-            entry["flight"],
-            entry["value"],
-            entry.get("beside", {}),
-            tuple(entry.get("changes", ())),
-        )
-        for parameter, entry in table().items()
-        if "flight" in entry
-    ]
+TABLE: dict[str, dict[str, Any]] = yaml.safe_load(
+    Path(__file__).with_name("parameters.yaml").read_text("utf-8")
+)
+"""Entries by parameter."""
 
-
-def table() -> dict[str, dict[str, Any]]:
-    """Return the entries by parameter."""
-    return dict(yaml.safe_load(FILE.read_text("utf-8")))
+CASES = [
+    Case(
+        parameter,
+        entry["flight"],
+        entry["value"],
+        entry.get("beside", {}),
+        tuple(entry.get("changes", ())),
+    )
+    for parameter, entry in TABLE.items()
+    if "flight" in entry
+]
+"""The entries that are tried in flights."""
 
 
 @cache
-def _prints(flight: str, beside: str) -> dict[str, str]:
-    return prints(flight, json.loads(beside))
+def prints(flight: str, parameters: str) -> dict[str, str]:
+    """Return a fingerprint of every quantity of a flight by its name; a refusal is one.
 
-
-def prints(flight: str, parameters: Mapping[str, Any]) -> dict[str, str]:
-    """Return a fingerprint of every quantity of a flight by its name; a refusal is one."""
+    ``parameters`` are those beside the flight's, as JSON.
+    """
     words = dict(FLIGHTS[flight])
-    words["parameters"] = {**words.get("parameters", {}), **parameters}
+    words["parameters"] = {**words.get("parameters", {}), **json.loads(parameters)}
     try:
         # The flight of a refused goal has quantities as well.
         with patch.object(api, "_raise_if_refused", lambda flight: flight):
@@ -172,7 +167,11 @@ def prints(flight: str, parameters: Mapping[str, Any]) -> dict[str, str]:
         "outcome": flown.outcome,
         "message": flown.message,
         "events": [str(event) for event in flown.events],
-        "statuses": [(stamp, _repeatable(status)) for stamp, status in flown.statuses],
+        "statuses": [
+            # Notes say where a plan is from.
+            (stamp, replace(status, notes={}) if isinstance(status, PlannerStatus) else status)
+            for stamp, status in flown.statuses
+        ],
         "refusals": [str(refusal) for refusal in flown.refusals],
         "schedules": [
             (stamp, s.method, s.velocities, s.path.position) for stamp, s in flown.schedules
@@ -183,13 +182,6 @@ def prints(flight: str, parameters: Mapping[str, Any]) -> dict[str, str]:
     found |= series
     found |= {topic: (c.time, c.values) for topic, c in flown.commands.items()}
     return {name: _fingerprint(value) for name, value in found.items()}
-
-
-def _repeatable(status: Status) -> Status:
-    """Return a status without the notes, which say where a plan is from."""
-    if isinstance(status, PlannerStatus):
-        return replace(status, notes={})
-    return status
 
 
 def _fingerprint(value: Any) -> str:
@@ -209,32 +201,11 @@ def _fingerprint(value: Any) -> str:
     return digest.hexdigest()[:16]
 
 
-def main() -> None:
-    """Write the quantities that change into the table anew."""
-    wanted, entries = sys.argv[1:], table()
-    for case in cases():
-        if case.changes and (not wanted or any(word in case.parameter for word in wanted)):
-            entries[case.parameter]["changes"] = list(case.found())
-            print(case.parameter, *entries[case.parameter]["changes"], flush=True)
-    head = "".join(
-        f"{line}\n" for line in FILE.read_text("utf-8").splitlines() if line.startswith("#")
-    )
-    body = yaml.safe_dump(entries, sort_keys=False, width=100, default_flow_style=None)
-    FILE.write_text(f"{head}\n{body}", "utf-8")
-
-
-if __name__ == "__main__":
-    main()
-
-
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 
 NAMES = sorted(path.stem for path in BAGS.glob("*.mcap"))
 
-SOME_QUICK = [
-    name if name == "servicer_thrusters" else pytest.param(name, marks=pytest.mark.slow)
-    for name in NAMES
-]
+SOME_QUICK = some_fast(NAMES, "servicer_thrusters")
 
 Messages = Mapping[str, list[Any]]
 
@@ -502,11 +473,11 @@ _LONG = {
 
 def test_parameters_of_the_table_exist() -> None:
     every = {f"{node}.{p.name}" for node in NODES for p in declared(CONFIGS[node])}
-    assert set(table()) <= every
+    assert set(TABLE) <= every
 
 
 def test_named_tests_name_the_parameter() -> None:
-    for parameter, entry in table().items():
+    for parameter, entry in TABLE.items():
         if "test" in entry:
             file, _, name = entry["test"].partition("::")
             text = (TESTS / file).read_text("utf-8")
@@ -515,16 +486,20 @@ def test_named_tests_name_the_parameter() -> None:
 
 
 def test_flights_are_short_and_all_are_used() -> None:
-    assert {case.flight for case in cases()} == set(FLIGHTS)
+    assert {case.flight for case in CASES} == set(FLIGHTS)
 
 
-def _marked(case: Case) -> object:
-    quick = case.flight in _QUICK and case.parameter not in _LONG
-    marks = () if quick else (pytest.mark.slow,)
-    return pytest.param(case, id=case.parameter, marks=marks)
-
-
-@pytest.mark.parametrize("case", [_marked(case) for case in cases()])
+@pytest.mark.parametrize(
+    "case",
+    some_fast(
+        {case.parameter: case for case in CASES},
+        *(
+            each.parameter
+            for each in CASES
+            if each.flight in _QUICK and each.parameter not in _LONG
+        ),
+    ),
+)
 def test_a_parameter_changes_these_quantities_and_no_others(case: Case) -> None:
     found = case.found()
     assert found, "it changes nothing"
