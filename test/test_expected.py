@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.command_prints import command_prints, topic_prints
 from support.expected import (
     ANALYSED,
     BAGS,
@@ -19,34 +18,41 @@ from support.expected import (
     REPORTS,
     TOPIC_TABLE,
     VIEWER,
+    command_prints,
     differences,
     parameters,
     plans,
+    topic_prints,
 )
 from support.figure_prints import PARTS, analysis_prints, report_part
 from support.page_prints import CAMPAIGNS
+from support.slow import some_fast
 from support.viewer_prints import SITUATIONS, viewer_prints
 
 WRITE = "If this is wanted, `make expected` writes the file anew."
 
 
-def _some_quick(names: Sequence[str], *quick: str) -> list[Any]:
-    return [n if n in quick else pytest.param(n, marks=pytest.mark.slow) for n in names]
+def kept_in(file: Path) -> Any:
+    return json.loads(file.read_text("utf-8"))
 
 
 def as_kept(found: dict[str, Any]) -> Any:
     return json.loads(json.dumps(found))
 
 
+def check(found: Any, kept: Any) -> None:
+    problems = differences(found, kept)
+    assert not problems, "\n".join([*problems[:40], WRITE])
+
+
 def test_parameters_keep_names_types_defaults_and_limits() -> None:
-    kept = json.loads(PARAMETERS.read_text("utf-8"))
+    kept = kept_in(PARAMETERS)
     found = as_kept(parameters())
     assert {node: sorted(kept[node].keys() - found[node].keys()) for node in kept} == {
         node: [] for node in kept
     }, "parameters are gone"
     # New ones are no difference for anybody's files.
     listed = {node: {name: found[node][name] for name in kept[node]} for node in kept}
-    assert not differences(listed, kept), WRITE
     assert listed == kept, f"Defaults and limits have no rounding. {WRITE}"
     for node, entries in kept.items():
         for name, entry in entries.items():
@@ -54,7 +60,7 @@ def test_parameters_keep_names_types_defaults_and_limits() -> None:
 
 
 def test_every_parameter_is_kept() -> None:
-    kept = json.loads(PARAMETERS.read_text("utf-8"))
+    kept = kept_in(PARAMETERS)
     new = {node: sorted(set(found) - set(kept[node])) for node, found in parameters().items()}
     assert not any(new.values()), f"New parameters have no expectation. {WRITE}"
 
@@ -74,45 +80,37 @@ def known_to(kept: Any, found: Any) -> Any:
 def test_commands_and_topics_stay_as_they_are(
     file: Path, prints: Callable[[], dict[str, Any]]
 ) -> None:
-    kept = json.loads(file.read_text("utf-8"))
+    kept = kept_in(file)
     found = known_to(kept, as_kept(prints()))
-    assert not differences(found, kept), WRITE
+    check(found, kept)
     assert list(found) == list(kept), "the plant publishes in this order"
 
 
 def test_plans_stay_as_they_are() -> None:
-    problems = differences(as_kept(plans()), json.loads(PLANS.read_text("utf-8")))
-    assert not problems, "\n".join([*problems[:40], WRITE])
+    check(as_kept(plans()), kept_in(PLANS))
 
 
 @pytest.mark.parametrize("part", PARTS)
-@pytest.mark.parametrize("name", _some_quick(BAGS, "servicer_thrusters", "sliding_masses"))
+@pytest.mark.parametrize("name", some_fast(BAGS, "servicer_thrusters", "sliding_masses"))
 def test_reports_stay_as_they_are(name: str, part: str) -> None:
-    kept = json.loads(REPORTS.read_text("utf-8"))[name].get(part)
-    problems = differences(report_part(name, part), kept)
-    assert not problems, "\n".join([*problems[:40], WRITE])
+    check(report_part(name, part), kept_in(REPORTS)[name].get(part))
 
 
 @pytest.mark.parametrize("name", SITUATIONS)
 def test_the_page_of_the_viewer_stays_as_it_is(name: str) -> None:
     pytest.importorskip("viser")
-    problems = differences(viewer_prints(name), json.loads(VIEWER.read_text("utf-8"))[name])
-    assert not problems, "\n".join([*problems[:40], WRITE])
+    check(viewer_prints(name), kept_in(VIEWER)[name])
 
 
 @pytest.mark.parametrize("name", CAMPAIGNS)
 def test_pages_of_campaigns_stay_as_they_are(name: str) -> None:
     pytest.importorskip("pyarrow")
-    kept = json.loads(CAMPAIGN_PAGES.read_text("utf-8"))
-    problems = differences(CAMPAIGNS[name](), kept[name])
-    assert not problems, "\n".join([*problems[:40], WRITE])
+    check(CAMPAIGNS[name](), kept_in(CAMPAIGN_PAGES)[name])
 
 
-@pytest.mark.parametrize("name", _some_quick(ANALYSED, "planar_chain"))
+@pytest.mark.parametrize("name", some_fast(ANALYSED, "planar_chain"))
 def test_pictures_of_robots_stay_as_they_are(name: str) -> None:
-    kept = json.loads(REPORTS.read_text("utf-8"))[f"analysis of {name}"]
-    problems = differences(analysis_prints(name), kept)
-    assert not problems, "\n".join([*problems[:40], WRITE])
+    check(analysis_prints(name), kept_in(REPORTS)[f"analysis of {name}"])
 
 
 def test_differences_are_found_beyond_rounding() -> None:

@@ -22,8 +22,7 @@ def test_every_known_error_can_be_put_in_and_names_tests_that_exist() -> None:
     for error in errors:
         try:
             # To parse every file takes most of a test; a part of a line changes no indent.
-            several = "\n" in error.before + error.after
-            (error.put_into if several else error.replaced)(content(error.file))
+            error.put_into(content(error.file), parse="\n" in error.before + error.after)
         except ValueError as problem:
             problems.append(f"{error.source}: {problem}")
         if not error.noticed_by:

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
-from support.command_prints import command_prints, topic_prints
 from support.figure_prints import analysis_prints, report_prints
 from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
 from support.viewer_prints import SITUATIONS, viewer_prints
 
 from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
+from spacerobot_ros.cli.main import main as spacerobot
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import Parameter, declared
@@ -37,6 +38,7 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.config import PlantConfig
+from spacerobot_ros.topics import TOPICS
 from spacerobot_ros.viewer.server import ViewerConfig
 
 FOLDER = Path(__file__).parents[1] / "expected"
@@ -261,6 +263,59 @@ def _numbers(schedule: GaitSchedule) -> dict[str, Any]:
 
 def _plain(note: Any) -> Any:
     return note if isinstance(note, (str, float)) else [float(x) for x in note]
+
+
+def command_prints() -> dict[str, Any]:
+    """Return every command by its words, with its parameters by name."""
+    context = click.Context(spacerobot)
+    found: dict[str, Any] = {}
+    for name in spacerobot.list_commands(context):
+        command = spacerobot.get_command(context, name)
+        assert command is not None
+        found |= dict(_prints_of(name, command))
+    return found
+
+
+def topic_prints() -> dict[str, Any]:
+    """Return every topic by its name, without its texts, in their order."""
+    texts = ("meaning", "when")
+    return {
+        name: {key: value for key, value in asdict(topic).items() if key not in texts}
+        for name, topic in TOPICS.items()
+    }
+
+
+def _prints_of(words: str, command: click.Command) -> list[tuple[str, Any]]:
+    parameters = {each.name: _parameter(each) for each in command.params if each.name is not None}
+    found: list[tuple[str, Any]] = [(words, parameters)]
+    if isinstance(command, click.Group):
+        for name, part in command.commands.items():
+            found += _prints_of(f"{words} {name}", part)
+    return found
+
+
+def _parameter(parameter: click.Parameter) -> dict[str, Any]:
+    kind: Any = parameter.type
+    found = {
+        "names": [*parameter.opts, *parameter.secondary_opts],
+        "type": type(kind).__name__,
+        "numbers": parameter.nargs,
+        "metavar": parameter.metavar,
+        "required": parameter.required,
+    }
+    default = parameter.default
+    # Versions of click differ in what stands for no default.
+    if isinstance(default, str | bool | int | float | tuple):
+        found["default"] = str(default)
+    if isinstance(kind, click.Choice):
+        found["choices"] = list(kind.choices)
+    if isinstance(kind, click.IntRange | click.FloatRange):
+        found["range"] = [str(kind.min), str(kind.max), kind.min_open, kind.max_open]
+    if isinstance(parameter, click.Option):
+        found |= {"multiple": parameter.multiple, "flag": parameter.is_flag}
+        if isinstance(parameter.flag_value, str | int | float):
+            found["flag_value"] = str(parameter.flag_value)
+    return found
 
 
 def differences(found: Any, kept: Any, where: str = "") -> list[str]:

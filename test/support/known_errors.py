@@ -17,7 +17,7 @@ import sys
 import tempfile
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
 from queue import SimpleQueue
@@ -59,29 +59,14 @@ class KnownError:
         """Return the entry for a message."""
         return f"{self.file}: {self.error}"
 
-    def put_into(self, text: str) -> str:
+    def put_into(self, text: str, *, parse: bool = True) -> str:
         """Return the text of the file with the error in it.
 
         Raises
         ------
         ValueError
-            The text before is not there exactly once, or the file is no Python afterwards.
-        """
-        changed = self.replaced(text)
-        if self.file.endswith(".py"):
-            try:
-                ast.parse(changed)
-            except SyntaxError as error:
-                raise ValueError(f"{self.line} The file is no Python afterwards: {error}") from None
-        return changed
-
-    def replaced(self, text: str) -> str:
-        """Return the text of the file with the error in it, not parsed: that takes most of a test.
-
-        Raises
-        ------
-        ValueError
-            The text before is not there exactly once.
+            The text before is not there exactly once, or the file is no Python afterwards (unless
+            it is not to be parsed: that takes most of a test).
         """
         pattern = _pattern(self.before)
         found = [match.start() for match in pattern.finditer(text)]
@@ -95,6 +80,11 @@ class KnownError:
         changed = pattern.sub(replacement, text)
         if changed == text:
             raise ValueError(f"{self.line} It changes nothing.")
+        if parse and self.file.endswith(".py"):
+            try:
+                ast.parse(changed)
+            except SyntaxError as error:
+                raise ValueError(f"{self.line} The file is no Python afterwards: {error}") from None
         return changed
 
 
@@ -133,18 +123,13 @@ def known_errors(folder: Path = FOLDER) -> list[KnownError]:
 
 
 def _entry(source: str, entry: dict[str, Any]) -> KnownError:
-    keys = {"file", "before", "after", "error", "noticed_by"}
+    keys = {each.name for each in fields(KnownError)} - {"source"}
     if set(entry) != keys:
         raise ValueError(f"{source}: {entry} has not the keys {', '.join(sorted(keys))}.")
     named = entry["noticed_by"]
-    return KnownError(
-        source,
-        entry["file"],
-        entry["before"].rstrip("\n"),
-        entry["after"].rstrip("\n"),
-        entry["error"],
-        (named,) if isinstance(named, str) else tuple(named),
-    )
+    tests = (named,) if isinstance(named, str) else tuple(named)
+    texts = {key: entry[key].rstrip("\n") for key in ("before", "after")}
+    return KnownError(source, **{**entry, **texts, "noticed_by": tests})
 
 
 # -- trying them ------------------------------------------------------------------------------
@@ -194,19 +179,14 @@ class Workplace:
         try:
             if error.file.startswith(_KEEPS_RESULTS):
                 # Plans of the code as it is, under the names of those that it would make now.
-                shutil.copytree(
-                    self._cache, self._own_cache, ignore=shutil.ignore_patterns("plans")
-                )
+                without_plans = shutil.ignore_patterns("plans")
+                shutil.copytree(self._cache, self._own_cache, ignore=without_plans)
             code, output = self.test(error.noticed_by)
         finally:
             self._write(path, text)
             shutil.rmtree(self._own_cache, ignore_errors=True)
-        match code:
-            case 0:
-                return Outcome.NOT_NOTICED, ""
-            case 1:
-                return Outcome.NOTICED, ""
-        return Outcome.NOT_RUN, output
+        known = {0: Outcome.NOT_NOTICED, 1: Outcome.NOTICED}
+        return (known[code], "") if code in known else (Outcome.NOT_RUN, output)
 
     def _write(self, path: Path, text: str) -> None:
         path.write_text(text, "utf-8")
