@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
-from support.altered_bags import altered
+from std_msgs.msg import String
+from support.altered_bags import Change, altered
 from support.made_bags import array, made_bag, odometry, stamped
 from support.raw_messages import iterate_raw
 from support.sentences import assert_one_sentence
@@ -122,12 +122,17 @@ class Made:
 
 
 def verified(path: Path, *args: Any, **options: Any) -> Verification:
-    return verify_bag(Made(*args, **options).write(path / "a.mcap"))
+    return verify_bag(Made(*args, **options).write(path / f"{len(os.listdir(path))}.mcap"))
 
 
-def held(stuck: int, since: int, count: int = 10) -> list[Any]:
+def difference_in(result: Verification) -> Difference:
+    assert result.difference is not None
+    return result.difference
+
+
+def held(stuck: int, since: int) -> list[Any]:
     """Return rates of which one slider's is zero from a tick on."""
-    return [RATES * [float(i != stuck or k < since) for i in range(3)] for k in range(count)]
+    return [RATES * [float(i != stuck or k < since) for i in range(3)] for k in range(10)]
 
 
 ALL = dict.fromkeys(range(10), RATES)
@@ -148,9 +153,7 @@ def test_efforts_are_compared_where_the_plant_of_the_bag_published_them(
     for efforts in (exact, None):
         right = verified(tmp_path, moved, first=first, efforts=efforts)
         assert right.difference is None, str(right.difference)
-    wrong = Made(moved, first=first, efforts={6: 1e-6}).write(tmp_path / "wrong.mcap")
-    difference = verify_bag(wrong).difference
-    assert difference is not None
+    difference = difference_in(verified(tmp_path, moved, first=first, efforts={6: 1e-6}))
     assert difference.time == pytest.approx(6 * TICK)
     assert difference.field == "effort of slider_1"
     assert difference.recorded - difference.expected == pytest.approx(1e-6)
@@ -161,9 +164,7 @@ def test_a_fault_acts_in_the_tick_that_it_came_in(tmp_path: Path, time: float) -
     fault = [(time, "joint_stuck slider_2")]
     right = verified(tmp_path, held(1, 3), ALL, fault)
     assert right.difference is None, str(right.difference)
-    late = Made(held(1, 4), ALL, fault).write(tmp_path / "late.mcap")
-    difference = verify_bag(late).difference
-    assert difference is not None
+    difference = difference_in(verified(tmp_path, held(1, 4), ALL, fault))
     assert difference.time == pytest.approx(4 * TICK)
 
 
@@ -173,8 +174,7 @@ def test_all_faults_of_a_tick_act(tmp_path: Path) -> None:
     assert verified(tmp_path, moved, ALL, faults).difference is None
     repaired = [RATES if k < 3 or k >= 6 else RATES * [0.0, 0.0, 1.0] for k in range(10)]
     faults += [(6.0, "clear"), (8.0, "nonsense")]
-    made = Made(repaired, ALL, faults).write(tmp_path / "b.mcap")
-    assert verify_bag(made).difference is None
+    assert verified(tmp_path, repaired, ALL, faults).difference is None
 
 
 PUSH = "mass_2 force 0.5 -1 2 torque 0 0.2 0 in link"
@@ -186,17 +186,13 @@ def test_disturbances_are_flown_again(tmp_path: Path) -> None:
     result = verified(tmp_path, moved, config=config)
     assert (result.difference, result.messages) == (None, 33)
     injected = [(4.0, PUSH), (6.7, f"{PUSH} until 0.9"), (8.0, "clear"), (9.0, "nonsense")]
-    made = Made(moved, disturbed=injected[:3], told=injected)
-    assert verify_bag(made.write(tmp_path / "b.mcap")).difference is None
+    assert verified(tmp_path, moved, disturbed=injected[:3], told=injected).difference is None
 
 
 def test_a_disturbance_counts_for_the_tick_that_it_came_in(tmp_path: Path) -> None:
     moved, push = [RATES] * 10, [(3.6, PUSH)]
-    right = Made(moved, disturbed=push, told=[(3.9, PUSH)]).write(tmp_path / "a.mcap")
-    assert verify_bag(right).difference is None
-    wrong = Made(moved, disturbed=push, told=[(4.0, PUSH)]).write(tmp_path / "b.mcap")
-    difference = verify_bag(wrong).difference
-    assert difference is not None
+    assert verified(tmp_path, moved, disturbed=push, told=[(3.9, PUSH)]).difference is None
+    difference = difference_in(verified(tmp_path, moved, disturbed=push, told=[(4.0, PUSH)]))
     assert difference.topic == "/odom"
     assert difference.time == pytest.approx(4 * TICK)
 
@@ -211,9 +207,7 @@ def test_a_tick_without_a_command_rests_and_the_difference_says_so(tmp_path: Pat
     commands = {k: RATES for k in range(10) if k != 3}
     moved = [RATES if k != 3 else REST for k in range(10)]
     assert verified(tmp_path, moved, commands).difference is None
-    made = Made([RATES] * 10, commands).write(tmp_path / "b.mcap")
-    difference = verify_bag(made).difference
-    assert difference is not None
+    difference = difference_in(verified(tmp_path, [RATES] * 10, commands))
     assert difference.time == pytest.approx(4 * TICK)
     assert difference.remark == " (no message on /joint_commands is stamped 0.3 s)"
 
@@ -233,26 +227,18 @@ def test_what_follows_a_latched_fault_is_said_to(tmp_path: Path) -> None:
     moved = [RATES if k < 4 else REST for k in range(10)]
     assert verified(tmp_path, moved, commands, config=config).difference is None
     # As if somebody had rearmed it at once.
-    moved = [RATES if k != 4 else REST for k in range(10)]
-    made = Made(moved, commands, config=config).write(tmp_path / "b.mcap")
-    difference = verify_bag(made).difference
-    assert difference is not None
-    assert difference.time == pytest.approx(6 * TICK)
-    assert difference.remark == " (a fault latched at 0.4 s; rearming is not recorded)"
+    rearmed = [RATES if k != 4 else REST for k in range(10)]
     # In the tick after it latched that is why it rests.
-    moved = [RATES] * 10
-    made = Made(moved, commands, config=config).write(tmp_path / "c.mcap")
-    difference = verify_bag(made).difference
-    assert difference is not None
-    assert difference.time == pytest.approx(5 * TICK)
-    assert difference.remark == " (a fault latched at 0.4 s; rearming is not recorded)"
+    for moved, tick in ((rearmed, 6), ([RATES] * 10, 5)):
+        difference = difference_in(verified(tmp_path, moved, commands, config=config))
+        assert difference.time == pytest.approx(tick * TICK)
+        assert difference.remark == " (a fault latched at 0.4 s; rearming is not recorded)"
 
 
 @pytest.mark.parametrize("prefix", ["", "/a"])
 def test_the_refusal_of_a_command_is_named(tmp_path: Path, prefix: str) -> None:
     commands = {k: RATES if k != 4 else [np.nan, 0.0, 0.0] for k in range(10)}
-    difference = verified(tmp_path, [RATES] * 10, commands, prefix=prefix).difference
-    assert difference is not None
+    difference = difference_in(verified(tmp_path, [RATES] * 10, commands, prefix=prefix))
     assert difference.time == pytest.approx(5 * TICK)
     assert f"the command on {prefix}/joint_commands stamped 0.4 s is rejected:" in difference.remark
 
@@ -278,9 +264,8 @@ def test_states_after_the_end_of_its_plant_are_differences(
     monkeypatch.setattr(verification, "build_plant", failing)
     result = verify_bag(bag)
     assert result.ticks == 5
-    assert result.difference is not None
-    assert result.difference.time == pytest.approx(6 * TICK)
-    assert result.difference.remark == " (its plant had stopped: It came apart)"
+    assert difference_in(result).time == pytest.approx(6 * TICK)
+    assert difference_in(result).remark == " (its plant had stopped: It came apart)"
 
 
 def test_the_robot_of_one_plant_is_verified(tmp_path: Path) -> None:
@@ -289,8 +274,7 @@ def test_the_robot_of_one_plant_is_verified(tmp_path: Path) -> None:
             Made([RATES] * 4, prefix=prefix).add(bag, say)
     with pytest.raises(RecordingError, match=r"contains states of 2 plants \(/a, /b\)"):
         verify_bag(tmp_path / "two.mcap")
-    alone = Made([RATES] * 4, prefix="/a").write(tmp_path / "one.mcap")
-    assert verify_bag(alone).difference is None
+    assert verified(tmp_path, [RATES] * 4, prefix="/a").difference is None
 
 
 def test_the_earliest_difference_is_named_wherever_it_is_in_the_file(tmp_path: Path) -> None:
@@ -309,9 +293,8 @@ def test_the_earliest_difference_is_named_wherever_it_is_in_the_file(tmp_path: P
 
         made.add(bag, altered)
     result = verify_bag(path)
-    assert result.difference is not None
-    assert result.difference.time == pytest.approx(4 * TICK)
-    assert result.difference.field == "position of slider_1"
+    assert difference_in(result).time == pytest.approx(4 * TICK)
+    assert difference_in(result).field == "position of slider_1"
     # What is found different is not the largest deviation before it.
     assert result.largest < 1e-12
 
@@ -425,58 +408,56 @@ def test_a_state_that_was_lost_on_its_way_to_the_recorder_is_counted(tmp_path: P
         assert bool(verify_bag(path).missing) is missing
 
 
-# -- what counts as a difference between a bag and its re-simulation, at the borders of ----------
+# -- reference bags of which something is altered -----------------------------------------------
 
 
 BAGS = share_directory() / "bags"
-BAG = BAGS / "sliding_masses.mcap"
+REFERENCE = BAGS / "sliding_masses.mcap"
+TICKS = 340
 
 
-def found(tmp_path: Path, topic: str, number: int, change: Any) -> Difference | None:
-    return verify_bag(altered(BAG, tmp_path / "altered.mcap", topic, number, change)).difference
+def added(path: str, amount: float) -> Change:
+    """Return what adds to the number at a path such as ``velocity.2`` of a message."""
+    *parts, last = path.split(".")
+
+    def change(message: Any) -> Any:
+        part = reduce(getattr, parts, message)
+        if last.isdigit():
+            part[int(last)] += amount
+        else:
+            setattr(part, last, getattr(part, last) + amount)
+        return message
+
+    return change
 
 
 def test_a_quaternion_means_the_same_with_either_sign(tmp_path: Path) -> None:
-    def negated(message: Any) -> Any:
-        q = message.pose.pose.orientation
-        assert q.w > 0.5
-        q.x, q.y, q.z, q.w = -q.x, -q.y, -q.z, -q.w
-        return message
+    """The opposite rotation is a difference."""
 
-    assert found(tmp_path, "/odom", 120, negated) is None
+    def of_sign(w: float) -> Change:
+        def change(message: Any) -> Any:
+            q = message.pose.pose.orientation
+            assert abs(q.x) > 1e-4
+            assert q.w > 0.5
+            q.x, q.y, q.z, q.w = -q.x, -q.y, -q.z, w * q.w
+            return message
 
+        return change
 
-def test_the_opposite_rotation_is_a_difference(tmp_path: Path) -> None:
-    def conjugated(message: Any) -> Any:
-        q = message.pose.pose.orientation
-        assert abs(q.x) > 1e-4
-        q.x, q.y, q.z = -q.x, -q.y, -q.z
-        return message
-
-    difference = found(tmp_path, "/odom", 120, conjugated)
-    assert difference is not None
-    assert difference.field == "pose.pose.orientation.x"
+    same, opposite = (
+        verify_bag(altered(REFERENCE, tmp_path / f"{w}.mcap", "/odom", 120, of_sign(w)))
+        for w in (-1.0, 1.0)
+    )
+    assert same.difference is None
+    assert difference_in(opposite).field == "pose.pose.orientation.x"
 
 
 def test_a_number_that_is_none_is_a_difference(tmp_path: Path) -> None:
-    def lost(message: Any) -> Any:
-        message.twist.twist.linear.z = math.nan
-        return message
-
-    difference = found(tmp_path, "/odom", 120, lost)
-    assert difference is not None
+    lost = added("twist.twist.linear.z", math.nan)
+    bag = altered(REFERENCE, tmp_path / "b.mcap", "/odom", 120, lost)
+    difference = difference_in(verify_bag(bag))
     assert difference.topic == "/odom"
     assert difference.time == pytest.approx(12.0)
-
-
-def test_the_very_first_state_is_compared(tmp_path: Path) -> None:
-    def moved(message: Any) -> Any:
-        message.position[1] += 1e-6
-        return message
-
-    difference = found(tmp_path, "/joint_states", 0, moved)
-    assert difference is not None
-    assert (difference.time, difference.field) == (0.0, "position of slider_2")
 
 
 @pytest.mark.parametrize(("row", "least", "most"), [(256, 7.0, 9.0), (32, 0.2, 0.3)])
@@ -503,21 +484,11 @@ def test_deviations_count_as_a_share_above_one_and_as_they_are_below(
         assert result.largest_at.field == "kinetic energy"
 
 
-REFERENCE = share_directory() / "bags" / "sliding_masses.mcap"
-
-TICKS = 340
-
-
-def scaled(message: JointState) -> JointState:
-    message.velocity[1] += 1e-4
-    return message
-
-
 @pytest.mark.parametrize("tick", [1, 80, 333])
 def test_an_altered_command_is_found_where_it_acts(tmp_path: Path, tick: int) -> None:
-    bag = altered(REFERENCE, tmp_path / "b.mcap", "/joint_commands", tick, scaled)
-    difference = verify_bag(bag).difference
-    assert difference is not None
+    faster = added("velocity.1", 1e-4)
+    bag = altered(REFERENCE, tmp_path / "b.mcap", "/joint_commands", tick, faster)
+    difference = difference_in(verify_bag(bag))
     assert difference.time == pytest.approx((tick + 1) * TICK)
     assert (difference.topic, difference.field) == ("/joint_states", "position of slider_2")
     # What the slider does in a tick.
@@ -525,75 +496,44 @@ def test_an_altered_command_is_found_where_it_acts(tmp_path: Path, tick: int) ->
     assert_one_sentence(str(difference), "position of slider_2", f"{(tick + 1) * TICK:g} s")
 
 
-def moved(message: Any) -> Any:
-    if isinstance(message, JointState):
-        message.velocity[2] += 1e-6
-    elif isinstance(message, Odometry):
-        message.twist.twist.angular.y += 1e-6
-    elif isinstance(message, PoseStamped):
-        message.pose.orientation.x += 1e-6
-    elif isinstance(message, Float64MultiArray):
-        message.data[6] += 1e-6
-    return message
-
-
 @pytest.mark.parametrize(
-    ("topic", "field"),
+    ("name", "topic", "number", "path", "field"),
     [
-        ("/joint_states", "velocity of slider_3"),
-        ("/odom", "twist.twist.angular.y"),
-        ("/base_pose", "pose.orientation.x"),
-        ("/momentum", "kinetic energy"),
+        ("sliding_masses", "/joint_states", 0, "position.1", "position of slider_2"),
+        ("sliding_masses", "/joint_states", 33, "velocity.2", "velocity of slider_3"),
+        ("sliding_masses", "/odom", 33, "twist.twist.angular.y", "twist.twist.angular.y"),
+        ("sliding_masses", "/base_pose", 33, "pose.orientation.x", "pose.orientation.x"),
+        ("sliding_masses", "/momentum", 33, "data.6", "kinetic energy"),
+        pytest.param(
+            *("servicer_thrusters", "/thrusters", 33, "effort.3", "effort of plus_x_4"),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            *("servicer_thrusters", "/base_wrench_realised", 33),
+            *("wrench.torque.y", "wrench.torque.y"),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
-def test_an_altered_state_is_found(tmp_path: Path, topic: str, field: str) -> None:
-    bag = altered(REFERENCE, tmp_path / "b.mcap", topic, 33, moved)
-    difference = verify_bag(bag).difference
-    assert difference is not None
+def test_an_altered_number_is_found(
+    tmp_path: Path, name: str, topic: str, number: int, path: str, field: str
+) -> None:
+    source = BAGS / f"{name}.mcap"
+    bag = altered(source, tmp_path / "b.mcap", topic, number, added(path, 1e-6))
+    difference = difference_in(verify_bag(bag))
     assert (difference.topic, difference.field) == (topic, field)
-    assert difference.time == pytest.approx(read_bag(REFERENCE)[topic].stamp[33])
+    assert difference.time == pytest.approx(read_bag(source)[topic].stamp[number])
     assert difference.recorded - difference.expected == pytest.approx(1e-6, rel=1e-6)
     assert verify_bag(bag, tolerance=2e-6).difference is None
-
-
-def moved_thrust(message: Any) -> Any:
-    if isinstance(message, JointState):
-        message.effort[3] += 1e-6
-    else:
-        message.wrench.torque.y += 1e-6
-    return message
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("topic", "field"),
-    [("/thrusters", "effort of plus_x_4"), ("/base_wrench_realised", "wrench.torque.y")],
-)
-def test_an_altered_thrust_is_found(tmp_path: Path, topic: str, field: str) -> None:
-    source = REFERENCE.with_name("servicer_thrusters.mcap")
-    bag = altered(source, tmp_path / "b.mcap", topic, 33, moved_thrust)
-    difference = verify_bag(bag).difference
-    assert difference is not None
-    assert (difference.topic, difference.field) == (topic, field)
-    assert difference.recorded - difference.expected == pytest.approx(1e-6, rel=1e-6)
 
 
 @pytest.mark.slow
 def test_another_robot_is_found(tmp_path: Path) -> None:
     text = b'<mass value="10" />', b'<mass value="10.01" />'
-    difference = verify_bag(altered(REFERENCE, tmp_path / "b.mcap", urdf=text)).difference
-    assert difference is not None
+    difference = difference_in(verify_bag(altered(REFERENCE, tmp_path / "b.mcap", urdf=text)))
     # The joints go as commanded, but with other efforts.
     assert difference.topic == "/joint_states"
     assert difference.time == pytest.approx(TICK)
-
-
-def test_a_missing_command_is_named(tmp_path: Path) -> None:
-    bag = altered(REFERENCE, tmp_path / "b.mcap", "/joint_commands", 5, lambda _: None)
-    difference = verify_bag(bag).difference
-    assert difference is not None
-    assert difference.time == pytest.approx(6 * TICK)
-    assert "no message on /joint_commands is stamped 0.5 s" in str(difference)
 
 
 def test_a_joint_that_the_robot_does_not_have_is_refused(tmp_path: Path) -> None:
@@ -611,16 +551,16 @@ def test_a_bag_that_begins_in_mid_flight(tmp_path: Path) -> None:
     result = verify_bag(bag)
     assert result.difference is None
     assert result.ticks == TICKS - 1
-    bag = altered(bag, tmp_path / "changed.mcap", "/odom", 7, moved)
-    difference = verify_bag(bag).difference
-    assert difference is not None
+    turned = added("twist.twist.angular.y", 1e-6)
+    bag = altered(bag, tmp_path / "changed.mcap", "/odom", 7, turned)
+    difference = difference_in(verify_bag(bag))
     assert difference.time == pytest.approx(8 * TICK)
 
 
 def test_a_flight_under_efforts_that_begins_in_mid_flight_has_its_joint_rates(
     tmp_path: Path,
 ) -> None:
-    whole = share_directory() / "bags" / "coordinated_control.mcap"
+    whole = BAGS / "coordinated_control.mcap"
     # The robot starts at rest; half a second later its joints move.
     bag = altered(whole, tmp_path / "late.mcap", begin_ns=500_000_000)
     assert np.abs(read_bag(bag)["/joint_states"].field("velocity")[0]).min() > 1e-3
