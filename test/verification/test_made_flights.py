@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
-from functools import reduce
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,10 @@ import pytest
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from support.altered_bags import Change, altered
-from support.made_bags import array, made_bag, odometry, stamped
-from support.raw_messages import iterate_raw
+from support.made_bags import Say, array, made_bag, odometry, stamped
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.bag import BagWriter, read_bag
+from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import RecordingError, SpaceRobotError
 from spacerobot_ros.flight import verification
 from spacerobot_ros.flight.verification import Difference, Verification, verify_bag
@@ -42,6 +41,10 @@ def _interpreted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def config_of(**more: Any) -> PlantConfig:
     return PlantConfig(robot="sliding_masses", time_mode="lockstep", tick_rate=1 / TICK, **more)
+
+
+Hear = Callable[[Say, str, Any, float], None]
+"""Takes what writes a message, and the message with its topic and time, s."""
 
 
 class Made:
@@ -76,9 +79,14 @@ class Made:
         self.efforts, self.disturbed = efforts, disturbed
         self.told = disturbed if told is None else told
 
-    def write(self, path: Path) -> Path:
+    def write(
+        self, path: Path, hear: Hear | None = None, recorder: dict[str, str] | None = None
+    ) -> Path:
+        """Write the bag; ``hear`` decides what is written, ``recorder`` is what was counted."""
         with made_bag(path) as (bag, say):
-            self.add(bag, say)
+            if recorder is not None:
+                bag.add_metadata("recorder", recorder)
+            self.add(bag, say if hear is None else partial(hear, say))
         return path
 
     def add(self, bag: Any, say: Any) -> None:
@@ -278,21 +286,16 @@ def test_the_robot_of_one_plant_is_verified(tmp_path: Path) -> None:
 
 
 def test_the_earliest_difference_is_named_wherever_it_is_in_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    made = Made([RATES] * 10)
-    with made_bag(path) as (bag, say):
+    def alter(say: Say, topic: str, message: Any, time: float) -> None:
+        tick = round(time / TICK)
+        if topic == "/joint_states" and tick in (4, 6):
+            message.position[0 if tick == 4 else 1] += 1e-3
+            message.velocity[2] += 1e-3
+            # Recorded out of order.
+            time = 1.0 - time
+        say(topic, message, time)
 
-        def altered(topic: str, message: Any, time: float) -> None:
-            tick = round(time / TICK)
-            if topic == "/joint_states" and tick in (4, 6):
-                message.position[0 if tick == 4 else 1] += 1e-3
-                message.velocity[2] += 1e-3
-                # Recorded out of order.
-                time = 1.0 - time
-            say(topic, message, time)
-
-        made.add(bag, altered)
-    result = verify_bag(path)
+    result = verify_bag(Made([RATES] * 10).write(tmp_path / "a.mcap", alter))
     assert difference_in(result).time == pytest.approx(4 * TICK)
     assert difference_in(result).field == "position of slider_1"
     # What is found different is not the largest deviation before it.
@@ -311,19 +314,16 @@ def test_a_flight_that_begins_at_a_limit_but_for_rounding(tmp_path: Path) -> Non
 @pytest.mark.parametrize("at", [4, 7])
 def test_a_reset_is_refused_with_the_time_of_its_state(tmp_path: Path, at: int) -> None:
     """The plant's time goes on, and its first state is published once more."""
-    path = tmp_path / "a.mcap"
-    made = Made([RATES] * 10)
     start = JointState(name=NAMES, position=[0.0] * 3, velocity=[0.0] * 3, effort=[0.0] * 3)
-    with made_bag(path) as (bag, say):
 
-        def again(topic: str, message: Any, time: float) -> None:
-            say(topic, message, time)
-            if topic == "/joint_states" and round(time / TICK) == at:
-                say(topic, stamped(start, time - 2 * TICK, "base_link"), time)
+    def again(say: Say, topic: str, message: Any, time: float) -> None:
+        say(topic, message, time)
+        if topic == "/joint_states" and round(time / TICK) == at:
+            say(topic, stamped(start, time - 2 * TICK, "base_link"), time)
 
-        made.add(bag, again)
+    bag = Made([RATES] * 10).write(tmp_path / "a.mcap", again)
     with pytest.raises(RecordingError) as refusal:
-        verify_bag(path)
+        verify_bag(bag)
     assert f"the plant was reset at {(at - 2) * TICK:.9g} s; only flights" in str(refusal.value)
 
 
@@ -349,8 +349,12 @@ def test_how_much_was_verified_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kept", [1, 2, 6])
 def test_a_bag_whose_states_were_removed_is_not_verified(tmp_path: Path, kept: int) -> None:
     """Its commands are all there: each answers a state."""
-    whole = Made([RATES] * 10).write(tmp_path / "whole.mcap")
-    bag = without_states(whole, tmp_path / "a.mcap", since=kept)
+
+    def hear(say: Say, topic: str, message: Any, time: float) -> None:
+        if topic == "/joint_commands" or time < (kept - 0.5) * TICK:
+            say(topic, message, time)
+
+    bag = Made([RATES] * 10).write(tmp_path / "a.mcap", hear)
     if kept == 1:
         with pytest.raises(RecordingError, match="the states of only one tick: there is nothing"):
             verify_bag(bag)
@@ -362,50 +366,35 @@ def test_a_bag_whose_states_were_removed_is_not_verified(tmp_path: Path, kept: i
     assert result.missing == f"it has commands for {10 - kept} states that are missing, {first}"
 
 
-def without_states(bag: Path, out: Path, since: int) -> Path:
-    """Copy a bag without the states of a tick and later."""
-    with BagWriter(out) as writer:
-        for name, values in read_bag(bag).metadata.items():
-            writer.add_metadata(name, values)
-        for name, data in read_bag(bag).attachments.items():
-            writer.add_attachment(name, data, "application/xml", 0)
-        for topic, kind, time_ns, _, raw in iterate_raw(bag):
-            if topic == "/joint_commands" or time_ns < (since - 0.5) * TICK * 1e9:
-                writer.write(writer.add_topic(topic, kind), raw, time_ns, time_ns)
-    return out
-
-
 @pytest.mark.parametrize(("counted", "lost"), [(42, 0), (43, 0), (43, 5)])
 def test_a_bag_with_fewer_messages_than_its_recorder_wrote_is_not_whole(
     tmp_path: Path, counted: int, lost: int
 ) -> None:
-    with made_bag(tmp_path / "a.mcap") as (bag, say):
-        Made([RATES] * 10).add(bag, say)
-        counts = {"messages": str(counted), "messages_lost": str(lost)}
-        bag.add_metadata("recorder", counts)
-    held = read_bag(tmp_path / "a.mcap").message_count()
-    assert held == 3 * 11 + 10
-    result = verify_bag(tmp_path / "a.mcap")
-    assert result.missing == ""
-    with made_bag(tmp_path / "b.mcap") as (bag, say):
-        Made([RATES] * 10).add(bag, say)
-        bag.add_metadata("recorder", {"messages": str(held + 1), "messages_lost": str(lost)})
-    missing = verify_bag(tmp_path / "b.mcap").missing
-    assert missing == f"its recorder wrote {held + 1} messages, but it contains {held}."
+    # Three messages of each of eleven states, and ten commands.
+    whole, lacking = (
+        verify_bag(
+            Made([RATES] * 10).write(
+                tmp_path / f"{messages}.mcap",
+                recorder={"messages": str(messages), "messages_lost": str(lost)},
+            )
+        )
+        for messages in (counted, 44)
+    )
+    assert whole.missing == ""
+    assert lacking.missing == "its recorder wrote 44 messages, but it contains 43."
 
 
-def test_a_state_that_was_lost_on_its_way_to_the_recorder_is_counted(tmp_path: Path) -> None:
-    for lost, missing in ((1, False), (0, True)):
-        path = tmp_path / f"{lost}.mcap"
-        with made_bag(path) as (bag, say):
+@pytest.mark.parametrize(("lost", "missing"), [(1, False), (0, True)])
+def test_a_state_that_was_lost_on_its_way_to_the_recorder_is_counted(
+    tmp_path: Path, lost: int, missing: bool
+) -> None:
+    def hear(say: Say, topic: str, message: Any, time: float) -> None:
+        if not (topic == "/joint_states" and time == 5 * TICK):
+            say(topic, message, time)
 
-            def heard(topic: str, message: Any, time: float, say: Any = say) -> None:
-                if not (topic == "/joint_states" and time == 5 * TICK):
-                    say(topic, message, time)
-
-            Made([RATES] * 10).add(bag, heard)
-            bag.add_metadata("recorder", {"messages": "1", "messages_lost": str(lost)})
-        assert bool(verify_bag(path).missing) is missing
+    counts = {"messages": "1", "messages_lost": str(lost)}
+    bag = Made([RATES] * 10).write(tmp_path / "a.mcap", hear, counts)
+    assert bool(verify_bag(bag).missing) is missing
 
 
 # -- reference bags of which something is altered -----------------------------------------------

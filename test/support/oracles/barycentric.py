@@ -9,32 +9,9 @@ formulas remain.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 
 from spacerobot_ros.model.kinematics import TreeKinematics
-
-
-@dataclass(frozen=True)
-class BarycentricInertia:
-    """Blocks of ``H+`` (eq. 15) in base components.
-
-    ``D`` (3, 3) system inertia about the system's centre of mass, ``D_q`` (3, n), ``D_qq``
-    (n, n); ``v[i][k]`` are the barycentric vectors, each (3,).
-    """
-
-    mass: float | ca.SX
-    D: ca.SX
-    D_q: ca.SX
-    D_qq: ca.SX
-    v: tuple[tuple[ca.SX, ...], ...]
-
-    @property
-    def H_plus(self) -> ca.SX:
-        """The inertia matrix (6 + n, 6 + n) of ``[v_cm; omega; qdot]``, eq. (15)."""
-        turning = ca.blockcat([[self.D, self.D_q], [self.D_q.T, self.D_qq]])
-        return ca.diagcat(self.mass * ca.SX.eye(3), turning)
 
 
 def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
@@ -65,8 +42,11 @@ def barycentric_vectors(kin: TreeKinematics) -> tuple[tuple[ca.SX, ...], ...]:
     )
 
 
-def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
-    """Return the blocks of ``H+`` (eqs 14-17), with the slide terms of prismatic joints."""
+def barycentric_inertia(kin: TreeKinematics) -> ca.SX:
+    """Return ``H+`` (6 + n, 6 + n) of ``[v_cm; omega; qdot]`` in base components.
+
+    Eqs (14-17), with the slide terms of prismatic joints.
+    """
     n, M = kin.moving_body_count, kin.total_mass
     bodies = range(n + 1)
     v = barycentric_vectors(kin)
@@ -119,7 +99,8 @@ def barycentric_inertia(kin: TreeKinematics) -> BarycentricInertia:
             reduced = shared - carried[0] * carried[1] / M
             D_qq[a - 1, b - 1] = reduced * ca.dot(kin.axis[a], kin.axis[b])
     D_q, D_qq = kin.gather(D_q.T).T, kin.gather(kin.gather(D_qq).T)
-    return BarycentricInertia(M, D, D_q, D_qq, v)
+    turning = ca.blockcat([[D, D_q], [D_q.T, D_qq]])
+    return ca.diagcat(M * one, turning)
 
 
 def _outboard(kin: TreeKinematics, j: int) -> list[int]:
