@@ -230,8 +230,8 @@ def plan_approach(
     standoff or to a standoff at two or three times the distance, or starts later.
 
     ``held`` is the end-effector reference before the approach; if it moves, the approach starts
-    immediately. The limits are those of the reference in W. Without ``clearance``, the target body
-    is unknown.
+    immediately. The limits are those of the reference in W. If the target body is unknown,
+    ``clearance`` is None.
 
     Raises
     ------
@@ -410,7 +410,10 @@ class TargetClearance:
         geometry = self._geometry
         if not len(geometry.pairs):
             return None
-        poses = geometry.poses(shapes, self._base_in_target(base, grapple))
+        R_TW = self._grapple.R @ np.swapaxes(grapple.R, 1, 2)
+        r_TB = np.einsum("kij,kj->ki", R_TW, base.r - grapple.r) + self._grapple.r
+        turns = np.array([quaternion_from_matrix(R) for R in R_TW @ base.R])
+        poses = geometry.poses(shapes, BasePoses(r_TB, turns))
         bounds = geometry.lower_bounds(poses)
         bounds[closes:, self._is_pair_of_end_effector] = np.inf
         found: NearestLinks | None = None
@@ -421,9 +424,3 @@ class TargetClearance:
                 if found is None or distance < found.distance:
                     found = NearestLinks(distance, geometry.links_of(pair))
         return found
-
-    def _base_in_target(self, base: Pose, grapple: FrameMotion) -> BasePoses:
-        R_TW = self._grapple.R @ np.swapaxes(grapple.R, 1, 2)
-        r_TB = np.einsum("kij,kj->ki", R_TW, base.r - grapple.r) + self._grapple.r
-        R_TB = R_TW @ base.R
-        return BasePoses(r_TB, np.array([quaternion_from_matrix(R) for R in R_TB]))

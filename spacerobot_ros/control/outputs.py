@@ -257,7 +257,11 @@ class OutputVector:
         if selection.joints:
             target = ca.SX.sym("joint_reference", 3 * n)
             references.append(target)
-            groups.append(_selected(self._joint_group(target), robot.joint_names, selection.joints))
+            q_des, qdot_des, qddot_des = ca.vertsplit(target, [0, n, 2 * n, 3 * n])
+            J = ca.horzcat(ca.SX(n, 6), ca.SX.eye(n))
+            errors = q_des - self.q, qdot_des - self.qdot
+            joints = _OutputGroup(*errors, qddot_des, J, ca.SX(n, 1))
+            groups.append(_selected(joints, robot.joint_names, selection.joints))
         self.reference = ca.vertcat(*references)
         self._error_function: ca.Function | None = None
         self.error, self.error_rate, self.acceleration, self.J_z, self.bias_acceleration = (
@@ -354,12 +358,6 @@ class OutputVector:
         quaternion = quaternion_multiply(self._quaternion, attitude)
         J_B = self.model(f"jacobian:{link}", self.q)
         return self._pose_group(J_B, position, quaternion, target)
-
-    def _joint_group(self, target: ca.SX) -> _OutputGroup:
-        n = self.robot.n
-        q_des, qdot_des, qddot_des = ca.vertsplit(target, [0, n, 2 * n, 3 * n])
-        J = ca.horzcat(ca.SX(n, 6), ca.SX.eye(n))
-        return _OutputGroup(q_des - self.q, qdot_des - self.qdot, qddot_des, J, ca.SX(n, 1))
 
 
 def _selected(group: _OutputGroup, names: Sequence[str], chosen: Sequence[str]) -> _OutputGroup:

@@ -171,7 +171,9 @@ def composites(kin: TreeKinematics) -> Composites:
         composite.append(SpatialInertia(kin.mass(k), h, J[k] + symmetric(h @ rho.T)))
     S, P = ([ca.SX(6, 1)] * (n + 1) for _ in range(2))
     for k in range(n, 0, -1):
-        S[k] = _joint_motion(kin, k)
+        S[k] = ca.vertcat(ca.SX(3, 1), kin.axis[k])
+        if kin.is_revolute(k):
+            S[k] = ca.vertcat(kin.axis[k], ca.cross(kin.p[k] - c, kin.axis[k]))
         P[k] = composite[k] @ S[k]
         composite[kin.parent(k)] += composite[k]
     return Composites(kin, J, tuple(composite), tuple(S), tuple(P), rotational(composite[0].J))
@@ -466,13 +468,6 @@ def _equations(kin: TreeKinematics, *, loaded: bool) -> _Equations:
     omega = system.base_motion(matrix_from_quaternion(quaternion).T @ L_W, qdot)
     Q, _ = shape_forces(system, omega, qdot, external, tau, loads)
     return _Equations({"x": x, "command": command}, system, omega, external, Q, loads)
-
-
-def _joint_motion(kin: TreeKinematics, k: int) -> ca.SX:
-    """Return the motion (6,) for a unit rate of joint k, at the system's centre of mass."""
-    if kin.is_revolute(k):
-        return ca.vertcat(kin.axis[k], ca.cross(kin.p[k] - kin.r_BC_B, kin.axis[k]))
-    return ca.vertcat(ca.SX(3, 1), kin.axis[k])
 
 
 def _angular_operator(omega: ca.SX, alpha: ca.SX) -> ca.SX:

@@ -76,9 +76,8 @@ class ThrusterPlant(WrappedPlant):
     def __init__(self, plant: Plant, config: PlantConfig) -> None:
         super().__init__(plant)
         self.table = table = find_thrusters(config.thrusters, plant.robot.description)
-        self._control_period = config.control_period
         disabled = config.thrusters_excluded.split()
-        self.modulator = ThrusterModulator(table, config.control_period, disabled)
+        self.modulator = ThrusterModulator(table, self.control_period, disabled)
         self._wrenches, self._mass_flow = table.wrenches, table.mass_flow
         count = len(table.names)
         self.wrench = np.zeros(6)
@@ -103,7 +102,7 @@ class ThrusterPlant(WrappedPlant):
         for command in (effort, wanted):
             if not np.all(np.isfinite(command)):
                 raise CommandError(f"A command is not finite: {np.asarray(command).tolist()}.")
-        tick = self._control_period
+        tick = self.control_period
         on_time = self.modulator.fire(wanted)
         on_time[self.stuck_on] = tick
         self.duty[:] = on_time / tick
@@ -153,7 +152,6 @@ class PlantWithFaults(WrappedPlant):
         self.timeline = Timeline(config.faults, lambda line, now: parse_fault(line, targets, now))
         self.tick = 0
         """Ticks since the beginning."""
-        self._control_period = config.control_period
         # The random stream differs from the sensors' stream, which has the seed itself.
         self._rng = np.random.default_rng(np.random.SeedSequence(config.sensors.seed).spawn(1)[0])
         self._index = {name: i for i, name in enumerate(self.robot.joint_names)}
@@ -179,7 +177,7 @@ class PlantWithFaults(WrappedPlant):
     @property
     def time(self) -> float:
         """Simulated time, s."""
-        return self.tick * self._control_period
+        return self.tick * self.control_period
 
     def start_at(self, tick: int) -> None:
         """Continue from another time, given as the number of ticks since the beginning."""
@@ -219,7 +217,7 @@ class PlantWithFaults(WrappedPlant):
 
     def _update_active(self) -> None:
         """Apply the faults and disturbances that are active at the current time."""
-        period, timelines = self._control_period, (self.timeline, self._disturbances)
+        period, timelines = self.control_period, (self.timeline, self._disturbances)
         now = self.time + _FAULT_TIME_ROUNDING * period
         faults, disturbances = self.timeline.at(now), self._disturbances.at(now)
         next_change = min(each.next_change for each in timelines)

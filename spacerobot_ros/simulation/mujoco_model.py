@@ -80,16 +80,6 @@ def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
     return spec
 
 
-def _add_motors(mujoco: Any, spec: Any, description: RobotDescription) -> None:
-    """Add actuators to a specification: six for the wrench on the base in B, one for each joint."""
-    # The wrench rotates with the base, at every stage of every step.
-    spec.worldbody.first_body().add_site(name="wrench")
-    for axis in np.eye(6):
-        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="wrench", gear=axis.tolist())
-    for name in description.joint_names:
-        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
-
-
 def joint_addresses(model: Any, description: RobotDescription) -> tuple[list[int], list[int]]:
     """Return the joint indices, in the robot's order, in ``qpos`` and in ``qvel``."""
     joints = [model.joint(name) for name in description.joint_names]
@@ -129,8 +119,12 @@ def build_model(
         MuJoCo rejects the robot, or a joint mimics another.
     """
     spec, shapes = robot_spec(mujoco, robot), list[str]()
-    _add_motors(mujoco, spec, robot)
+    # The wrench on the base, in B, rotates with it at every stage of every step.
+    spec.worldbody.first_body().add_site(name="wrench")
+    for axis in np.eye(6):
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_SITE, target="wrench", gear=axis.tolist())
     for name in robot.joint_names:
+        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
         spec.add_equality(
             name=f"lock {name}",
             type=mujoco.mjtEq.mjEQ_JOINT,

@@ -51,6 +51,8 @@ class Plant(Protocol):
     """
 
     robot: SpaceRobot
+    control_period: float
+    """Duration of a tick, s."""
     initial: InitialState
     pose: Array
     twist: Array
@@ -92,6 +94,7 @@ class WrappedPlant:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.robot, self.initial = plant.robot, plant.initial
+        self.control_period = plant.control_period
         self.pose, self.twist = plant.pose, plant.twist
         self.momentum, self.expected_momenta = plant.momentum, plant.expected_momenta
         self.q, self.qdot, self.effort = plant.q, plant.qdot, plant.effort

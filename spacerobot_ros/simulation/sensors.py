@@ -90,7 +90,7 @@ class Sensors:
                 f"Parameter 'sensors.joint_bias' has {counted(len(errors.joint_bias), 'value')}; "
                 f"the robot has {counted(n, 'joint')}."
             )
-        self._plant, self._config, self._control_period = plant, errors, config.control_period
+        self._plant, self._config = plant, errors
         self._normals = NormalNumbers(errors.seed, 12 + 2 * n)
         self._joint_index = {name: i for i, name in enumerate(plant.robot.joint_names)}
         self.pose, self.twist = plant.pose.copy(), plant.twist.copy()
@@ -171,7 +171,7 @@ class Sensors:
             (self.twist_covariance, "velocity", "angular_velocity"),
         ):
             covariance[[0, 7, 14]], covariance[[21, 28, 35]] = variances[linear], variances[angular]
-        self._delay = round(delay / self._control_period)
+        self._delay = round(delay / self._plant.control_period)
         self._past = deque(self._past, maxlen=self._delay + 1)
 
 
