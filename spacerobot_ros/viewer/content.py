@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Generic, TypeVar
 
+from spacerobot_ros.control.wheels import BUDGET_PARTS
 from spacerobot_ros.errors import ParameterError, enumeration, numbers, quantity, shortened
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
@@ -23,9 +24,8 @@ from spacerobot_ros.planning.execution.status import PlannerState
 from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, parse_fault, with_seconds
 from spacerobot_ros.simulation.status import PlantState
 from spacerobot_ros.viewer.reachability import GoalCheck, Verdict
+from spacerobot_ros.viewer.scene import Color
 from spacerobot_ros.viewer.state import Measured, Notice, Part, StackState
-
-Color = tuple[int, int, int]
 
 SILENT_AFTER = 1.0
 """Wall time, s, after which the page reports that no state was received."""
@@ -48,11 +48,7 @@ COLORS: Mapping[Verdict, Color] = {
 }
 """Ghost colours by goal verdict."""
 
-_LEVEL_COLORS = (
-    "var(--ok-color,#2a9d5c)",
-    "var(--warn-color,#c98a00)",
-    "var(--bad-color,#d23c3c)",
-)
+_LEVEL_COLORS = "var(--ok-color,#2a9d5c)", "var(--warn-color,#c98a00)", "var(--bad-color,#d23c3c)"
 """Colours of the levels OK, WARN and ERROR; the colours in ``page.js`` are readable in both
 themes.
 """
@@ -127,22 +123,17 @@ def status_html(
     without a planner, of the controller; None if unknown.
     """
     lines = []
-    silence = silence_message(state)
-    if silence:
-        lines.append(_line_html(silence, 2))
-    elif not described:
-        lines.append(
-            _line_html("No robot is shown: no valid robot_description has been received.", 2)
-        )
+    hidden = "No robot is shown: no valid robot_description has been received."
+    if problem := silence_message(state) or (not described and hidden):
+        lines.append(_line_html(problem, 2))
     if has_stack_ended(state):
         lines.append(_line_html(_ENDED, 2))
     for name, seconds in sorted(state.silent.items()):
         lines.append(_line_html(f"Node '{name}' has been silent for {math.floor(seconds)} s.", 2))
     lines.extend(_line_html(f"Node '{name}' is not active.", 1) for name in sorted(state.inactive))
     if state.measured is not None:
-        left = time_to_go(state)
-        text = f"t = {state.measured.time_s:.2f} s"
-        lines.append(_line_html(text + _to_go_text(left), None))
+        text = f"t = {state.measured.time_s:.2f} s{_to_go_text(time_to_go(state))}"
+        lines.append(_line_html(text, None))
     if state.replay is not None:
         replay = state.replay
         text = f"Replay {replay.state}: {replay.position_s:.2f} s of {replay.duration_s:.2f} s"
@@ -158,18 +149,13 @@ def status_html(
         for kind, found in (("Fault", plant.faults), ("Disturbance", plant.disturbances)):
             lines.extend(_line_html(f"{kind}: {with_seconds(each)}", 1) for each in found)
     if state.clearance is not None and state.clearance.distance < _NEAR_CONTACT:
-        level = state.clearance.level or None
-        lines.append(
-            _grey_out(_line_html(state.clearance.message, level), offline="plant" in state.absent)
-        )
-    if state.planner is not None:
-        status = state.planner
-        level = status.state.level
-        if status.state is PlannerState.REACHED and status.not_controlled:
-            level = 1
-        lines.append(_node_html(state, "planner", status.state.value, status.message, level))
-    if state.controller is not None:
-        control = state.controller
+        line = _line_html(state.clearance.message, state.clearance.level or None)
+        lines.append(_grey_out(line, offline="plant" in state.absent))
+    if (planner := state.planner) is not None:
+        partly = planner.state is PlannerState.REACHED and planner.not_controlled
+        level = 1 if partly else planner.state.level
+        lines.append(_node_html(state, "planner", planner.state.value, planner.message, level))
+    if (control := state.controller) is not None:
         word, level = control.state.value, control.state.level
         lines.append(_node_html(state, "controller", word, control.message, level))
     if task := _task_before_goals(state):
@@ -270,8 +256,7 @@ def check_html(check: GoalCheck) -> str:
         f'<span style="display:inline-block;width:.8em;height:.8em;border-radius:50%;'
         f'background:rgb({red},{green},{blue});margin-right:.4em"></span>'
     )
-    text = f"{dot}<b>Goal {check.verdict.value}</b>"
-    return padded(f"{text} {escape(check.message)}")
+    return padded(f"{dot}<b>Goal {check.verdict.value}</b> {escape(check.message)}")
 
 
 # -- tables -------------------------------------------------------------------------------------
@@ -289,13 +274,13 @@ def joints_html(robot: RobotDescription, q: Array, qdot: Array, effort: Array) -
         if share is not None and not _NEAR_LIMIT_SHARE <= share <= 1 - _NEAR_LIMIT_SHARE:
             level = 2 if not 0.0 <= share <= 1.0 else 1
         bar = "no limits" if share is None else _bar_html(share, level)
-        name = f'<span title="{escape(joint.name)}">{escape(shortened(joint.name))}</span>'
-        cells = [name, f"{numbers([q[i]], 3)} {joint.unit}", bar]
+        # Long names take several lines.
+        style = "white-space:normal;overflow-wrap:anywhere"
+        cells = [f'<div style="{style}">{_name_html(joint.name)}</div>']
+        cells += [f"{numbers([q[i]], 3)} {joint.unit}", bar]
         effort_unit = "N" if joint.unit == "m" else "N m"
         cells.append(_value_and_limit(qdot[i], fastest[i], f"{joint.unit}/s"))
         cells.append(_value_and_limit(effort[i], strongest[i], effort_unit))
-        # Long names take several lines.
-        cells[0] = f'<div style="white-space:normal;overflow-wrap:anywhere">{name}</div>'
         rows.append(cells)
     if not rows:
         return padded("The robot has no joints.")
@@ -309,6 +294,10 @@ def _table_html(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
     lines = "".join(f"<tr>{''.join(each)}</tr>" for each in cells)
     style = "border-spacing:3px 2px;text-align:left;white-space:nowrap;font-size:.85em"
     return f'<table style="{style}">{lines}</table>'
+
+
+def _name_html(name: str) -> str:
+    return f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
 
 
 def _bar_html(share: float, level: int) -> str:
@@ -458,10 +447,6 @@ def flown_check(state: StackState) -> GoalCheck | None:
     return GoalCheck(verdict, message, shape=motion[-1, 7:], base=base, source=motion)
 
 
-MOMENTUM_PARTS = ("base", "arm", "wheels", "sum")
-"""Components of the momentum budget, in page order."""
-
-
 def momentum_budget(state: StackState) -> dict[str, float]:
     """Return the angular momentum components in controller/status, N m s; empty if there are none,
     or if the controller is offline.
@@ -470,8 +455,8 @@ def momentum_budget(state: StackState) -> dict[str, float]:
     if control is None or control.command is None or "controller" in state.absent:
         return {}
     found = control.command.momentum
-    complete = set(MOMENTUM_PARTS) <= set(found)
-    return {part: found[part] for part in MOMENTUM_PARTS} if complete else {}
+    complete = set(BUDGET_PARTS) <= set(found)
+    return {part: found[part] for part in BUDGET_PARTS} if complete else {}
 
 
 def momentum_html(state: StackState) -> str:
@@ -485,9 +470,8 @@ def momentum_html(state: StackState) -> str:
     for name, share in command.wheels.items():
         # 0, 1 or 2: the number of thresholds that it reaches.
         level = sum(abs(share) >= each for each in (_WARNING_WHEEL_SHARE, _SATURATED_WHEEL_SHARE))
-        title = f'<span title="{escape(name)}">{escape(shortened(name))}</span>'
         bar = _bar_html((1.0 + share) / 2, level)
-        rows.append((title, f"{numbers([100 * share], 0)} %", bar))
+        rows.append((_name_html(name), f"{numbers([100 * share], 0)} %", bar))
     dumping = _line_html("The wheel momentum is being dumped.", 1)
     return padded(f"<b>Angular momentum</b>{_table_html(rows)}{dumping * command.dumping}")
 

@@ -11,12 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.errors import GoalError, shortened
-from spacerobot_ros.model.description import (
-    DEFAULT_END_EFFECTOR,
-    Array,
-    Joint,
-    RobotDescription,
-)
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import (
     compose_poses,
@@ -98,14 +93,8 @@ class GoalEditor:
     controller goal is for the base and for the controller's end-effector: the end-effector gizmo
     follows the base gizmo, and can be moved separately.
 
-    Parameters
-    ----------
-    server
-        Page server; the number fields are added to the current GUI container.
-    defer
-        Queues user changes.
-    on_note
-        Function called with the reason if an input is rejected.
+    The number fields are added to the current GUI container of the ``server``; ``defer`` queues
+    user changes, and ``on_note`` is called with the reason if an input is rejected.
     """
 
     def __init__(
@@ -126,9 +115,8 @@ class GoalEditor:
         """The last followed goals."""
         self._check = GoalCheck(Verdict.UNCHECKED)
         gui = server.gui
-        self._none_taken = gui.add_html(
-            hint_html("A recording does not accept goals."), visible=False
-        )
+        recorded = hint_html("A recording does not accept goals.")
+        self._none_taken = gui.add_html(recorded, visible=False)
         self._hint = gui.add_html(hint_html("Drag the arrows or enter numbers, then press Fly."))
         self._verdict = gui.add_html(check_html(self._check))
         edit = self._defer_edit
@@ -141,8 +129,8 @@ class GoalEditor:
             "Goal for the end-effector",
             initial_value=True,
             hint="If disabled, the end-effector keeps its current goal, if any.",
+            visible=False,
         )
-        self._tool_too.visible = False
         self._final = _FinalShape(gui, edit, self._mark_changed)
         react(self._tool_too.on_update, edit, lambda _: self.touch(time.monotonic()))
         self._to_robot = gui.add_button("Goal to the robot", color="gray")
@@ -189,12 +177,8 @@ class GoalEditor:
         assert self._robot is not None
         if _BASE_GIZMO not in self._gizmos:
             self._add_gizmo(_BASE_GIZMO, 0.2 * self._reach)
-            self._ghost = RobotDrawing(
-                self._server.scene,
-                f"{_BASE_GIZMO}/ghost",
-                self._robot,
-                color=COLORS[Verdict.UNCHECKED],
-            )
+            color, path = COLORS[Verdict.UNCHECKED], f"{_BASE_GIZMO}/ghost"
+            self._ghost = RobotDrawing(self._server.scene, path, self._robot, color=color)
         self._present = base, q
         self._final.update_robot(q)
         self._final.fill()
@@ -209,16 +193,8 @@ class GoalEditor:
         self._origin = Origin.ROBOT
 
     def follow(self, goals: Mapping[Part, Goal], now: float) -> None:
-        """Show the last goals sent by any client, once per goal. A goal that a user is editing is
-        kept.
-
-        Parameters
-        ----------
-        goals
-            Goals by robot part.
-        now
-            Wall time, s.
-        """
+        """Show the last goals sent by any client, by robot part, once per goal; ``now`` is the wall
+        time, s. A goal that a user is editing is kept."""
         before = self._followed
         links = {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
         same = goals.keys() == before.keys() and all(goals[x].equals(before[x]) for x in goals)
@@ -234,9 +210,9 @@ class GoalEditor:
             asked[BASE_GOAL_KEY] = RequestedPart.POSE
         self._parts.choose(asked)
         if base is not None:
-            self._move_gizmo(_BASE_GIZMO, np.concatenate([base.position, base.quaternion]))
+            self._move_gizmo(_BASE_GIZMO, _pose_of(base))
         if tool is not None and not tool.end_effectors and self.has_tool:
-            self._move_gizmo(_TOOL_GIZMO, np.concatenate([tool.position, tool.quaternion]))
+            self._move_gizmo(_TOOL_GIZMO, _pose_of(tool))
         for link, aim in links.items():
             self._place_link_gizmo(link)
             turn = self._poses[_link_gizmo(link)][3:] if aim.quaternion is None else aim.quaternion
@@ -309,10 +285,7 @@ class GoalEditor:
         distance = float(np.linalg.norm(goal[:3] - pose[:3]))
         turned = 2.0 * math.acos(min(1.0, abs(float(goal[3:] @ pose[3:]))))
         bent = float(np.abs(shape - q).max(initial=0.0))
-        return (
-            distance < _HIDDEN_GHOST_DISTANCE * self._reach
-            and max(turned, bent) < _HIDDEN_GHOST_DISTANCE
-        )
+        return max(distance / self._reach, turned, bent) < _HIDDEN_GHOST_DISTANCE
 
     def show_flight(self, *, flies: bool) -> None:
         """Hide the gizmos while the robot flies to the displayed goal."""
@@ -382,11 +355,8 @@ class GoalEditor:
     def settled_goals(self, now: float) -> dict[Part, Goal] | None:
         """Return the goals once after each change, as soon as they have been unchanged for
         a while; otherwise None."""
-        if (
-            self._changed_at is None
-            or now - self._changed_at < GOAL_SETTLING_TIME_S
-            or not self.placed
-        ):
+        changed = self._changed_at
+        if changed is None or now - changed < GOAL_SETTLING_TIME_S or not self.placed:
             return None
         self._changed_at = None
         try:
@@ -444,7 +414,7 @@ class GoalEditor:
             return  # The gizmo belongs to an earlier robot, or the pose is not finite.
         # The values shown in the fields are sent.
         goal = Goal.from_rpy(*_fields_of(pose))
-        self._set_goal(name, np.concatenate([goal.position, goal.quaternion]))
+        self._set_goal(name, _pose_of(goal))
         self._show_fields()
 
     def _on_fields_typed(self, position: tuple[float, ...], angles: tuple[float, ...]) -> None:
@@ -457,7 +427,7 @@ class GoalEditor:
             self._show_fields()
             return
         gizmo = _gizmo_of(self._parts.shown)
-        self._set_goal(gizmo, np.concatenate([goal.position, goal.quaternion]))
+        self._set_goal(gizmo, _pose_of(goal))
         self._move_gizmo(gizmo, self._poses[gizmo])
 
     def _set_goal(self, name: str, pose: Array) -> None:
@@ -540,10 +510,9 @@ class _PartMenu:
         self._on_note, self._on_change = on_note, on_change
         self._folder = gui.add_folder("Goal for", visible=False)
         self._menus: dict[Part, Any] = {}
-        self._numbers: Any = gui.add_dropdown(
-            "Numbers of", (BASE_GOAL_KEY,), hint="The part to which the numbers below apply."
-        )
-        self._numbers.visible = False
+        hint = "The part to which the numbers below apply."
+        parts = (BASE_GOAL_KEY,)
+        self._numbers: Any = gui.add_dropdown("Numbers of", parts, hint=hint, visible=False)
         self._there = False
         react(self._numbers.on_update, defer, lambda _: self._on_change(self.shown))
 
@@ -590,11 +559,8 @@ class _PartMenu:
             self._on_change(self.shown)
 
     def _add_menu(self, part: Part) -> Any:
-        choices = (
-            (RequestedPart.POSE, RequestedPart.NOTHING)
-            if part == BASE_GOAL_KEY
-            else tuple(RequestedPart)
-        )
+        base = part == BASE_GOAL_KEY
+        choices = (RequestedPart.POSE, RequestedPart.NOTHING) if base else tuple(RequestedPart)
         menu = self._gui.add_dropdown(shortened(part), [each.value for each in choices], hint=part)
         react(menu.on_update, self._edit, lambda _: self._on_chosen(part))
         return menu
@@ -638,8 +604,8 @@ class _FinalShape:
             initial_value=False,
             hint="If enabled, the planned motion ends at these joint positions; otherwise, final "
             "joint positions are free.",
+            visible=False,
         )
-        self._enabled.visible = False
         self._folder = gui.add_folder("At the end", visible=False)
         self._fields: list[Any] = []
         self._q: Array = np.zeros(0)
@@ -703,12 +669,13 @@ class _FinalShape:
 
 def _fields_of(pose: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the position, m, and roll, pitch and yaw, deg, of a pose (7,), as they are shown."""
-    numbers = (pose[:3], np.degrees(rpy_from_matrix(matrix_from_quaternion(pose[3:]))))
-    position, angles = (
-        tuple(np.round(part, digits).tolist())
-        for part, digits in zip(numbers, _DECIMALS, strict=True)
-    )
-    return position, angles
+    angles = np.degrees(rpy_from_matrix(matrix_from_quaternion(pose[3:])))
+    shown = np.round(pose[:3], _DECIMALS[0]), np.round(angles, _DECIMALS[1])
+    return tuple(shown[0].tolist()), tuple(shown[1].tolist())
+
+
+def _pose_of(goal: Goal) -> Array:
+    return np.concatenate([goal.position, goal.quaternion])
 
 
 def _link_gizmo(link: str) -> str:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from spacerobot_ros.control.wheels import BUDGET_PARTS
 from spacerobot_ros.errors import GoalError, ParameterError, shortened
 from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, RobotDescription
@@ -88,11 +89,8 @@ class ButtonPanel:
         self._fly_scenario = gui.add_button(
             "Fly the scenario's goal", color="teal", visible=self._has_scenario_goals
         )
-        self._goal = gui.add_button_group(
-            "Goal",
-            ("Abort goal",),
-            hint="Abandon the goal; the joints brake, and the stack continues.",
-        )
+        hint = "Abandon the goal; the joints brake, and the stack continues."
+        self._goal = gui.add_button_group("Goal", ("Abort goal",), hint=hint)
         self._plant = gui.add_button_group(
             "Plant",
             ("Stop all", "Rearm", "Reset"),
@@ -146,25 +144,16 @@ class TimeLine:
 
 
 class LookBack:
-    """Slider for looking back over a flight, and a button to return to the current state.
-
-    Attributes
-    ----------
-    time_s
-        Simulated time shown to the user, s; None: the present.
-    """
+    """Slider for looking back over a flight, and a button to return to the current state."""
 
     def __init__(self, gui: viser.GuiApi, defer: Defer) -> None:
         self.time_s: float | None = None
+        """Simulated time shown to the user, s; None: the present."""
         self._left_alone_until: float | None = None
+        hint = "Show an earlier state from the last five minutes; the robot keeps flying."
+        step = _LOOK_BACK_STEP_S
         self._slider: Any = gui.add_slider(
-            "Look back to (s)",
-            0.0,
-            _LOOK_BACK_STEP_S,
-            _LOOK_BACK_STEP_S,
-            0.0,
-            visible=False,
-            hint="Show an earlier state from the last five minutes; the robot keeps flying.",
+            "Look back to (s)", 0.0, step, step, 0.0, visible=False, hint=hint
         )
         self._live = gui.add_button("Back to the present", color="orange", visible=False)
         react(self._live.on_click, defer, lambda _: self._look(None, 0.0))
@@ -272,14 +261,8 @@ class FaultPanel:
 
     def _on_inject(self) -> None:
         try:
-            line = content.fault_line(
-                self._kind.value,
-                self._target.value,
-                float(self._value.value),
-                float(self._lasts.value),
-                self._now_s,
-                self._targets,
-            )
+            numbers = float(self._value.value), float(self._lasts.value), self._now_s
+            line = content.fault_line(self._kind.value, self._target.value, *numbers, self._targets)
         except ParameterError as error:
             self._on_note(str(error))
             return
@@ -302,7 +285,7 @@ class Plots:
             units = ("1e-6 kg m/s", "1e-6 kg m²/s")
             self._momentum = _Plot(gui, "Momentum drift", units, 1.0, units)
             self._budget_text = gui.add_html("")
-            self._budget = _Plot(gui, "Momentum budget (N m s)", content.MOMENTUM_PARTS, 0.01)
+            self._budget = _Plot(gui, "Momentum budget (N m s)", BUDGET_PARTS, 0.01)
             self._budget.handle.visible = False
         self._joint_tab = self._tab_group.add_tab("Shape")
         self._shape: _Plot | None = None
@@ -336,10 +319,8 @@ class Plots:
             if self._first is None:
                 self._first = state.momenta.actual
             expected = state.momenta.expected
-            drift = momentum_change(
-                state.momenta.actual, self._first if expected is None else expected
-            )
-            self._momentum.add(time_s, 1e6 * drift)
+            reference = self._first if expected is None else expected
+            self._momentum.add(time_s, 1e6 * momentum_change(state.momenta.actual, reference))
         budget = content.momentum_budget(state)
         if budget:
             self._budget.handle.visible = True
@@ -547,43 +528,29 @@ fractions of the distance.
 
 
 def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Array]:
-    """Return a camera position and target (3,), m, for which the panel does not cover the robot.
+    """Return a camera position and target (3,), m, for which the panel does not cover the robot:
+    it is at the bottom on a phone, and on the right on a desktop.
 
     Parameters
     ----------
     at, away
         Robot position (3,), and camera position relative to it on a desktop, m.
     aspect
-        Window aspect ratio (width to height). The panel is at the bottom on a phone, and on
-        the right on a desktop.
+        Window aspect ratio (width to height).
     """
     right = np.cross([0.0, 0.0, 1.0], away)
     right /= np.linalg.norm(right)
     up = np.cross(away, right) / np.linalg.norm(away)
+    aside = _PANEL_SHIFT * right
     if aspect < _PORTRAIT:
-        away = _PORTRAIT_DISTANCE * away
-        aside = -_PORTRAIT_SHIFT * up
-    else:
-        aside = _PANEL_SHIFT * right
+        away, aside = _PORTRAIT_DISTANCE * away, -_PORTRAIT_SHIFT * up
     look_at = at + float(np.linalg.norm(away)) * aside
     return look_at + away, look_at
 
 
 class Page:
-    """The page, which shows the same content in all browsers.
-
-    Parameters
-    ----------
-    server
-        Server of the page.
-    config
-        Its parameters.
-
-    Attributes
-    ----------
-    editor, faults
-        The goal editor and the fault menu.
-    """
+    """The page, which shows the same content in all browsers, with its goal ``editor`` and its menu
+    of ``faults``."""
 
     def __init__(self, server: viser.ViserServer, config: ViewerConfig) -> None:
         self._server, self._config = server, config
@@ -638,11 +605,8 @@ class Page:
         presets = gui.add_button_group(
             "View from", tuple(_PRESETS), hint="Rotate this browser's camera."
         )
-        react_to_client(
-            presets.on_click,
-            defer,
-            lambda client, name: self._aim_camera(client.camera, _PRESETS[name]),
-        )
+        aim = self._aim_camera
+        react_to_client(presets.on_click, defer, lambda c, name: aim(c.camera, _PRESETS[name]))
         self._follow: Any = gui.add_checkbox(
             "Follow the robot", initial_value=False, hint="All cameras move with the base."
         )
@@ -756,8 +720,10 @@ class Page:
 
     def note(self, notice: Notice) -> None:
         """Add a line to the log; without a time, it has the time of the last state."""
-        timed = replace(notice, time_s=self._time_s) if notice.time_s is None else notice
-        self._log.add(timed)
+        measured = self._state.measured
+        if notice.time_s is None and measured is not None:
+            notice = replace(notice, time_s=measured.time_s)
+        self._log.add(notice)
 
     def announce(self, notice: Notice, seconds: float = _ANSWER_TIME_S) -> None:
         """Add a line to the log, and show it at the top of the page for a wall time in s."""
@@ -844,10 +810,9 @@ class Page:
         if looked_back or self._looked_back or self._is_due("paths", _PATHS_S):
             self._draw_paths(state, around, measured.time_s)
         if state.firing is not None and self._table is not None:
-            names, duty = state.firing.names, state.firing.duty
-            around.plume_lines.draw_segments(
-                scene.plume_lines(self._table, names, duty, 0.25 * self._reach)
-            )
+            firing, length = state.firing, 0.25 * self._reach
+            lines = scene.plume_lines(self._table, firing.names, firing.duty, length)
+            around.plume_lines.draw_segments(lines)
 
     def _draw_paths(self, state: StackState, around: scene.Surroundings, until: float) -> None:
         flown = {part: np.array(path.until(until)) for part, path in self._flown.items()}
@@ -882,10 +847,8 @@ class Page:
         has_tool = content.has_tool(state)
         if has_tool and state.measured is not None and not self.editor.has_tool:
             self.editor.add_tool(state.tool)
-        steered = state.replay is None
-        self.editor.show_parts(
-            tool=has_tool and steered, planned=state.planner is not None and steered
-        )
+        steered, planned = state.replay is None, state.planner is not None
+        self.editor.show_parts(tool=has_tool and steered, planned=planned and steered)
 
     def _is_due(self, part: str, period: float) -> bool:
         if self._now < self._due.get(part, 0.0):
@@ -897,9 +860,8 @@ class Page:
         """Turn a camera to the robot; before its first state, to the origin."""
         seen = self._last if self._drawn is None else self._drawn
         at = np.zeros(3) if seen is None else seen.pose[:3]
-        camera.position, camera.look_at = view_beside_panel(
-            at, self._reach * offset, getattr(camera, "aspect", 1.0)
-        )
+        aspect = getattr(camera, "aspect", 1.0)
+        camera.position, camera.look_at = view_beside_panel(at, self._reach * offset, aspect)
 
     def _aim_cameras(self) -> None:
         for client in self._server.get_clients().values():
@@ -910,8 +872,7 @@ class Page:
     def _request(self, action: Action) -> None:
         self._actions.append(action)
         if isinstance(action, Request):
-            self.announce(Notice(f"{action.value.capitalize()} requested.", source="page",
-                                 time_s=self._time_s))  # fmt: skip
+            self.announce(Notice(f"{action.value.capitalize()} requested.", source="page"))
 
     def _fly(self) -> None:
         try:
@@ -931,8 +892,4 @@ class Page:
             self.editor.place(measured.pose, tool, measured.q, self._now)
 
     def _refuse(self, message: str) -> None:
-        self.announce(Notice(message, 2, self._time_s, "page"))
-
-    @property
-    def _time_s(self) -> float | None:
-        return None if self._state.measured is None else self._state.measured.time_s
+        self.announce(Notice(message, 2, source="page"))

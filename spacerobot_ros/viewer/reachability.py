@@ -74,19 +74,12 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, eq=False)
 class GoalCheck:
-    """Result of a goal check.
+    """Result of a goal check: a verdict, and a message for the user, including the reason if the
+    goal is rejected.
 
-    Attributes
-    ----------
-    verdict
-        The verdict.
-    message
-        Message for the user, including the reason if the goal is rejected.
-    shape, base
-        Predicted (n,) joint positions, m or rad, and (7,) base pose at the end; None if
-        there is no prediction.
-    source
-        The planned motion on which the result is based, if this motion is already being executed.
+    ``shape`` and ``base`` are the predicted joint positions (n,), m or rad, and base pose (7,) at
+    the end; None if there is no prediction. ``source`` is the planned motion on which the result is
+    based, if this motion is already being executed.
     """
 
     verdict: Verdict
@@ -98,21 +91,12 @@ class GoalCheck:
 
 @dataclass(frozen=True)
 class GoalQuestion:
-    """A goal to check, and the data on which the check is based.
+    """A goal to check for the base of a robot, its links, or both, and the data on which the check
+    is based, with planner parameters as JSON strings by name.
 
-    Attributes
-    ----------
-    urdf
-        Description of the robot.
-    parameters
-        Planner parameters, as JSON strings by name.
-    state, goal
-        Start state of the robot, and the goal for its base, its links, or both.
-    tool, link
-        Link goal for a controller. A controller does not plan, so the check is whether the arm can
-        reach this goal. None: a planner flies.
-    axes
-        Link axes that the controller controls; errors along other axes are ignored.
+    ``tool`` is the goal of a ``link`` for a controller; None: a planner flies. A controller does
+    not plan, so the check is whether the arm can reach this goal. ``axes`` are the link axes that
+    the controller controls; errors along other axes are ignored.
     """
 
     urdf: str
@@ -130,16 +114,10 @@ def make_question(
     robot: RobotDescription | None,
     parameters: Mapping[str, Mapping[str, str]],
 ) -> GoalQuestion | str:
-    """Return a reachability question for goals, or the reason why no question is possible.
+    """Return a reachability question for goals by robot part, or the reason why no question is
+    possible.
 
-    Parameters
-    ----------
-    state, goals
-        The state of the stack, and the goals by robot part.
-    robot
-        The robot; None: unknown.
-    parameters
-        Parameters of ``planner`` and ``controller``, as JSON strings by name, if known.
+    ``parameters`` are those of ``planner`` and ``controller``, as JSON strings by name, if known.
     """
     measured = state.measured
     if measured is None or robot is None:
@@ -344,9 +322,8 @@ class Planner:
             return GoalCheck(Verdict.REFUSED, str(error))
         base = _predicted_end(self._robot, request, schedule)
         left_out = _uncontrolled_text(schedule, base, question.goal, request.tolerance)
-        message = (
-            f"Reachable in {schedule.expected_duration:.4g} s with '{schedule.method}'.{left_out}"
-        )
+        time_s, method = f"{schedule.expected_duration:.4g} s", schedule.method
+        message = f"Reachable in {time_s} with '{method}'.{left_out}"
         verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
         return GoalCheck(verdict, message, schedule.positions[-1], base)
 
@@ -365,13 +342,8 @@ def _predicted_end(robot: SpaceRobot, request: PlanRequest, schedule: GaitSchedu
         if "position" in schedule.controls:
             position = goal.position
         else:
-            (position,) = coasting_positions(
-                robot,
-                request.state,
-                np.array([schedule.expected_duration]),
-                schedule.positions[-1:],
-                quaternion[np.newaxis],
-            )
+            end = np.array([schedule.expected_duration]), schedule.positions[-1:]
+            (position,) = coasting_positions(robot, request.state, *end, quaternion[np.newaxis])
     return np.concatenate([position, quaternion])
 
 
@@ -391,9 +363,8 @@ def _uncontrolled_text(
 
 
 def _check_arm(question: GoalQuestion, tool: Goal) -> GoalCheck:
-    base, end = (
-        Pose(matrix_from_quaternion(g.quaternion), g.position) for g in (question.goal, tool)
-    )
+    goals = (question.goal, tool)
+    base, end = (Pose(matrix_from_quaternion(g.quaternion), g.position) for g in goals)
     arm = FixedBaseArm(SpaceRobot(parse_robot(question.urdf)), question.link, base, question.axes)
     shape, distance, angle = arm.search_shape(question.state.q, end)
     if is_reached(distance, angle):
@@ -423,19 +394,16 @@ def main(descriptor: int) -> None:
                     questions.put((number, question, cancellation))
             os._exit(0)
 
-        def send_answer(number: int, answer: GoalCheck | str | None) -> None:
-            connection.send((number, answer))
-
         threading.Thread(target=receive_questions, daemon=True).start()
         planner, number = Planner(), 0
 
         def send_progress(progress: SearchProgress) -> None:
-            send_answer(number, f"{progress.message}, {progress.elapsed_s:.0f} s")
+            connection.send((number, f"{progress.message}, {progress.elapsed_s:.0f} s"))
 
         with report_progress(send_progress):
             while True:
                 number, question, cancellation = questions.get()
-                send_answer(number, None)
+                connection.send((number, None))
                 if question is not None and not cancellation.requested:
                     with suppress(PlanningCancelled):
-                        send_answer(number, planner.answer(question, cancellation))
+                        connection.send((number, planner.answer(question, cancellation)))

@@ -65,20 +65,10 @@ def xyzw(quaternion: Array) -> Array:
 
 
 class RobotDrawing:
-    """A drawn robot: the robot itself, or the ghost at its goal.
+    """A robot drawn in a scene, with its base at a node path: the robot itself, or the ghost at its
+    goal, all of whose parts have a ``color``; None: the URDF colors.
 
-    Parameters
-    ----------
-    scene
-        Scene to draw in.
-    path
-        Node path of the base of the robot.
-    robot
-        The robot.
-    color
-        Color of all parts; None: the URDF colors.
-    on_note
-        Function called with a message about each mesh that cannot be drawn.
+    ``on_note`` is called with a message about each mesh that cannot be drawn.
     """
 
     def __init__(
@@ -90,10 +80,12 @@ class RobotDrawing:
         color: Color | None = None,
         on_note: Callable[[str], None] = lambda message: None,
     ) -> None:
-        self._scene, self._path = scene, path
+        self._scene = scene
         self._kinematics = kinematics = ForwardKinematics(robot)
         self.base = scene.add_frame(path, show_axes=False)
-        paths = self._node_paths(robot)
+        paths = {robot.base_link: path}
+        for joint in joints_outward(robot):
+            paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
         frames: dict[str, Any] = {}
         for pairs, poses in (
             (kinematics.moving, kinematics.transforms_at(np.zeros(len(robot.joint_names)))),
@@ -113,12 +105,6 @@ class RobotDrawing:
         self._robot, self._paths = robot, paths
         self._extras: dict[str, list[Any]] = {}
         """Parts by kind; each kind is drawn when first shown."""
-
-    def _node_paths(self, robot: RobotDescription) -> dict[str, str]:
-        paths = {robot.base_link: self._path}
-        for joint in joints_outward(robot):
-            paths[joint.child] = f"{paths[joint.parent]}/link{len(paths)}"
-        return paths
 
     def show_collision_shapes(self, *, visible: bool) -> None:
         """Show or hide the geometry used to measure distances between links."""
@@ -210,24 +196,12 @@ def reach_of(robot: RobotDescription) -> float:
 
 
 class Lines:
-    """Connected points in the scene, such as a path.
-
-    Parameters
-    ----------
-    scene, path
-        Scene to draw in, and node path.
-    color
-        Color of the line.
-    """
+    """Connected points in the scene, such as a path, at a node path."""
 
     def __init__(self, scene: viser.SceneApi, path: str, color: Color) -> None:
+        empty = np.zeros((1, 2, 3), np.float32)
         self._handle: Any = scene.add_line_segments(
-            path,
-            np.zeros((1, 2, 3), np.float32),
-            color,
-            thickness=_LINE_WIDTH,
-            thickness_units="screen",
-            visible=False,
+            path, empty, color, thickness=_LINE_WIDTH, thickness_units="screen", visible=False
         )
         self._shown, self._empty = True, True
 
@@ -251,14 +225,8 @@ class Lines:
 def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
     """Return active thruster plumes as segments (k, 2, 3) in the base frame, m.
 
-    Parameters
-    ----------
-    table
-        The robot's thrusters.
-    names, duty
-        Thruster names, and the fraction of time each thruster is on, 0 to 1.
-    length
-        Plume length, m, at a duty cycle of 1.
+    ``duty`` is the fraction of time each thruster is on, 0 to 1, and ``length`` the length of a
+    plume, m, at a duty cycle of 1.
     """
     segments = []
     for name, part in zip(names, duty, strict=True):
@@ -274,19 +242,8 @@ BACKDROPS = ("Space", "Grid")
 
 
 class Surroundings:
-    """Sky or grid, paths and plumes.
-
-    Parameters
-    ----------
-    scene
-        Scene to draw in.
-    reach
-        Robot size, m; see :func:`reach_of`.
-    robot_path
-        Node path of the robot's base, to which the plumes are attached.
-    center
-        (3,) point above the grid, m.
-    """
+    """Sky or grid around a ``center`` (3,), m, for a robot of size ``reach``, m (see
+    :func:`reach_of`); paths; and plumes, attached to the node path of the robot's base."""
 
     def __init__(self, scene: viser.SceneApi, reach: float, robot_path: str, center: Array) -> None:
         cell = 10.0 ** np.floor(np.log10(reach)) / 2
@@ -317,28 +274,20 @@ class Surroundings:
         # Most stars are faint.
         brightness = 60 + 195 * np.random.default_rng(1961).uniform(size=_STARS) ** 3
         distance = _SKY * reach
-        stars = self._scene.add_point_cloud(
-            "/stars",
-            (distance * directions).astype(np.float32),
-            np.repeat(brightness[:, np.newaxis], 3, axis=1).astype(np.uint8),
-            point_size=0.002 * distance,
-            point_shape="circle",
-            position=center,
-        )
-        sun = self._scene.add_point_cloud(
-            "/sun",
-            (distance * _SUN[np.newaxis]).astype(np.float32),
-            _SUN_COLOR,
-            point_size=0.08 * distance,
-            point_shape="circle",
-            position=center,
-        )
+        grey = np.repeat(brightness[:, np.newaxis], 3, axis=1).astype(np.uint8)
+
+        def add_points(path: str, points: Array, color: Any, size: float) -> Any:
+            at, radius = (distance * points).astype(np.float32), size * distance
+            return self._scene.add_point_cloud(
+                path, at, color, point_size=radius, point_shape="circle", position=center
+            )
+
+        stars = add_points("/stars", directions, grey, 0.002)
+        sun = add_points("/sun", _SUN[np.newaxis], _SUN_COLOR, 0.08)
+        x, y, z = _SUN.tolist()
+        at = x, y, z
         light = self._scene.add_light_directional(
-            "/sunlight",
-            color=_SUN_COLOR,
-            intensity=_SUN_INTENSITY,
-            cast_shadow=True,
-            position=(float(_SUN[0]), float(_SUN[1]), float(_SUN[2])),
+            "/sunlight", color=_SUN_COLOR, intensity=_SUN_INTENSITY, cast_shadow=True, position=at
         )
         # Light from the stars and other bodies: parts in shadow stay visible.
         fill = self._scene.add_light_ambient("/skylight", intensity=_SKY_INTENSITY)
