@@ -431,14 +431,13 @@ class _ControlledLanes:
     ) -> Iterator[Measures | str]:
         """Yield the measures of each flight, or the reason for a fallback."""
         for row, ready in enumerate(batch):
-            if row in result.failures:
-                yield "was refused by the plant"
-            else:
-                yield self._measures_of(result, row, ready, flights)
+            yield self._measures_of(result, row, ready, flights)
 
     def _measures_of(
         self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights
     ) -> Measures | str:
+        if row in result.failures:
+            return "was refused by the plant"
         decision, period_ns = Decision(result.decision[row]), ready.flight.scenario.plant.period_ns
         decided = int(result.decision_tick[row])
         if decision is Decision.LOST:

@@ -191,14 +191,8 @@ def figure_of_flights(
     figures = [each for each in drawn if isinstance(each, ReportFigure)]
     if not figures or len(flights) < 2:
         return drawn[0]
-    groups = [
-        {
-            (group.label, group.unit, *group.names): group
-            for group in (each.groups if isinstance(each, ReportFigure) else ())
-            if not group.rows
-        }
-        for each in drawn
-    ]
+    found = [each.groups if isinstance(each, ReportFigure) else () for each in drawn]
+    groups = [{(x.label, x.unit, *x.names): x for x in each if not x.rows} for each in found]
     merged = []
     for key in dict.fromkeys(key for each in groups for key in each):
         same = [each[key] for each in groups if key in each]

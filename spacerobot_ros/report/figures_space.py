@@ -218,20 +218,17 @@ def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> Re
     # Compared with an arm's reach, the path of a base without thrust would be a dot.
     shows_tool = len(flight.tool) > 0 and len(flight.tool_goals) > 0
     flown = [flight, *(other for other in beside if len(other.time))]
-    tints = [_FLIGHT_COLOURS[k % len(_FLIGHT_COLOURS)] for k in range(len(flown))]
-    paths = [
-        (Signal(each.time, each.pose[:, :3]).broken_at(each.resets).values, tint)
-        for each, tint in zip(flown, tints, strict=True)
-    ]
-    names = labels_of(flown) if beside else ["base"]
-    keys = [legend_entry(tint, name) for tint, name in zip(tints, names, strict=True)]
+    names, tints = labels_of(flown) if beside else ["base"], itertools.cycle(_FLIGHT_COLOURS)
+    poses = [each.signal("pose").broken_at(each.resets) for each in flown]
+    drawn = list(zip(names, tints, poses, strict=False))
     if shows_tool:
-        paths.append((flight.tool.broken_at(flight.resets).values[:, :3], HAND_COLOUR))
-        keys.append(legend_entry(HAND_COLOUR, "end-effector"))
-    for number, (link, poses) in enumerate(flight.link_poses.items()):
-        tint = _LINK_COLOURS[number % len(_LINK_COLOURS)]
-        paths.append((poses.broken_at(flight.resets).values[:, :3], tint))
-        keys.append(legend_entry(tint, shortened(link)))
+        drawn.append(("end-effector", HAND_COLOUR, flight.tool.broken_at(flight.resets)))
+    for (link, pose), tint in zip(
+        flight.link_poses.items(), itertools.cycle(_LINK_COLOURS), strict=False
+    ):
+        drawn.append((shortened(link), tint, pose.broken_at(flight.resets)))
+    keys = [legend_entry(tint, name) for name, tint, _ in drawn]
+    paths = [(each.values[:, :3], tint) for _, tint, each in drawn]
     if flight.planned:
         keys.append(legend_entry(PLANNED_COLOUR, "planned", DASHES))
     everything = np.concatenate(

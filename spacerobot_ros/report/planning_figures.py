@@ -60,13 +60,11 @@ _COLOUR_BAR_X = WIDTH - 0.86
 """Horizontal position of a colour bar, inches."""
 
 _RING_STYLES: dict[str, dict[str, Any]] = {
-    "path-independent": {"facecolor": (PALETTE[0], 0.25), "edgecolor": PALETTE[0], "lw": 0.6},
-    "path-dependent": {
-        "facecolor": (PALETTE[1], 0.25),
-        "edgecolor": PALETTE[1],
-        "hatch": "///",
-        "lw": 0.6,
-    },
+    kind: {"facecolor": (tint, 0.25), "edgecolor": tint, "hatch": hatch, "lw": 0.6}
+    for kind, tint, hatch in (
+        ("path-independent", PALETTE[0], None),
+        ("path-dependent", PALETTE[1], "///"),
+    )
 }
 
 
@@ -94,10 +92,8 @@ def draw_workspaces(found: Analysis, format: PictureFormat = PictureFormat.PNG) 
             axes = panel(figure, 0.75 + column * (high + gap), 0.95, high, high)
             draw_rings(axes, each)
             axes.set_title("within joint limits" if each.within_limits else "joints turn freely")
-            axes.set_xlabel(
-                f"'{each.link}' from the centre of mass (m)"
-                + ("" if each.dimensions == 2 else ", any section")
-            )
+            section = "" if each.dimensions == 2 else ", any section"
+            axes.set_xlabel(f"'{each.link}' from the centre of mass (m){section}")
         kinds = [Patch(label=kind, **style) for kind, style in _RING_STYLES.items()]
         figure.axes[0].legend(handles=kinds, loc="upper left", bbox_to_anchor=(0.0, -0.16), ncols=2)
         return picture_of(figure, format)
@@ -106,10 +102,8 @@ def draw_workspaces(found: Analysis, format: PictureFormat = PictureFormat.PNG) 
 def draw_rings(axes: Axes, workspaces: Workspaces) -> None:
     """Draw the path-dependent and the path-independent ranges of distances as rings around the
     centre of mass."""
-    for kind, intervals in (
-        ("path-independent", workspaces.path_independent),
-        ("path-dependent", workspaces.path_dependent),
-    ):
+    ranges = workspaces.path_independent, workspaces.path_dependent
+    for kind, intervals in zip(_RING_STYLES, ranges, strict=True):
         for low, high in intervals:
             # A single distance is a thin ring.
             width = max(high - low, 1e-3 * workspaces.distance_range[1])
@@ -142,7 +136,7 @@ def _planar_figure(found: Analysis) -> Figure:
     left.set_xlabel(f"{robot.joint_names[i]} (rad)")
     left.set_ylabel(f"{robot.joint_names[j]} (rad)")
     left.set_title("H: rotation per area of small clockwise loops (1/rad)")
-    _draw_colour_bar(figure, bar, norm, "RdBu_r", "H (1/rad)")
+    _draw_colour_bar(bar, norm, "RdBu_r", "H (1/rad)")
     right = panel(figure, 5.9, 0.6, WIDTH - 6.2, 3.55)
 
     def distance_to_limits(point: Array) -> float:
@@ -163,9 +157,8 @@ def _draw_square_turns(axes: Axes, plane: PhasePlane, centre: Array, room: float
     turns = np.abs(plane.turns_by_squares(np.tile(centre, (_SQUARE_COUNT, 1)), sides))
     small = abs(float(plane.curvature(centre))) * sides**2
     axes.plot(sides, turns, color=PALETTE[0], label="round the best centre")
-    axes.plot(
-        sides, small, color=SECONDARY_COLOUR, dashes=(4, 3), lw=0.9, label="|H| z², small squares"
-    )
+    label = "|H| z², small squares"
+    axes.plot(sides, small, color=SECONDARY_COLOUR, dashes=(4, 3), lw=0.9, label=label)
     axes.set_xlabel("side z of the square (rad)")
     axes.set_title("base rotation by one square loop")
     axes.set_ylabel("turn (rad)")
@@ -203,10 +196,8 @@ def _spatial_figure(found: Analysis) -> Figure:
         # A rotation in rad per area in the plane of the two joints.
         first, second = (movable[joints[k]].unit for k in pair)
         area = f"{first}²" if first == second else f"({first} {second})"
-        label = f"curvature K (rad/{area})"
-        _draw_colour_bar(
-            figure, panel(figure, _COLOUR_BAR_X, bottom, 0.12, high), norm, "RdBu_r", label
-        )
+        bar = panel(figure, _COLOUR_BAR_X, bottom, 0.12, high)
+        _draw_colour_bar(bar, norm, "RdBu_r", f"curvature K (rad/{area})")
     bottom -= high + (0.0 if sliding else gap)
     poor = BoundaryNorm(_CONDITION_LEVELS, 256, extend="max")
     for column, (pair, (x, y, _, condition)) in enumerate(zip(JOINT_PLANES, maps, strict=True)):
@@ -214,10 +205,8 @@ def _spatial_figure(found: Analysis) -> Figure:
         axes.contourf(x, y, condition, _CONDITION_LEVELS, norm=poor, cmap="viridis_r", extend="max")
         _mark_shape(axes, found, pair)
         axes.set_title("condition number of M")
-    label = "condition number of M (1)"
-    _draw_colour_bar(
-        figure, panel(figure, _COLOUR_BAR_X, bottom, 0.12, high), poor, "viridis_r", label
-    )
+    bar = panel(figure, _COLOUR_BAR_X, bottom, 0.12, high)
+    _draw_colour_bar(bar, poor, "viridis_r", "condition number of M (1)")
     if sliding:
         _draw_condition_shares(panel(figure, 0.7, 0.55, WIDTH - 1.0, 1.5), found.conditions)
     return figure
@@ -263,9 +252,8 @@ def _draw_condition_shares(axes: Axes, conditions: Array) -> None:
     axes.set_xlim(1.0, None)
     axes.set_ylim(0.0, 1.05)
     axes.set_xlabel("condition number of the best three brackets (1)")
-    axes.set_title(
-        f"share of {len(conditions)} shapes in the shape space with at most this condition number"
-    )
+    shapes = f"share of {len(conditions)} shapes in the shape space"
+    axes.set_title(f"{shapes} with at most this condition number")
 
 
 # -- parts --------------------------------------------------------------------------------------
@@ -274,26 +262,22 @@ def _draw_condition_shares(axes: Axes, conditions: Array) -> None:
 def _draw_map(axes: Axes, x: Array, y: Array, values: Array, norm: Normalize) -> None:
     levels = np.linspace(norm.vmin or 0.0, norm.vmax or 1.0, _COLOUR_LEVELS + 1)
     axes.contourf(x, y, values, levels, norm=norm, cmap="RdBu_r")
-    for lines, color, linewidth in (
-        (levels, SECONDARY_COLOUR, 0.35),
-        (np.zeros(1), TEXT_COLOUR, 0.8),
-    ):
+    kinds = (levels, SECONDARY_COLOUR, 0.35), (np.zeros(1), TEXT_COLOUR, 0.8)
+    for lines, color, linewidth in kinds:
         # Matplotlib before 3.7 warns where there is nothing to draw.
         inside = lines[(values.min() < lines) & (lines < values.max())]
         if len(inside):
             axes.contour(x, y, values, inside, colors=color, linewidths=linewidth)
     axes.grid(False)
-    for spine in axes.spines.values():
-        spine.set_visible(True)
-        spine.set_color(LINE_COLOUR)
+    axes.spines[:].set(visible=True, color=LINE_COLOUR)
 
 
 def _symmetric_norm(peak: float) -> Normalize:
     return TwoSlopeNorm(0.0, -peak, peak)
 
 
-def _draw_colour_bar(figure: Figure, axes: Axes, norm: Any, colours: str, label: str) -> None:
-    bar = figure.colorbar(ScalarMappable(norm, colours), cax=axes, label=label)
+def _draw_colour_bar(axes: Axes, norm: Any, colours: str, label: str) -> None:
+    bar = axes.figure.colorbar(ScalarMappable(norm, colours), cax=axes, label=label)
     bar.outline.set_linewidth(0.0)
     axes.grid(False)
 
