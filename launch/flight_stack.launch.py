@@ -12,7 +12,7 @@ from launch_ros.actions import Node
 from launch import LaunchContext, LaunchDescription
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.scenario_files import read_scenario
+from spacerobot_ros.scenario_files import read_sections
 from spacerobot_ros.topics import GLOBAL_TOPICS
 
 PACKAGE = "spacerobot_ros"
@@ -44,7 +44,7 @@ def nodes(context: LaunchContext) -> list[Node]:
     chosen = {name: LaunchConfiguration(name).perform(context) for name, _, _ in ARGUMENTS}
     namespace, files = chosen["namespace"].strip("/"), parameter_files(chosen)
     # The file has a section for each node that its scenario needs.
-    sections = read_scenario(files[-1])[0] if files else {"plant": {}, "planner": {}}
+    sections = read_sections(files[-1]) if files else {"plant": {}, "planner": {}}
     wanted = [name for name in ("plant", "planner", "coordinated_control") if name in sections]
     if is_true(chosen["record"]):
         wanted.append("recorder")

@@ -92,9 +92,8 @@ KEYS_OF_PARTS: Mapping[Controlled, frozenset[str]] = {
 # -- parameters by node and settings ------------------------------------------------------------
 
 
-def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any] | None]:
-    """Return the parameters in a scenario file, by node and full name, and the values in its
-    section ``scenario``; None: there is no such section, but the plant has a robot.
+def read_sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the parameters in a parameter file, by node and full name.
 
     A section applies to a node in any namespace (``/**/plant``), in one namespace
     (``/robot_1/plant``), in no namespace (``plant``), or to all nodes (``/**``). If two sections
@@ -104,28 +103,25 @@ def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any]
     Raises
     ------
     ParameterError
-        The file cannot be read; a section has no ``ros__parameters`` that contains parameters; or
-        the section ``scenario`` is missing or has an unknown key.
+        The file cannot be read, or a section has no ``ros__parameters`` that contains parameters.
     """
-    try:
-        content = load_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ParameterError(
-            f"The scenario file {path} cannot be read: {reason(error)}."
-        ) from error
-    content = content if isinstance(content, dict) else {}
-    in_file = _parameters_by_node(content, path)
-    # Files next to the scenario file get their full paths.
-    for parameters in in_file.values():
-        for name in ("robot", "world", "target.robot", "srdf", "thrusters"):
-            file = parameters.get(name, "")
-            named = isinstance(file, str) and (is_path(file) or name in ("srdf", "thrusters"))
-            if named and (path.parent / file).is_file():
-                parameters[name] = str((path.parent / file).resolve())
-    plant, section = in_file.get("plant", {}), content.get("scenario")
+    return _sections(_read_content(path), path)
+
+
+def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any] | None]:
+    """Return the parameters in a scenario file, as in :func:`read_sections`, and the values in its
+    section ``scenario``; None: there is no such section, but the plant has a robot.
+
+    Raises
+    ------
+    ParameterError
+        See :func:`read_sections`; or the section is missing or has an unknown key.
+    """
+    content = _read_content(path)
+    in_file, values = _sections(content, path), _scenario_values(content)
+    plant = in_file.get("plant", {})
     if "scenario" not in content and (plant.get("robot") or plant.get("robot_description")):
         return in_file, None
-    values = section.get("ros__parameters") if isinstance(section, dict) else None
     if not isinstance(values, dict):
         raise ParameterError(
             f"The scenario file {path} has no 'scenario: ros__parameters:' section with a goal."
@@ -136,19 +132,25 @@ def read_scenario(path: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Any]
             f"The scenario file {path} has an unknown key '{unknown[0]}' in its scenario section; "
             f"the keys are {', '.join(_SCENARIO_KEYS)}."
         )
-    if (world := values.get("world")) is not None:
-        file = (path.parent / str(world)).resolve()
-        try:
-            load_world(file)
-        except RobotDescriptionError as error:
-            message = f"The world in the scenario file {path} is invalid: {error}"
-            raise ParameterError(message) from None
-        for node in in_file.keys() & {"plant", "planner"}:
-            in_file[node] = {"world": str(file), **in_file[node]}
     return in_file, values
 
 
-def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
+def _scenario_values(content: Mapping[str, Any]) -> Any:
+    section = content.get("scenario")
+    return section.get("ros__parameters") if isinstance(section, dict) else None
+
+
+def _read_content(path: Path) -> Mapping[str, Any]:
+    try:
+        content = load_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ParameterError(
+            f"The scenario file {path} cannot be read: {reason(error)}."
+        ) from error
+    return content if isinstance(content, dict) else {}
+
+
+def _sections(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any]]:
     by_node: dict[str, dict[str, Any]] = {}
     of_all_nodes: dict[str, Any] = {}
     for key, section in content.items():
@@ -165,7 +167,23 @@ def _parameters_by_node(content: Mapping[str, Any], path: Path) -> dict[str, dic
         chosen = of_all_nodes if node == "**" else by_node.setdefault(node, {})
         chosen.update(_flatten_section(values))
     for node, values in by_node.items():
-        by_node[node] = {**known_values(CONFIGS[node], of_all_nodes), **values}
+        parameters = by_node[node] = {**known_values(CONFIGS[node], of_all_nodes), **values}
+        # Files next to the scenario file get their full paths.
+        for name in ("robot", "world", "target.robot", "srdf", "thrusters"):
+            file = parameters.get(name, "")
+            named = isinstance(file, str) and (is_path(file) or name in ("srdf", "thrusters"))
+            if named and (path.parent / file).is_file():
+                parameters[name] = str((path.parent / file).resolve())
+    values = _scenario_values(content)
+    if isinstance(values, dict) and (world := values.get("world")) is not None:
+        obstacles = (path.parent / str(world)).resolve()
+        try:
+            load_world(obstacles)
+        except RobotDescriptionError as error:
+            message = f"The world in the scenario file {path} is invalid: {error}"
+            raise ParameterError(message) from None
+        for node in by_node.keys() & {"plant", "planner"}:
+            by_node[node] = {"world": str(obstacles), **by_node[node]}
     return by_node
 
 

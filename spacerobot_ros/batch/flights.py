@@ -77,6 +77,11 @@ class InitialStates:
             np.array(is_center_of_mass, dtype=np.bool_),
         )
 
+    @classmethod
+    def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
+        """Return ``count`` identical rows; for errors, see :meth:`of`."""
+        return cls.of(robot, [initial] * count)
+
     def __len__(self) -> int:
         return len(self.position)
 

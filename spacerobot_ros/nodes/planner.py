@@ -5,7 +5,7 @@ messages.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Mapping
 from functools import partial
 from threading import Thread
 from typing import Any, ClassVar
@@ -61,8 +61,9 @@ class PlannerNode(CommanderNode):
     default_name: ClassVar = "planner"
     config: PlannerConfig
     commander: PlannerCommander
-    _trajectories: _TrajectoryClients | None = None
-    """FollowJointTrajectory clients, for ``output: trajectory``."""
+    _trajectory_clients: Mapping[str, ActionClient] = {}
+    """FollowJointTrajectory clients by action, for ``output: trajectory``. They exist as long as
+    the node: after a cleanup, an executor might still hold a response for one of them."""
     _announcement: Thread | None = None
     """Publishes the latest schedule."""
 
@@ -84,10 +85,7 @@ class PlannerNode(CommanderNode):
         self._markers_topic = self.create_publisher(MarkerArray, "markers", STREAM)
         self.listen("planner/status")
         if self.config.output == "trajectory":
-            self._trajectories = self._trajectories or _TrajectoryClients(self)
-            self.commander.trajectories = self._trajectories.connect(
-                self.config.trajectory_action, self.commander.end_schedule
-            )
+            self.commander.trajectories = self._connect(self.config.trajectory_action)
         self.subscribe_to_goals("goal_pose")
         for name in self.config.goal_links:
             self.subscribe_to_goals(link_topic(name, "goal_pose"), name)
@@ -99,6 +97,22 @@ class PlannerNode(CommanderNode):
         self.create_subscription(JointState, "goal_joint_states", self._on_goal_shape, STREAM)
         self.listen_to_obstacles()
         self.offer("~/statistics", lambda: self.commander.statistics.to_json())
+
+    def _connect(self, action: str) -> TrajectoryOutput:
+        kind = interface_class("control_msgs.action", "FollowJointTrajectory")
+        if kind is None:
+            raise ParameterError(
+                "Parameter 'output' is 'trajectory', which requires the package control_msgs: "
+                "install it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
+            )
+        clients = dict(self._trajectory_clients)
+        if action not in clients:
+            clients[action] = ActionClient(self, kind, action)
+        self._trajectory_clients = clients
+        connection = _Connection(kind, clients[action])
+        name, on_end = self.resolve_topic_name(action), self.commander.end_schedule
+        connection.output = TrajectoryOutput(connection, name, on_end)
+        return connection.output
 
     def start_message(self) -> str:
         """Return a log message with the method, the robot and the goal topic."""
@@ -120,8 +134,9 @@ class PlannerNode(CommanderNode):
     def destroy_node(self) -> None:
         """Destroy the node, whatever its state, and its trajectory clients."""
         self._await_announcement()
-        if self._trajectories is not None:
-            self._trajectories.destroy()
+        for client in self._trajectory_clients.values():
+            client.destroy()
+        self._trajectory_clients = {}
         super().destroy_node()
 
     def use(self, robot: SpaceRobot) -> None:
@@ -195,37 +210,6 @@ class PlannerNode(CommanderNode):
         self._schedule_topic.publish(trajectory_message(schedule, stamp_ns, robot.base_link))
         self._path_topic.publish(path_message(schedule.path, stamp_ns, frame))
         self._markers_topic.publish(goal_markers(schedule.goal, schedule.path, robot, frame))
-
-
-class _TrajectoryClients:
-    """The FollowJointTrajectory clients of a planner node, which exist as long as the node: after a
-    cleanup, an executor might still hold a response for one of them.
-    """
-
-    def __init__(self, node: Any) -> None:
-        kind = interface_class("control_msgs.action", "FollowJointTrajectory")
-        if kind is None:
-            raise ParameterError(
-                "Parameter 'output' is 'trajectory', which requires the package control_msgs: "
-                "install it (apt: ros-$ROS_DISTRO-control-msgs), or set another output."
-            )
-        self._kind, self._node = kind, node
-        self._clients: dict[str, ActionClient] = {}
-
-    def connect(self, name: str, on_end: Callable[[str, bool], None]) -> TrajectoryOutput:
-        """Return an output to an action server; the output calls `on_end` when a schedule ends."""
-        if name not in self._clients:
-            self._clients[name] = ActionClient(self._node, self._kind, name)
-        connection = _Connection(self._kind, self._clients[name])
-        output = TrajectoryOutput(connection, self._node.resolve_topic_name(name), on_end)
-        connection.output = output
-        return output
-
-    def destroy(self) -> None:
-        """Destroy the clients when the node is destroyed."""
-        for client in self._clients.values():
-            client.destroy()
-        self._clients.clear()
 
 
 class _Connection:

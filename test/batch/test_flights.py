@@ -142,7 +142,7 @@ def test_starts_are_rows_of_initial_states(sliders: SpaceRobot) -> None:
         once = InitialStates.of(sliders, [wanted])
         for each in dataclasses.fields(InitialStates):
             assert getattr(again, each.name).tolist() == getattr(once, each.name).tolist()
-    three = InitialStates.of(sliders, [first] * 3)
+    three = InitialStates.repeated(sliders, first, 3)
     assert (len(three), three.momenta.shape, three.position_is_of_center_of_mass.shape) == (
         3,
         (3, 6),
@@ -278,7 +278,7 @@ STATES = "pose", "twist", "q", "qdot", "momentum"
 
 
 def drawn_starts(robot: SpaceRobot, count: int, rng: np.random.Generator) -> InitialStates:
-    starts = InitialStates.of(robot, [InitialState()] * count)
+    starts = InitialStates.repeated(robot, InitialState(), count)
     lower, upper = np.maximum(robot.lower, -1.0), np.minimum(robot.upper, 1.0)
     starts.q[:] = lower + (upper - lower) * rng.uniform(0.2, 0.8, starts.q.shape)
     starts.position[:] = rng.normal(size=(count, 3))
@@ -374,7 +374,7 @@ def test_stepped_lanes_are_plants_with_resets_and_other_masses(
 def test_reaction_wheels_in_lanes_are_those_of_the_plant() -> None:
     robot, rng = SpaceRobot(load_robot(robot_file("tender"))), np.random.default_rng(4)
     wheels = np.array([name in robot.description.wheel_names for name in robot.joint_names])
-    starts, masses = InitialStates.of(robot, [InitialState()] * 5), drawn_masses(robot, 5, rng)
+    starts, masses = InitialStates.repeated(robot, InitialState(), 5), drawn_masses(robot, 5, rng)
     starts.q[:, ~wheels] = [0.9, -0.9, 1.6]
     starts.qdot[:, wheels] = 0.999 * robot.velocity_limit[wheels] * rng.choice([-1, 1], (5, 4))
     flights = SteppedFlights(robot, "effort", 0.02, starts, masses, link="base_link")

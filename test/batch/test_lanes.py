@@ -267,7 +267,7 @@ def controlled(
     robot = SpaceRobot(load_robot(share_directory() / "urdf" / f"{name}.urdf"))
     wanted: dict[str, Any] = {"tick_rate": 100.0, "settle_time": 0.2, "profile": "quintic"}
     config = dataclasses.replace(ControllerConfig(), **(wanted | parameters))
-    starts = InitialStates.of(robot, [InitialState(joint_positions=shape)] * count)
+    starts = InitialStates.repeated(robot, InitialState(joint_positions=shape), count)
     starts.position[:, :2] = 0.01 * rng.normal(size=(count, 2))
     sensors = SensorErrors.of(robot, [SensorConfig()] * count)
     sensors.noise[1:] = 1e-5
@@ -397,7 +397,7 @@ def test_a_device_flies_faster_than_registers_to_the_same_states(
     device, robot = target_named("device"), SpaceRobot(load_robot(robot_file(name)))
     assert isinstance(device, CudaDevice)
     rng, count = np.random.default_rng(6), 131_072
-    starts = InitialStates.of(robot, [InitialState()] * count)
+    starts = InitialStates.repeated(robot, InitialState(), count)
     limits = robot.velocity_limit if actuation == "velocity" else 0.02 * robot.effort_limit
     commands = 0.05 * limits * rng.uniform(-1.0, 1.0, (count, robot.n))
     if actuation == "effort":
@@ -465,7 +465,7 @@ class Compiler(Target):
 
 def flights_of(name: str, actuation: str, *, controlled: bool) -> Flights:
     robot = SpaceRobot(load_robot(robot_file(name)))
-    starts = InitialStates.of(robot, [InitialState()] * 1)
+    starts = InitialStates.repeated(robot, InitialState(), 1)
     program: Any = HeldCommands(np.zeros((1, robot.n + 6 * (actuation == "effort"))))
     if controlled:
         base = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

@@ -27,7 +27,7 @@ from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.resources import share_directory
-from spacerobot_ros.scenario_files import read_scenario
+from spacerobot_ros.scenario_files import read_sections
 
 SLIDERS = ["slider_1", "slider_2", "slider_3"]
 VELOCITY = {
@@ -234,7 +234,7 @@ def test_bags_and_dumps_with_the_parameters_of_ros_are_read(
     assert scenario.plant.tick_rate == 20.0
     assert (scenario.planner.method, scenario.planner.tick_rate) == ("lie_bracket", 20.0)
 
-    sections, _ = read_scenario(dump)
+    sections = read_sections(dump)
     assert set(sections) == {"plant", "planner", "recorder"}
     assert sections["planner"]["use_sim_time"] is True
     assert sections["planner"][QOS_OVERRIDE] == "volatile"

@@ -71,13 +71,6 @@ AUTOSTART = Parameter(
 )
 """Parameter of every node: whether it starts automatically."""
 
-_STATES_THAT_CAN_SHUT_DOWN = (
-    State.PRIMARY_STATE_UNCONFIGURED,
-    State.PRIMARY_STATE_INACTIVE,
-    State.PRIMARY_STATE_ACTIVE,
-)
-
-
 _MIDDLEWARE_TOPICS = ("/rosout", "/parameter_events")
 
 UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
@@ -366,7 +359,8 @@ class FlightNode(LifecycleNode):
 
     def finalize(self) -> None:
         """Shut the node down unless it is already shut down."""
-        if self.lifecycle_state in _STATES_THAT_CAN_SHUT_DOWN:
+        # Unconfigured, inactive and active lie in between; states of transitions come after.
+        if State.PRIMARY_STATE_UNKNOWN < self.lifecycle_state < State.PRIMARY_STATE_FINALIZED:
             self.trigger_shutdown()
 
     def destroy_node(self) -> None:

@@ -74,9 +74,7 @@ M = TypeVar("M")
 
 
 class LatestMessage(Generic[M]):
-    """The last message of a topic, deserialized on demand; no executor spins the subscribing
-    node.
-    """
+    """The last message of a topic, deserialized on demand."""
 
     def __init__(self, node: Node, kind: type[M], topic: str) -> None:
         self._kind = kind
