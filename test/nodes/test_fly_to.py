@@ -23,6 +23,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from support.hand_motion import end_of_motion
 from support.planner_flight import (
+    DECIDED,
     NEAR,
     PLANT,
     TURNED,
@@ -138,12 +139,11 @@ class ActionFlight(Flight):
 
     def decisions(self, goal_id: str) -> list[tuple[str, str]]:
         """State and message of the statuses that decide a goal."""
+        about = ((values_of(s), s.message) for s in self.probe.messages["planner/status"])
         return [
-            (values_of(status)["state"], status.message)
-            for status in self.probe.messages["planner/status"]
-            if values_of(status).get("goal_id") == goal_id
-            and values_of(status)["state"]
-            in ("reached", "reached_partly", "failed", "refused", "aborted")
+            (values["state"], message)
+            for values, message in about
+            if values.get("goal_id") == goal_id and values["state"] in DECIDED
         ]
 
     def check(self, sent: SentGoal) -> str:

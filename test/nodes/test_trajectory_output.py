@@ -108,16 +108,14 @@ class TrajectoryServer:
         if np.abs(at(since) - q).max() > self.path_tolerance and since < times[-1]:
             self.freezes_at = None
             self._end("aborted", -4, f"{state.name[0]} is off.")
-            return [0.0] * len(q)
-        if since >= times[-1]:
-            if np.abs(goal - q).max() <= 1e-5:
-                self._end("succeeded")
-                return [0.0] * len(q)
-            if since >= times[-1] + self.goal_time:
-                self.falls_short = 0.0
-                self._end("aborted", -5, "Not there.")
-                return [0.0] * len(q)
-        return [float(rate) for rate in rates]
+        elif np.abs(goal - q).max() <= 1e-5 and since >= times[-1]:
+            self._end("succeeded")
+        elif since >= times[-1] + self.goal_time:
+            self.falls_short = 0.0
+            self._end("aborted", -5, "Not there.")
+        else:
+            return [float(rate) for rate in rates]
+        return [0.0] * len(q)
 
 
 class DrivenFlight(Flight):

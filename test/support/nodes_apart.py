@@ -20,7 +20,7 @@ from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from support.awaited import processes_with
-from support.planner_flight import Place, goal_at, values_of
+from support.planner_flight import DECIDED, Place, goal_at, values_of
 from support.ros_harness import Harness
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,7 +35,6 @@ STATUS_OF = {
     "planner": "planner/status",
     "coordinated_control": "controller/status",
 }
-DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
 _COMPLAINT = re.compile(r"^\[(WARN|ERROR|FATAL)\]|Traceback|Warning: |Error: ")
 _OF_A_BUSY_MACHINE = "URDF limits have restricted joints"
 """Where commands came late, joints catch up as fast as they can."""

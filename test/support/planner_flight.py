@@ -46,6 +46,9 @@ TOPICS = {
     "planned_path": Path,
 }
 
+DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
+"""States of statuses that decide a goal."""
+
 HERE = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
 NEAR = ([0.05, -0.03, 0.02], [0.0, 0.0, 0.0])
 TURNED = ([0.02, -0.03, 0.01], [0.01, -0.005, 0.015])

@@ -15,14 +15,13 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 from support.oracles import Array, Motion, PinocchioOracle
+from support.planner_flight import DECIDED
 from support.random_actions.setups import Setup
 
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 SECOND = 10**9
-
-_DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
 
 
 @dataclass(frozen=True)
@@ -382,7 +381,7 @@ class Goals:
         if goal_id and goal_id not in self.sent:
             self._report(f"a status about goal {goal_id}, which was never sent: {sentence}")
         before = self.decided.get(goal_id)
-        if state in _DECIDED and goal_id:
+        if state in DECIDED and goal_id:
             if before is not None and not (self._repeats and before == state):
                 self._report(f"goal {goal_id} was {before} and is {state}: {sentence}")
             self.decided[goal_id] = state

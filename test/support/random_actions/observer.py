@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from support.planner_flight import DECIDED
 from support.random_actions.expectations import (
     SECOND,
     Check,
@@ -198,10 +199,7 @@ class Observer:
         state, goal_id = values["state"], values.get("goal_id", "")
         book = self.books[name]
         self._heard.append(f"{name}: {state} {goal_id}: {message.message}")
-        if (
-            state in ("reached", "reached_partly", "failed", "refused", "aborted")
-            and goal_id not in book.decided
-        ):
+        if state in DECIDED and goal_id not in book.decided:
             self.figures.decisions[state] += 1
         if state == "refused" and name == self._setup.decider:
             self.situation.goals_since_stop.discard(goal_id)
