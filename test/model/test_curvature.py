@@ -11,7 +11,6 @@ import pinocchio as pin
 import pytest
 from model.test_coupled_joints import coupled_robot
 from planning.sliding_robots import random_sliding_robot
-from scipy.spatial.transform import Rotation
 from support.oracles import Array, PinocchioOracle, assert_agrees
 from support.planar_manoeuvres import closed_forms, phase_density
 from support.random_robots import random_robot_urdf
@@ -21,6 +20,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Inertia
 from spacerobot_ros.model.external_loads import mean_motion_at
 from spacerobot_ros.model.grasp import Payload
+from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.resources import robot_file
 
 SEEDS = range(20, 24)
@@ -248,30 +248,21 @@ def test_robots_of_the_package(name: str) -> None:
 # -- joint rates that leave the base still, alone and after a capture ---------------------------
 
 
-BODY = Inertia(
-    23.0,
-    np.array([0.3, -0.2, 0.4]),
-    Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
-    @ np.diag([2.1, 3.9, 5.4])
-    @ Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix().T,
-)
+TURN = matrix_from_rpy([0.4, -0.7, 1.1])
+BODY = Inertia(23.0, np.array([0.3, -0.2, 0.4]), TURN @ np.diag([2.1, 3.9, 5.4]) @ TURN.T)
 SHAPE = np.array([0.3, -0.7, 0.5, 1.1, -0.4, 0.8, -0.6])
 
 
 def base_rate(robot: SpaceRobot, held: Inertia | None, q: Array, qdot: Array) -> Array:
-    """The angular velocity of the base at zero momentum, by Pinocchio's inertia matrix."""
-    model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
-    model.armature = np.zeros(model.nv)
+    """The angular velocity of the base at zero momentum, by Pinocchio."""
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
     if held is not None:
+        model = oracle.model
         wrist = model.frames[model.getFrameId("link_7", pin.FrameType.BODY)]
         inertia = pin.Inertia(held.mass, held.com, held.about_com)
         model.appendBodyToJoint(wrist.parentJoint, inertia, wrist.placement)
-    columns = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names]
-    at, rates = pin.neutral(model), np.zeros(model.nv)
-    at[[column + 1 for column in columns]], rates[columns] = q, qdot
-    H = np.triu(pin.crba(model, model.createData(), at))
-    H += np.triu(H, 1).T
-    return np.asarray(-np.linalg.solve(H[:6, :6], H[:6, 6:] @ rates[6:])[3:])
+        oracle.data = model.createData()
+    return oracle.base_twist(q, qdot)[3:]
 
 
 @pytest.fixture(scope="module")

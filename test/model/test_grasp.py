@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.oracles import Array, assert_agrees
+from support.oracles import Array, PinocchioOracle, assert_agrees
 
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot
@@ -25,15 +25,11 @@ from spacerobot_ros.model.grasp import (
     grasp_impact,
     separated_momenta,
 )
+from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.resources import robot_file
 
-TUMBLER = Inertia(
-    17.0,
-    np.array([0.3, -0.2, 0.15]),
-    Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
-    @ np.diag([1.1, 1.9, 2.4])
-    @ Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix().T,
-)
+TURN = matrix_from_rpy([0.4, -0.7, 1.1])
+TUMBLER = Inertia(17.0, np.array([0.3, -0.2, 0.15]), TURN @ np.diag([1.1, 1.9, 2.4]) @ TURN.T)
 
 
 def robot_named(name: str) -> SpaceRobot:
@@ -92,22 +88,19 @@ def test_velocities_after_it_are_those_of_pinocchios_joined_robot(seed: int) -> 
     body = random_body(rng, frame_motion(robot, "link_7", motion).r_WT)
     grasp = held_pose(robot, "link_7", motion, body)
 
-    model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
-    model.armature = np.zeros(model.nv)
-    q, u = np.concatenate([motion.pose, motion.q]), np.concatenate([motion.twist, motion.qdot])
-    data = model.createData()
-    alone = np.triu(pin.crba(model, data, q))
-    alone += np.triu(alone, 1).T
+    oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+    model, u = oracle.model, np.concatenate([motion.twist, motion.qdot])
+    oracle.place(motion.q, motion.pose[3:], motion.pose[:3])
+    alone = oracle.own_mass_matrix()
     wrist = model.frames[model.getFrameId("link_7", pin.FrameType.BODY)]
     held = wrist.placement * pin.SE3(grasp.R, grasp.r)
     inertia = pin.Inertia(TUMBLER.mass, TUMBLER.com, TUMBLER.about_com)
     model.appendBodyToJoint(wrist.parentJoint, inertia, held)
     model.addFrame(pin.Frame("held", wrist.parentJoint, held, pin.FrameType.OP_FRAME))
-    data = model.createData()
-    joined = np.triu(pin.crba(model, data, q))
-    joined += np.triu(joined, 1).T
-    pin.computeJointJacobians(model, data, q)
-    J = pin.getFrameJacobian(model, data, model.getFrameId("held"), pin.ReferenceFrame.LOCAL)
+    oracle.data = model.createData()
+    oracle.place(motion.q, motion.pose[3:], motion.pose[:3])
+    joined, frame = oracle.own_mass_matrix(), model.getFrameId("held")
+    J = pin.getFrameJacobian(model, oracle.data, frame, pin.ReferenceFrame.LOCAL)
     twist = np.concatenate([body.R_WT.T @ body.v, body.R_WT.T @ body.omega])
     momentum = alone @ u + J.T @ inertia.matrix() @ twist
     expected = np.linalg.solve(joined, momentum)

@@ -204,9 +204,7 @@ def test_a_file_that_holds_no_goal_is_refused(tmp_path: Path, content: bytes) ->
     assert path.read_bytes() == content
 
 
-def test_a_goal_that_others_could_have_written_is_not_flown_to(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_goal_that_others_could_have_written_is_not_flown_to(tmp_path: Path) -> None:
     path = tmp_path / "goal.json"
     file = GoalFile(str(path))
     before = os.umask(0)
@@ -215,21 +213,12 @@ def test_a_goal_that_others_could_have_written_is_not_flown_to(
     finally:
         os.umask(before)
     assert path.stat().st_mode & 0o777 == 0o600
-    for mode in (0o620, 0o602, 0o666):
-        path.chmod(mode)
-        with pytest.raises(ParameterError, match="is invalid: others can write") as refusal:
-            file.load()
-        assert f"chmod go-w '{path}'" in str(refusal.value)
+    path.chmod(0o602)
+    with pytest.raises(ParameterError, match="is invalid: others can write") as refusal:
+        file.load()
+    assert f"chmod go-w '{path}'" in str(refusal.value)
     path.chmod(0o644)
     assert BASE_GOAL_KEY in file.load()
-    path.unlink()
-    file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL)}))
-    if os.geteuid() == 0:
-        os.chown(path, 12345, 12345)
-    else:
-        monkeypatch.setattr("os.geteuid", lambda: os.getuid() + 1)
-    with pytest.raises(ParameterError, match="belongs to user"):
-        file.load()
 
 
 def test_a_goal_stays_on_file_until_it_is_decided(tmp_path: Path) -> None:
