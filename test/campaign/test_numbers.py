@@ -15,11 +15,10 @@ from scipy import stats
 from support.campaigns import campaign, written
 
 from spacerobot_ros.campaign import draws as sampling
-from spacerobot_ros.campaign import running as reruns
 from spacerobot_ros.campaign.config import Criterion, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset, Row, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
-from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation
+from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, stored_flight
 from spacerobot_ros.campaign.statistics import (
     Influence,
     PairedDifference,
@@ -34,7 +33,6 @@ from spacerobot_ros.campaign.statistics import (
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
-running: Any = reruns
 MADE = campaign(flights=6, disperse={"mass.mass_1": {"uniform": [0.5, 1.5]}})
 
 # -- statistics -----------------------------------------------------------------------------------
@@ -303,8 +301,8 @@ def test_a_stored_flight_has_its_metrics(tmp_path: Path) -> None:
     draws, metrics = Draws(MADE), {"position_error_m": 0.25, "duration_s": 3.0}
     rows = [Row(draws[n], "reached", ".", metrics, True, "lanes", 1.0, 2.0) for n in (2, 4)]
     dataset = written(tmp_path, MADE, rows)
-    assert running.stored_flight(dataset, 3) is None
-    assert running.stored_flight(dataset, 4) == ("reached", "lanes", metrics)
+    assert stored_flight(dataset, 3) is None
+    assert stored_flight(dataset, 4) == ("reached", "lanes", metrics)
 
 
 # -- datasets -------------------------------------------------------------------------------------

@@ -359,14 +359,8 @@ def test_a_begun_pulse_is_ended_although_nothing_is_wanted_any_more() -> None:
     rest = [pulses.fire(np.zeros(6))[0] for _ in range(6)]
     # 40 ms were owed.
     assert TICK + sum(rest) == pytest.approx(0.04)
-    assert pulses_end(rest)
+    assert not any(rest[rest.index(0.0) :]), "it does not begin again"
     assert pulses.begun.tolist() == [False, False]
-
-
-def pulses_end(on_times: list[float]) -> bool:
-    """Whether a pulse once ended does not begin again."""
-    ended = on_times.index(0.0)
-    return not any(on_times[ended:])
 
 
 def test_what_is_beyond_the_thrust_is_dropped_and_told() -> None:

@@ -211,7 +211,7 @@ class Alone(Reorient):
 @pytest.mark.parametrize(
     ("name", "arguments", "part"),
     [
-        (REACH, {"scenario": "noisy"}, "sensor errors of links"),
+        (REACH, {"scenario": "faults/noisy_sensors", "link": "mass_1"}, "sensor errors of links"),
         (ARM, {"scenario": "servicer_thrusters"}, "actuator faults, on/off thrusters, dist"),
         (OWN, {"task": Alone}, "task 'alone', which has no random_goals"),
     ],
@@ -219,11 +219,8 @@ class Alone(Reorient):
 def test_what_devices_do_not_support_is_refused(
     name: str, arguments: dict[str, Any], part: str
 ) -> None:
-    given = dict(arguments)
-    if given.get("scenario") == "noisy":
-        given |= {"scenario": "config/faults/noisy_sensors.yaml", "link": "mass_1"}
     with pytest.raises(ParameterError, match=f"'device' is 'host', but devices do not .* {part}"):
-        gymnasium.make_vec(name, 2, device="host", **given)
+        gymnasium.make_vec(name, 2, device="host", **arguments)
 
 
 def test_devices_have_many_robots_and_no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:

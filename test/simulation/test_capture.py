@@ -588,12 +588,8 @@ def test_robot_and_target_together_follow_the_ledger_of_an_orbit(engine: str) ->
         far = expected.copy() if tick == 20 else far
         changed = np.abs(expected - far).max() if 20 < tick < 40 else changed
     assert changed > 1e-2, "the gravity gradient acts on both while they are joined"
-    assert target_momentum(capturing) == pytest.approx(capturing.target.momenta, abs=1e-3)
-
-
-def target_momentum(capturing: CapturePlant) -> Array:
-    motion = capturing.target.motion
-    return np.concatenate(motion.momenta(capturing.target.inertia))
+    momenta = np.concatenate(capturing.target.motion.momenta(capturing.target.inertia))
+    assert momenta == pytest.approx(capturing.target.momenta, abs=1e-3)
 
 
 def test_a_target_slides_on_a_table_with_the_robot() -> None:

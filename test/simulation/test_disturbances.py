@@ -364,22 +364,6 @@ def test_servos_hold_joints_against_a_wrench() -> None:
     assert_agrees(plant.effort, expected, 1e-9)
 
 
-def test_a_constant_force_at_the_centre_of_mass_is_a_parabola() -> None:
-    robot = robot_of(random_urdf(3))
-    start = InitialState(linear_momentum=np.array([0.2, 0.0, -0.4]))
-    plant, loads = VelocityPlant(robot, 0.25, start), PlantLoads(robot)
-    base = robot.link_names.index(robot.base_link)
-    force = np.array([0.3, -0.2, 0.1])
-    loads.in_world[base] = [*force, *np.cross(robot.center_of_mass(plant.q), force)]
-    plant.load(loads)
-    center = robot.center_of_mass(plant.q)
-    for _ in range(4):
-        plant.step(np.zeros(robot.n))
-    np.testing.assert_allclose(plant.twist[3:], 0.0, atol=1e-15)
-    way = (start.linear_momentum + force / 2) / robot.total_mass
-    np.testing.assert_allclose(plant.pose[:3] + center, center + way, atol=1e-12)
-
-
 def test_loads_are_felt_at_stops_and_by_held_joints() -> None:
     """A joint that is held or on its stop: the momenta change by the impulse all the same."""
     rng, urdf = np.random.default_rng(2), random_urdf(3)
