@@ -29,6 +29,7 @@ from control.flights import (
 )
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation
+from support.executive_loop import UPRIGHT
 from support.oracles import Array
 from support.random_robots import random_robot_urdf
 from support.sentences import assert_one_sentence
@@ -58,8 +59,6 @@ from spacerobot_ros.model.inverse_kinematics import AXES
 from spacerobot_ros.parameters import configured, declared, parameter
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_names
-
-LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 # -- states, references and output accelerations of the servicer ---------------------------------
 
@@ -402,7 +401,7 @@ GOAL = Reference(pose([0, 0, 0]), pose([1.5, 1.2, 0]))
 
 
 def stretched(elbow: float) -> ControlState:
-    return ControlState.at_rest(np.zeros(3), LEVEL, np.array([0.3, elbow]))
+    return ControlState.at_rest(np.zeros(3), UPRIGHT, np.array([0.3, elbow]))
 
 
 def size(law: ControlLaw, elbow: float) -> float:
@@ -526,7 +525,7 @@ def _command_once(robot: SpaceRobot, config: ControllerConfig, shape: Sequence[f
         zip(robot.joint_names, shape, strict=False)
     )
     q = np.array([positions[name] for name in controller.law.robot.joint_names])
-    state = ControlState.at_rest(np.zeros(3), LEVEL, q)
+    state = ControlState.at_rest(np.zeros(3), UPRIGHT, q)
     controller.command(0.0, state, state.q, state.qdot)
 
 
@@ -642,7 +641,7 @@ def test_null_space_damping_and_posture() -> None:
     rng = np.random.default_rng(5)
     start = ControlState(
         np.zeros(3),
-        LEVEL,
+        UPRIGHT,
         rng.uniform(-0.05, 0.05, 3),
         rng.uniform(-0.05, 0.05, 3),
         SERVICER_SHAPE,
@@ -675,7 +674,7 @@ def test_null_space_damping_and_posture() -> None:
 def test_joint_damping_of_the_transposed_jacobian(damping: float) -> None:
     """Nine outputs of twelve: the wrist swings on unless it is damped."""
     robot = load("servicer")
-    still = ControlState.at_rest(np.zeros(3), LEVEL, SERVICER_SHAPE)
+    still = ControlState.at_rest(np.zeros(3), UPRIGHT, SERVICER_SHAPE)
     start = replace(still, qdot=np.array([0.0, 0.0, 0.0, 0.4, -0.3, 0.5]))
     law = TransposedJacobianLaw(
         robot,

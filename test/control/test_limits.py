@@ -169,8 +169,8 @@ def test_velocities_and_accelerations_are_derivatives(seed: int) -> None:
     for fraction in (0.1, 0.5, 0.83):
         time = fraction * profile.duration
         before, now, after = (parts(profile.at(time + dt)) for dt in (-STEP, 0.0, STEP))
-        rates, changes = [now[2].qdot, now[2].qddot], []
-        changes += [after[2].q - before[2].q, after[2].qdot - before[2].qdot]
+        rates = [now[2].qdot, now[2].qddot]
+        changes = [after[2].q - before[2].q, after[2].qdot - before[2].qdot]
         for n, b, a in zip(now[:2], before[:2], after[:2], strict=True):
             turn = Rotation.from_quat(a.quaternion) * Rotation.from_quat(b.quaternion).inv()
             rates += [n.velocity, n.angular_velocity, n.acceleration, n.angular_acceleration]

@@ -368,11 +368,11 @@ def test_without_pairs_a_plant_measures_no_clearance() -> None:
     assert ClearanceMonitor.of(load_robot(robot_file("sliding_masses")), ()) is None
 
 
-def ball_at(x: float, name: str = "ball") -> str:
+def ball_at(x: float) -> str:
     return (
-        f'<robot name="w"><link name="w"/><link name="{name}"><collision><geometry>'
+        '<robot name="w"><link name="w"/><link name="ball"><collision><geometry>'
         '<sphere radius="0.01"/></geometry></collision></link><joint name="a" type="fixed">'
-        f'<parent link="w"/><child link="{name}"/><origin xyz="{x} 0 0"/></joint></robot>'
+        f'<parent link="w"/><child link="ball"/><origin xyz="{x} 0 0"/></joint></robot>'
     )
 
 
