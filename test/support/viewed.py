@@ -36,7 +36,11 @@ class Viewed:
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        self.url = self.wait_for("viewer  ").split()[1]
+        try:
+            self.url = self.wait_for("viewer  ").split()[1]
+        except BaseException:
+            self.close()
+            raise
 
     def _read(self) -> None:
         assert self.process.stdout is not None
