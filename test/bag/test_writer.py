@@ -181,8 +181,8 @@ def test_a_bag_is_split_into_complete_files(tmp_path: Path, limit: dict[str, flo
 
 
 def test_a_file_is_full_when_it_lasts_exactly_as_long_as_it_may(tmp_path: Path) -> None:
-    times = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
-    bag_of_strings(tmp_path / "a.mcap", times, config=RecorderConfig(max_duration=1.0))
+    at = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    bag_of_strings(tmp_path / "a.mcap", at, config=RecorderConfig(max_duration=1.0))
     files = [Content(tmp_path / f"a_{n}.mcap") for n in range(3)]
     times = [[log_ns / S for _, log_ns, *_ in content.messages] for content in files]
     assert times == [[0.0, 0.5, 1.0], [1.5, 2.0, 2.5], [3.0]]
