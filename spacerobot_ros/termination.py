@@ -52,6 +52,11 @@ _PR_SET_PDEATHSIG = 1
 class Terminated(KeyboardInterrupt):
     """A signal that ends the process. Like KeyboardInterrupt, this exception is not caught
     by ``except Exception``.
+
+    Parameters
+    ----------
+    number
+        The signal.
     """
 
     def __init__(self, number: int) -> None:

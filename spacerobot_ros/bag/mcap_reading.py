@@ -130,6 +130,11 @@ class BagFile:
     A file compressed as a whole, such as rosbag2's ``NAME.mcap.zstd``, is unpacked to a
     temporary file, which is deleted with this object.
 
+    Parameters
+    ----------
+    path
+        Path of the file; error messages include it.
+
     Raises
     ------
     RecordingError

@@ -79,7 +79,13 @@ class InitialStates:
 
     @classmethod
     def repeated(cls, robot: SpaceRobot, initial: InitialState, count: int) -> InitialStates:
-        """Return ``count`` identical rows; for errors, see :meth:`of`."""
+        """Return ``count`` identical rows; the caller may overwrite columns.
+
+        Raises
+        ------
+        ParameterError
+            The plant would reject the initial state.
+        """
         return cls.of(robot, [initial] * count)
 
     def __len__(self) -> int:

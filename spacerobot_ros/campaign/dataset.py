@@ -60,9 +60,20 @@ ERROR = "error"
 class Row:
     """The result of one draw.
 
-    ``outcome`` and ``reason`` are the goal outcome, or ``error``, and the message. ``metrics``, by
-    name, are empty if nothing was flown. ``passed``: the goal was reached and all criteria were
-    met. Wall times of the flight and of its planning are in s.
+    Attributes
+    ----------
+    draw
+        The drawn values.
+    outcome, reason
+        Goal outcome, or ``error``, and the message.
+    metrics
+        Metrics by name; empty if nothing was flown.
+    passed
+        Whether the goal was reached and all criteria were met.
+    engine
+        Name of the engine used.
+    wall_time, plan_time
+        Wall time of the flight, and wall time of its planning, s.
     """
 
     draw: Draw
@@ -138,6 +149,11 @@ class Dataset:
 
     ``campaign.yaml`` and ``scenario.yaml`` describe the flights; ``flights/*.parquet`` contain one
     row per flight.
+
+    Parameters
+    ----------
+    folder
+        Path of the folder.
     """
 
     def __init__(self, folder: Path) -> None:

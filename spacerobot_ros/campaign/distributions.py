@@ -24,8 +24,17 @@ _TABLE, _CORRELATED = "table", "multivariate_normal"
 
 @dataclass(frozen=True)
 class Distribution:
-    """Probability distribution of a value: one of scipy.stats, with its arguments by name; equally
-    likely choices (``choice``); or table rows, one per flight (``table``)."""
+    """Probability distribution of a value: one of scipy.stats, a choice, or table rows.
+
+    Attributes
+    ----------
+    name
+        Name in ``scipy.stats``, ``choice``, or ``table``.
+    arguments
+        Arguments by name, as in ``scipy.stats``.
+    choices
+        Equally likely values of a ``choice``, or the values in a ``table``, one per flight.
+    """
 
     name: str
     arguments: Mapping[str, float] = field(default_factory=dict)

@@ -36,12 +36,20 @@ _SEED = "plant.sensors.seed"
 
 @dataclass(frozen=True)
 class Draw:
-    """The drawn values of the flight with some number, by dispersion name, and the seed of its
-    sensor and actuator noise.
+    """The drawn values of one flight.
 
-    ``fallback`` is the reason why engine ``flights`` flies the draw instead of the campaign's
-    engine, which completes "the flight ..." (for example "needed corrections"), or is an error
-    message; empty for the campaign's engine.
+    Attributes
+    ----------
+    number
+        Flight number.
+    seed
+        Seed of sensor and actuator noise.
+    values
+        Values by dispersion name.
+    fallback
+        Reason why engine ``flights`` flies the draw instead of the campaign's engine, which
+        completes "the flight ..." (for example "needed corrections"), or is an error message; empty
+        for the campaign's engine.
     """
 
     number: int
@@ -51,7 +59,13 @@ class Draw:
 
 
 class Draws:
-    """All draws in a campaign; ParameterError: the sampler requires more flights."""
+    """All draws in a campaign.
+
+    Raises
+    ------
+    ParameterError
+        The sampler requires more flights than the campaign has.
+    """
 
     def __init__(self, campaign: Campaign) -> None:
         self._campaign = campaign

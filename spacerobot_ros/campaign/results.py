@@ -58,12 +58,22 @@ _NOT_CONTROLLED = re.compile(r"[(; ]([a-z]+(?: and [a-z]+)*) not controlled\)")
 
 @dataclass(frozen=True)
 class Results:
-    """The rows of a campaign, from the folder of its dataset, as columns.
+    """Campaign rows as columns.
 
-    ``columns`` are those of the report (N,) by name, in flight order: numbers, with NaN for missing
-    values, or strings. ``messages`` are each outcome with a message and its number of flights, the
-    most frequent first; numbers are omitted from a message unless they are the same in all these
-    flights. ``planned_flights`` is the number of flights in the whole campaign.
+    Attributes
+    ----------
+    campaign
+        The campaign.
+    folder
+        Folder of the dataset.
+    columns
+        The report's columns (N,) by name, in flight order: numbers, with NaN for missing values,
+        or strings.
+    messages
+        Each outcome with a message and its number of flights, the most frequent first. Numbers are
+        omitted from a message unless they are the same in all these flights.
+    planned_flights
+        Number of flights in the whole campaign.
     """
 
     campaign: Campaign

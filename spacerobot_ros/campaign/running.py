@@ -33,11 +33,19 @@ from spacerobot_ros.scenario import Scenario
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a campaign: flights ``flown`` of ``total``, after some ``seconds`` of wall time,
-    at ``flights_per_second`` in this process.
+    """Progress of a campaign.
 
-    ``unflown`` is the number of flights in the dataset whose draw or goal was refused or that ended
-    with an error; it is counted at the end of the campaign.
+    Attributes
+    ----------
+    flown, total
+        Flights.
+    flights_per_second
+        Flights per second of wall time, in this process.
+    seconds
+        Wall time so far.
+    unflown
+        Number of flights in the dataset whose draw or goal was refused or that ended with an error;
+        counted at the end of the campaign.
     """
 
     flown: int
@@ -138,11 +146,22 @@ larger values."""
 
 @dataclass(frozen=True)
 class Rerun:
-    """The row and the bag of a repeated flight, compared with its row in the dataset.
+    """A repeated flight, compared with its row in the dataset.
 
-    ``deviation`` and ``worst_metric`` are the largest deviation of a metric and the name of that
-    metric, and ``outcome`` is the outcome in the dataset; None and empty if the flight is not in
-    the dataset. ``note`` is the reason why the metrics may differ; empty if they must agree.
+    Attributes
+    ----------
+    row
+        Row of the repeated flight.
+    deviation
+        Largest deviation of a metric; None if the flight is not in the dataset.
+    worst_metric
+        Name of that metric.
+    outcome
+        Outcome in the dataset; empty if the flight is not in the dataset.
+    bag
+        Path of the bag.
+    note
+        Reason why the metrics may differ from those in the dataset; empty if both must agree.
     """
 
     row: Row

@@ -88,9 +88,15 @@ class DispersionTarget:
 
 @dataclass(frozen=True)
 class MassFactors:
-    """Changes in the mass properties of N flights; targets write into the arrays: factors ``mass``
-    and ``inertia`` (N, B) for each body, where the inertia is multiplied by both, and offsets
-    ``com`` (N, B, 3) of the centres of mass, m."""
+    """Changes in the mass properties of N flights; targets write into the arrays.
+
+    Attributes
+    ----------
+    mass, inertia
+        (N, B) factors for each body; the inertia is multiplied by both.
+    com
+        (N, B, 3) centre of mass offsets, m.
+    """
 
     mass: Array
     inertia: Array

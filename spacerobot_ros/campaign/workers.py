@@ -85,11 +85,16 @@ def this_code() -> str:
 def fly_task(
     packed: bytes, code: str, draws: list[Draw], engine: str, include_fallbacks: bool
 ) -> list[Row | Draw]:
-    """Fly some draws with the engine of a name, and with ``include_fallbacks`` its fallbacks: a
-    worker task.
+    """Fly some draws: a worker task.
 
-    ``packed`` and ``code`` are the results of :func:`serialise_campaign` and, in the same process,
-    of :func:`this_code`.
+    Parameters
+    ----------
+    packed, code
+        Result of :func:`serialise_campaign`, and of :func:`this_code` in the same process.
+    draws, engine
+        Draws, and engine name.
+    include_fallbacks
+        Whether this task also flies the fallbacks of the engine.
 
     Raises
     ------
@@ -127,8 +132,14 @@ class _RecordingContext(SpawnContext):
 
 
 class LocalWorkers:
-    """Some processes on this machine, each connected by anonymous pipes that no other process can
-    access."""
+    """Processes on this machine, each connected by anonymous pipes that no other process can
+    access.
+
+    Parameters
+    ----------
+    count
+        The number of processes.
+    """
 
     tasks_per_worker = 1
 
@@ -189,10 +200,15 @@ def _end_with_campaign() -> None:
 
 
 class DaskWorkers:
-    """Workers of the scheduler of a dask.distributed ``client``.
+    """Workers of a dask.distributed scheduler.
 
     A scheduler runs code from anyone who can reach its port: protect it with a private network or
     TLS.
+
+    Parameters
+    ----------
+    client
+        A client of dask.distributed.
     """
 
     tasks_per_worker = 2  # The running task, and one that can follow without a round trip.
@@ -206,8 +222,13 @@ class DaskWorkers:
         worker."""
 
     def count(self) -> int:
-        """Return the number of workers, at least 1 because workers may join later; raise
-        SpaceRobotError if the scheduler is gone or a worker does not have this package."""
+        """Return the number of workers, at least 1 because workers may join later.
+
+        Raises
+        ------
+        SpaceRobotError
+            The scheduler is no longer available, or a worker does not have this package.
+        """
         try:
             if self._client.status != "running":
                 raise _lost_scheduler_error()
@@ -227,8 +248,15 @@ class DaskWorkers:
         return self._executor.submit(fly_task, *arguments)
 
     def result(self, task: _Task) -> list[Row | Draw]:
-        """Return the result of a finished task; raise WorkerDeath, or SpaceRobotError if the
-        scheduler is no longer available or cannot load the task."""
+        """Return the result of a finished task.
+
+        Raises
+        ------
+        WorkerDeath
+            The worker died.
+        SpaceRobotError
+            The scheduler is no longer available, or cannot load the task.
+        """
         from distributed.comm.core import CommClosedError
         from distributed.scheduler import KilledWorker
 
@@ -333,7 +361,14 @@ class TaskDistributor:
     If a worker dies, each flight in its lost tasks is repeated alone, while no other task runs.
     If a worker dies again, the flight that it was flying is the cause and is reported.
 
-    ``stopped`` returns whether to stop; it is called a few times per second.
+    Parameters
+    ----------
+    workers
+        The workers.
+    campaign, draws, engine
+        The campaign, its draws, and the engine name.
+    stopped
+        Function that returns whether to stop; it is called a few times per second.
     """
 
     def __init__(

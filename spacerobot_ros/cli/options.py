@@ -355,7 +355,13 @@ def warn_of_large_angles(rotvec: Sequence[float]) -> None:
 
 
 class RegisteredName(_Choice):
-    """A choice of names from registries (``module:attribute``), which are imported on demand."""
+    """A choice of names from registries, which are imported on demand.
+
+    Parameters
+    ----------
+    registries
+        Mappings as ``module:attribute``.
+    """
 
     def __init__(self, *registries: str) -> None:
         super().__init__(())

@@ -403,9 +403,16 @@ class TargetClearance:
     ) -> NearestLinks | None:
         """Return the smallest distance in a motion; None: nothing can touch.
 
-        The joint positions (K, n), m or rad, and the motion of the grapple frame are at the same
-        times, ``base`` is the pose of the fixed base in W, and ``closes`` the first sample of
-        closing in.
+        Parameters
+        ----------
+        base
+            Pose of the fixed base in W.
+        shapes
+            (K, n) joint positions, m or rad.
+        grapple
+            Motion of the grapple frame at the same times.
+        closes
+            First sample of closing in.
         """
         geometry = self._geometry
         if not len(geometry.pairs):

@@ -344,7 +344,10 @@ class CoordinatedController:
         ``measured`` is the state, or None without a base measurement; ``q`` and ``qdot`` (n,) are
         the joint positions and rates, which are always measured.
 
-        Raises NotFiniteError if a measurement is not finite.
+        Raises
+        ------
+        NotFiniteError
+            A measurement is not finite.
         """
         state, around_B = self._known_state(measured, q, qdot), None
         if state is None:

@@ -368,6 +368,11 @@ class ControlExecutive:
 
         ``reference`` is a planner's reference for this state; groups missing from the reference
         hold their pose.
+
+        Raises
+        ------
+        NotFiniteError
+            A measurement is not finite.
         """
         if self._time is not None and not 0 <= time - self._time <= self._config.longest_gap:
             # After a jump of time, the goal continues as before the jump.

@@ -121,11 +121,20 @@ class GoalMonitor:
         errors: OutputDistance,
         config: ControllerConfig,
     ) -> Scalar:
-        """Return the goal's :class:`Decision` from the largest errors in a state at a given time
-        (s), if control is not lost.
+        """Return the goal's :class:`Decision` from the errors in a state, if control is not lost.
 
-        ``at_rest``: whether the reference has come to rest at the goal, which it does at the time
-        ``ends`` (s).
+        Parameters
+        ----------
+        time
+            Time of the state, s.
+        at_rest
+            Whether the reference has come to rest at the goal.
+        ends
+            Time at which the reference comes to rest, s.
+        errors
+            Largest output errors by kind.
+        config
+            Tolerances, settling time and time limit.
         """
         within = (
             1.0

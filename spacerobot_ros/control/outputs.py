@@ -214,10 +214,20 @@ class OutputVector:
     ``acceleration``
         (m,) ``z1ddot_des``.
 
-    Without ``thrust``, no force on the base moves the centre of mass, and the first columns of
-    ``J_z`` are zero.
+    Parameters
+    ----------
+    robot
+        The model.
+    selection
+        The outputs.
+    thrust
+        Whether forces on the base move the centre of mass; if not, the first columns of ``J_z`` are
+        zero.
 
-    Raises ParameterError; see :meth:`OutputSelection.require_valid`.
+    Raises
+    ------
+    ParameterError
+        The robot lacks a selected output; see :meth:`OutputSelection.require_valid`.
     """
 
     def __init__(
@@ -274,7 +284,12 @@ class OutputVector:
     def pack_state(self, state: ControlState, memory: Array) -> None:
         """Write a state into memory (13 + 2 n,) for the symbol ``state``.
 
-        Raises as :meth:`.ControlLaw.command`.
+        Raises
+        ------
+        NotFiniteError
+            A value in the state is not finite.
+        ValueError
+            A component has the wrong length.
         """
         state.stack(memory)
         require_finite("state", memory)
@@ -282,7 +297,14 @@ class OutputVector:
     def pack_reference(self, reference: Reference, memory: Array) -> None:
         """Write a reference into memory for the symbol ``reference``.
 
-        Raises as :meth:`.ControlLaw.command`.
+        Raises
+        ------
+        TargetNotSetError
+            The reference lacks a selected group.
+        NotFiniteError
+            A value in the reference is not finite.
+        ValueError
+            A component has the wrong length.
         """
         parts: list[Array] = []
         if self.selection.base:

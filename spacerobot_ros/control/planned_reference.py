@@ -42,8 +42,12 @@ class PlannedReference(ReferenceProfile):
     """A motion of the base and the joints, planned within the available thrust and around
     obstacles.
 
-    The plan consists of ``legs``: motions one after the other, all but the last to a waypoint. See
-    :class:`.ReferenceProfile` for the other parameters.
+    Parameters
+    ----------
+    start, goal, carries
+        See :class:`.ReferenceProfile`.
+    *legs
+        The plan: motions one after the other, all but the last to a waypoint.
     """
 
     name: ClassVar[str] = PLANNED_PROFILE
@@ -144,8 +148,14 @@ class PlannedReference(ReferenceProfile):
 
 
 class GrappleReference(PlannedReference):
-    """A planned motion to a target, whose motion starts at the same time as the plan, followed by
-    motion with the target.
+    """A planned motion to a target, followed by motion with the target.
+
+    Parameters
+    ----------
+    start, motion
+        See :class:`PlannedReference`.
+    grapple
+        The target; its motion starts at the same time as the plan.
     """
 
     name: ClassVar[str] = "grapple"
@@ -251,7 +261,10 @@ class ReferencePlanner:
         """Return the planned reference for a motion; ``state`` provides the positions of joints
         without a reference.
 
-        Raises PlanningError if no motion is found.
+        Raises
+        ------
+        PlanningError
+            No motion is found.
         """
         start, goal, carries, waypoints = motion
         assert goal.base is not None
@@ -288,7 +301,10 @@ class ReferencePlanner:
     ) -> GrappleReference:
         """Return the planned reference to a target; the given target motion starts with the plan.
 
-        Raises PlanningError if no motion is found.
+        Raises
+        ------
+        PlanningError
+            No motion is found.
         """
         motion = self._planner.plan(self._begin(start, state), grapple, cancellation)
         return GrappleReference(start, motion, grapple)

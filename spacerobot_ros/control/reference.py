@@ -156,11 +156,16 @@ def _quintic(u: Any, T: Any) -> tuple[Any, Any, Any]:
 
 
 def profile_numbers(profile: ReferenceProfile, base: bool, end_effector: bool, n: int) -> Array:
-    """Return a profile, whose goal includes the controlled groups, as the values required by
-    :func:`profile_expression`.
+    """Return a profile as the values required by :func:`profile_expression`.
 
-    ``base`` and ``end_effector``: whether these poses are controlled; ``n``: number of joints with
-    references, 0 if joints are not controlled.
+    Parameters
+    ----------
+    profile
+        A profile whose goal includes the controlled groups.
+    base, end_effector
+        Whether these poses are controlled.
+    n
+        Number of joints with references; 0 if joints are not controlled.
     """
     start, goal = profile.start, profile.goal
     parts: list[npt.ArrayLike] = [[profile.duration]]
@@ -209,7 +214,12 @@ class HeldVelocityReference:
     """Joint references from commands whose velocities are held over a control period.
 
     At a command, the velocity jumps: the reference has the mean of the velocities before and after,
-    and the acceleration that changes one into the other within one period (s).
+    and the acceleration that changes one into the other within one period.
+
+    Parameters
+    ----------
+    control_period
+        Time between commands, s.
     """
 
     def __init__(self, control_period: float) -> None:

@@ -58,7 +58,10 @@ class ControlState:
     def stack(self, memory: Array) -> None:
         """Write the six components in sequence into ``memory`` (13 + 2 n,).
 
-        Raises ValueError if a component has the wrong length.
+        Raises
+        ------
+        ValueError
+            A component has the wrong length.
         """
         parts = self.r_WB, self.quaternion_WB, self.v_WB_B, self.omega_WB_B, self.q, self.qdot
         np.concatenate(parts, out=memory)
@@ -187,8 +190,19 @@ class DeadReckoning:
     rates replace the predicted ones, and the base rotates according to the connection ``A``. Errors
     then accumulate only in the effects of the thrusters.
 
-    A step lasts a ``control_period`` (s), in Runge-Kutta steps of at most ``integration_step`` (s).
-    Raises ParameterError; see :func:`.count_steps`.
+    Parameters
+    ----------
+    robot
+        The controller's robot model.
+    control_period
+        Duration of a step, s.
+    integration_step
+        Longest Runge-Kutta step, s.
+
+    Raises
+    ------
+    ParameterError
+        A duration is not positive.
     """
 
     def __init__(

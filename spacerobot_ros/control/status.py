@@ -184,8 +184,13 @@ _COMMAND_FORMAT = KeyValueFormat(
 
 def tracking_time(states: Iterable[tuple[float, ControllerState]]) -> float | None:
     """Return the time from the first tracked state to the last goal decision, s, which later
-    statuses repeat, given the times (s) and states of the controller statuses; None without a
-    tracked state or a decision.
+    statuses repeat.
+
+    Parameters
+    ----------
+    states
+        Times (s) and states of the controller statuses; without a tracked state or a decision, the
+        result is None.
     """
     began = ended = None
     decided = False

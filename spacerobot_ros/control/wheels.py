@@ -79,8 +79,14 @@ class WheelAllocation:
     """Distributes a torque over wheels by bounded least squares.
 
     The torques solve ``min |A tau - torque|`` with ``lower <= tau <= upper``; among several
-    solutions, the one with the smallest torques relative to their limits is chosen. ``axes`` (3, k)
-    are the wheel axes A, ``torque`` (k,) the largest motor torques, N m.
+    solutions, the one with the smallest torques relative to their limits is chosen.
+
+    Parameters
+    ----------
+    axes
+        (3, k) wheel axes A.
+    torque
+        (k,) largest motor torques, N m.
     """
 
     def __init__(self, axes: Array, torque: Array) -> None:

@@ -37,8 +37,15 @@ _SAME_TIME = 1e-6  # s
 
 
 class HeldTarget(NamedTuple):
-    """The target, according to its description, while held by the robot from capture to release, s;
-    ``end`` is infinite if there is no release."""
+    """The target while held by the robot.
+
+    Attributes
+    ----------
+    start, end
+        Capture and release times, s; ``end`` is infinite if there is no release.
+    payload
+        The body, according to the target's description.
+    """
 
     start: float
     end: float
@@ -106,8 +113,12 @@ def momentum_budget_over_time(flight: Flight, most: int) -> Signal:
     from the true states. Values are in N m s. A held body is treated as part of the link that holds
     it.
 
-    ``most`` is the largest number of states to evaluate. If the flight has no robot description or
-    no states, the returned signal is empty.
+    Parameters
+    ----------
+    flight
+        The flight; if it has no robot description or no states, the returned signal is empty.
+    most
+        Maximum number of states to evaluate.
 
     Raises
     ------
@@ -135,8 +146,15 @@ def payload_estimates(flight: Flight, most: int = 600) -> tuple[PayloadEstimate,
     """Return the estimated parameters of each body held by the robot.
 
     The parameters are determined from conservation of momentum (:mod:`.model.payload_estimation`),
-    the measured base and joint motion, the robot's masses and the thrust, at up to ``most`` states
-    per body. The target's description is not used.
+    the measured base and joint motion, the robot's masses and the thrust. The target's description
+    is not used.
+
+    Parameters
+    ----------
+    flight
+        The flight.
+    most
+        Maximum number of states used per body.
 
     Raises
     ------

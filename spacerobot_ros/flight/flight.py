@@ -47,13 +47,20 @@ _PARTS: frozenset[Controlled] = frozenset(("position", "attitude", "shape", "end
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a flight, according to its last true state, in a few words, such as ``Reached,
-    except for the position``, and in a sentence.
+    """The outcome of a flight in words, according to its last true state.
 
-    The sentence is the commander's message; if the goal is reached or the time limit has expired,
-    it states the true errors and the tolerances. ``succeeded``: the true state reaches all
-    controlled components of the goal, and any automatic capture has taken place. ``complete``:
-    every component of the goal was also controlled.
+    Attributes
+    ----------
+    word
+        The outcome in a few words, such as ``Reached, except for the position``.
+    sentence
+        The commander's message; if the goal is reached or the time limit has expired, a sentence
+        with the true errors and the tolerances.
+    succeeded
+        Whether the true state reaches all controlled components of the goal, and whether any
+        automatic capture has taken place.
+    complete
+        Whether every component of the goal was also controlled.
     """
 
     word: str
@@ -434,8 +441,14 @@ class Flight(FlightData):
         return figure(self)
 
     def animate(self, *, seconds: float = 8.0, frames: int = 80) -> Any:
-        """Return the robot in motion as an HTML animation for a notebook, which lasts some
-        ``seconds`` and consists of at most 1000 pictures (``frames``).
+        """Return the robot in motion as an HTML animation for a notebook.
+
+        Parameters
+        ----------
+        seconds
+            Duration of the animation.
+        frames
+            Number of pictures, at most 1000.
 
         Raises
         ------

@@ -107,8 +107,14 @@ class Robots:
 
 
 def require_flyable(scenario: Scenario) -> None:
-    """Raise ParameterError, naming the command to use, if a scenario requires ROS nodes, as it does
-    for wall time, other processes or a resumed flight."""
+    """Raise an error if a scenario requires ROS nodes, as it does for wall time, other processes or
+    a resumed flight.
+
+    Raises
+    ------
+    ParameterError
+        The scenario requires nodes; the message names the command to use.
+    """
     why = ""
     if not scenario.lockstep:
         why = "plant.time_mode is realtime"
@@ -192,7 +198,22 @@ class _Host:
 
 
 class LockstepFlight:
-    """One flight in lockstep, tick by tick; for parameters and errors see :func:`fly_scenario`."""
+    """One flight in lockstep, tick by tick.
+
+    Parameters
+    ----------
+    scenario
+        The scenario to fly; :func:`require_flyable` must accept it.
+    robots
+        The models.
+
+    Raises
+    ------
+    ParameterError
+        A parameter or the robot is invalid.
+    GoalError
+        The goal's joint positions belong to another robot.
+    """
 
     def __init__(self, scenario: Scenario, robots: Robots | None = None) -> None:
         require_flyable(scenario)

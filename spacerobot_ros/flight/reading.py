@@ -77,11 +77,18 @@ WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
 
 
 class FlightBag(RecordedRobot):
-    """The topics of one robot in a bag as signals over time, in a namespace such as ``/robot_1``;
-    empty: none.
+    """One robot's topics in a bag as signals over time.
 
-    Times are stamps (s), or log times if stamps come from another clock; they begin at the first
-    state if ``from_start`` is set.
+    Times are stamps (s), or log times if stamps come from another clock.
+
+    Parameters
+    ----------
+    bag
+        The recording.
+    namespace
+        Namespace of the robot's topics, such as ``/robot_1``; empty if there is no namespace.
+    from_start
+        Whether times begin at the first state.
     """
 
     def __init__(self, bag: Bag, namespace: str = "", *, from_start: bool = False) -> None:
@@ -142,10 +149,19 @@ class FlightBag(RecordedRobot):
     def signal(
         self, name: str, fields: Sequence[str], width: int, joints: Sequence[str] | None = None
     ) -> Signal:
-        """Return fields of a topic over time (N, ``width``), omitting messages that lack a field.
+        """Return fields of a topic over time, omitting messages that lack a field.
 
-        ``fields`` are the paths of numbers, or of one array; ``joints`` are the names of the joints
-        or thrusters, in the order of the columns; None: those in the first message.
+        Parameters
+        ----------
+        name
+            The topic.
+        fields
+            Paths of numbers, or of one array.
+        width
+            Number of columns.
+        joints
+            Names of the joints or thrusters, in the order of the columns; None: those in the first
+            message.
         """
         series = self.get(name)
         if series is None:
@@ -307,11 +323,17 @@ def _completed(true: Signal, measured: Signal) -> Signal:
 def open_flight_bag(
     path: str | os.PathLike[str], namespace: str | None = None, *, from_start: bool = False
 ) -> FlightBag:
-    """Open a bag, whose path is as for :func:`~spacerobot_ros.bag.read_bag`; for ``from_start`` see
-    :class:`FlightBag`.
+    """Open a bag.
 
-    ``namespace`` may have a leading slash; None selects the first namespace with an ``odom`` topic,
-    in alphabetical order.
+    Parameters
+    ----------
+    path
+        As for :func:`~spacerobot_ros.bag.read_bag`.
+    namespace
+        Namespace of the robot's topics, with or without the leading slash; None selects the first
+        namespace with an ``odom`` topic, in alphabetical order.
+    from_start
+        Whether times begin at the first state.
 
     Raises
     ------

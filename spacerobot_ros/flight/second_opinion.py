@@ -28,11 +28,22 @@ AGREEMENT_TOLERANCE = 1e-8
 
 @dataclass(frozen=True)
 class EngineComparison:
-    """The largest differences between a flight and its re-simulation in another engine: in the base
-    ``position``, m, and ``attitude``, rad, and in the positions of the ``joints``, m or rad.
+    """The largest differences between a flight and its re-simulation in another engine.
 
-    ``ticks`` is the number of compared ticks, and ``time`` the simulated time of the largest
-    difference, s. ``stop_reason`` states why the engine stopped early, if it did.
+    Attributes
+    ----------
+    engine
+        Name and version of the engine.
+    integrator
+        The engine's integrator, with its maximum step.
+    ticks
+        Number of compared ticks.
+    position, attitude, joints
+        Largest differences in base position, m, base attitude, rad, and joint positions, m or rad.
+    time
+        Simulated time of the largest difference, s.
+    stop_reason
+        Reason why the engine stopped early; empty if the replay was completed.
     """
 
     engine: str
@@ -51,7 +62,14 @@ class EngineComparison:
 
 
 class EngineFlight:
-    """Flies a robot in MuJoCo alongside a plant in its initial state, in ticks of ``period`` s.
+    """Flies a robot in MuJoCo alongside a plant, tick by tick.
+
+    Parameters
+    ----------
+    plant
+        The plant in its initial state.
+    period
+        Duration of a tick, s.
 
     Raises
     ------
@@ -107,8 +125,15 @@ class EngineFlight:
     def comparison(
         self, ticks: npt.NDArray[np.int64], poses: Array, shapes: Array
     ) -> EngineComparison:
-        """Return the differences from base poses (N, 7) and joint positions (N, n) at ticks (N,) in
-        a bag."""
+        """Return the differences from the states in a bag.
+
+        Parameters
+        ----------
+        ticks
+            (N,) ticks of the states.
+        poses, shapes
+            (N, 7) poses of the base, and (N, n) joint positions.
+        """
         rows = ticks - self._first
         known = (rows >= 0) & (rows < len(self._poses))
         rows = rows[known]

@@ -161,8 +161,14 @@ def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal |
 
 
 class FlightLog:
-    """Collects the arrays of a :class:`~spacerobot_ros.flight.flight.Flight` tick by tick: the
-    quantities that its plant reports, and the commands to it. A tick lasts ``period_ns``, ns.
+    """Collects the arrays of a :class:`~spacerobot_ros.flight.flight.Flight` tick by tick.
+
+    Parameters
+    ----------
+    plant, reported, commands
+        The plant, its reported quantities, and its commands.
+    period_ns
+        Duration of a tick, ns.
     """
 
     def __init__(

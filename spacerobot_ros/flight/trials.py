@@ -41,8 +41,19 @@ _RANDOM_GOAL_TOLERANCE = 1e-5  # rad and m
 
 @dataclass(frozen=True)
 class PlanningProblem:
-    """A planning problem, with the name of its scenario or robot, and the planner's parameters:
-    control period, tolerance, method options."""
+    """A planning problem.
+
+    Attributes
+    ----------
+    name
+        Name of the scenario or robot.
+    robot, initial
+        The model and its initial state.
+    goal
+        The goal.
+    config
+        Planner parameters: control period, tolerance, method options.
+    """
 
     name: str
     robot: SpaceRobot
@@ -91,12 +102,24 @@ class PlanningProblem:
 
 @dataclass(frozen=True)
 class PlanEvaluation:
-    """A gait method's plan for a problem, and its flight result in the plant.
+    """A method's plan for a problem, and its flight result in the plant.
 
-    ``pieces`` are successive schedules; only one, unless the method plans in stages. ``error`` is
-    the final error in the base ``pose`` (7,) in W, m and quaternion, and in the joint positions.
-    ``plan_time`` is a wall time, s. ``reached``: the goal was reached within the planner's
-    tolerance. ``controls`` are the goal components that the schedules control.
+    Attributes
+    ----------
+    method
+        Name of the gait method.
+    pieces
+        Successive schedules; only one, unless the method plans in stages.
+    error
+        Final error in ``pose`` and in the joint positions.
+    pose
+        (7,) final base pose in W: position (m) and quaternion.
+    plan_time
+        Planning wall time, s.
+    reached
+        Whether the goal was reached within the planner's tolerance.
+    controls
+        The goal components that the schedules control.
     """
 
     method: str

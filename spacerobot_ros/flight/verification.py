@@ -46,10 +46,19 @@ _COMPARED_FIRST = {"joint_states": 0, "odom": 1}
 
 @dataclass(frozen=True)
 class Difference:
-    """A value in the bag that does not follow from the commands, or that has the largest deviation,
-    with its simulated time (s) and the value ``expected`` from the re-simulation.
+    """A value in the bag that does not follow from the commands, or that has the largest deviation.
 
-    ``remark`` is a clause in parentheses on the commands that cause the difference, or empty.
+    Attributes
+    ----------
+    time
+        Simulated time, s.
+    topic, field
+        Name of the number.
+    recorded, expected
+        The value in the bag, and the value in the re-simulation.
+    remark
+        Remark on the commands that cause the difference: a clause in parentheses, or an empty
+        string.
     """
 
     time: float
@@ -68,13 +77,24 @@ class Difference:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of a verification: the number of re-simulated ticks and their ``duration``, s of
-    simulated time, and the number and topics of the compared messages.
+    """The result of a verification.
 
-    ``largest``, at ``largest_at``, is the largest deviation before the first ``difference``,
-    relative to max(1, expected value). ``missing`` is a message about states that are missing
-    according to the message counts in the bag; empty: none. ``second_opinion``, if requested,
-    contains the differences from another engine under the same commands.
+    Attributes
+    ----------
+    ticks, duration
+        Number of re-simulated ticks, and their duration in s of simulated time.
+    messages, topics
+        Number of compared messages, and their topics.
+    missing
+        Message about states that are missing according to the message counts in the bag; empty if
+        none are missing.
+    second_opinion
+        The differences from another engine under the same commands, if requested.
+    largest, largest_at
+        The largest deviation before the first difference, relative to max(1, expected value), and
+        its location.
+    difference
+        The first difference, if any.
     """
 
     ticks: int

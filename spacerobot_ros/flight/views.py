@@ -36,7 +36,13 @@ class Picture(Figure):
 
 
 class Animation:
-    """An animation that notebooks display as ``html``; :meth:`save` writes it as a page."""
+    """An HTML animation that notebooks display; :meth:`save` writes it as a page.
+
+    Attributes
+    ----------
+    html
+        The content that a notebook shows.
+    """
 
     def __init__(self, html: str) -> None:
         self.html = html

@@ -261,7 +261,16 @@ def source_hash(*names: str) -> str:
 
 def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca.Function:
     """Return an expensive function from the cache, or derive and cache it; both ways yield the same
-    function. ``key`` is a hash of everything that the function depends on.
+    function.
+
+    Parameters
+    ----------
+    name
+        Name of the function.
+    key
+        Hash of everything the function depends on.
+    build
+        Derives it.
     """
     cache = Cache(cache_directory())
     serialised = f"{name}-{key[:32]}.casadi"

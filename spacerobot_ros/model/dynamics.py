@@ -155,8 +155,16 @@ def momentum_derivatives(
     joint carries change by ``y1_i`` and ``y2_i``. Second derivatives for joints on different
     branches are zero, except for products of linear momenta, which keep the centre of mass at rest.
     The formulas, derived in docs/theory/model.md, need a tenth of the operations of CasADi's
-    derivatives. The angular velocity ``omega`` (3,) of the base is in the base frame, ``qdot`` (n,)
-    are joint rates, and ``eta`` (3,) weights of the momentum components.
+    derivatives.
+
+    Parameters
+    ----------
+    parts
+        The composites at the configuration.
+    omega, qdot
+        Angular velocity (3,) of the base, in the base frame, and joint rates (n,).
+    eta
+        (3,) weights of the momentum components.
     """
     kin, S, P = parts.kin, parts.S, parts.P
     joints = range(1, kin.moving_body_count + 1)

@@ -88,11 +88,22 @@ def external_loads(
     loads: ca.SX,
     time: ca.SX,
 ) -> ExternalLoads:
-    """Return the loads in a state, given the vector of :class:`LoadLayout` and the time, s.
+    """Return the loads in a state.
 
-    ``second_moments`` (3, 3) of mass of all bodies about their own centres are in the base frame;
-    ``quaternion`` (4,) is that of ``R_WB``, and ``r_WC_W`` (3,), m, the position of the system's
-    centre of mass.
+    Parameters
+    ----------
+    kin
+        The kinematics.
+    second_moments
+        (3, 3) second moment of mass of every body about its own centre, in the base frame.
+    quaternion
+        (4,) of ``R_WB``.
+    r_WC_W
+        (3,) position of the system's centre of mass, m.
+    loads
+        The vector of :class:`LoadLayout`.
+    time
+        Time, s.
     """
     links = [link.name for link in kin.robot.links]
     layout = LoadLayout(len(links))

@@ -30,8 +30,14 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 
 @dataclass(frozen=True)
 class Payload:
-    """A body held by a robot link: the name of the link, and the mass properties of the body in the
-    link frame.
+    """A body held by a robot link.
+
+    Attributes
+    ----------
+    link
+        Name of the link.
+    inertia
+        Mass properties of the body in the link frame.
     """
 
     link: str
@@ -92,8 +98,14 @@ class Payload:
 
 @dataclass(frozen=True)
 class TargetBody:
-    """A rigid body that can be captured: its mass properties and the pose of the grapple frame G,
-    both in its root link frame T.
+    """A rigid body that can be captured.
+
+    Attributes
+    ----------
+    inertia
+        Mass properties in its root link frame T.
+    grapple
+        Pose of the grapple frame G in T.
     """
 
     inertia: Inertia
@@ -213,8 +225,14 @@ class BodyMotion:
 
 @dataclass(frozen=True)
 class RelativeMotion:
-    """Motion of one frame relative to another: distance (m) and relative speed (m/s) of the frame
-    origins, angle (rad) between the frame attitudes, and relative angular rate (rad/s).
+    """Motion of one frame relative to another.
+
+    Attributes
+    ----------
+    distance, angle
+        Distance (m) between the frame origins, and angle (rad) between the frame attitudes.
+    speed, rate
+        Relative speed of the origins (m/s), and relative angular rate (rad/s).
     """
 
     distance: float
@@ -272,10 +290,18 @@ def frame_motion(robot: SpaceRobot, link: str, motion: RobotMotion) -> BodyMotio
 def grasp_impact(
     robot: SpaceRobot, link: str, motion: RobotMotion, body: BodyMotion, inertia: Inertia
 ) -> GraspImpact:
-    """Return the impact of a link that grasps a floating body, both at their current poses and with
-    these motions before the grasp.
+    """Return the impact of a link that grasps a floating body, both at their current poses.
 
-    The impulse is given at the origin of the link frame, ``inertia`` in the body frame T.
+    Parameters
+    ----------
+    robot
+        The robot.
+    link
+        The end-effector; the impulse is given at the origin of the end-effector frame.
+    motion, body
+        The motions before the grasp.
+    inertia
+        Mass properties of the body in the body frame T.
     """
     q, n, R_WB = motion.q, robot.n, motion.R_WB
     to_cm = _to_velocity_of_cm(robot, q)
@@ -306,9 +332,17 @@ def grasp_impact(
 def combined_momenta(
     masses: tuple[float, float], centers: tuple[Array, Array], momenta: tuple[Array, Array]
 ) -> Array:
-    """Return the combined momenta (6,) of two systems, linear first, about their combined centre of
-    mass, given their masses (kg), centres of mass in W (3,), m, and momenta (6,) in W, each about
-    its own centre of mass.
+    """Return the combined momenta (6,) of two systems.
+
+    Parameters
+    ----------
+    masses
+        Masses of the two systems, kg.
+    centers
+        Centres of mass of the two systems in W (3,), m.
+    momenta
+        Linear and angular momentum (6,) of each system about its own centre of mass, in W; the
+        result is about the combined centre of mass.
     """
     first, second = momenta
     arm = centers[1] - centers[0]

@@ -237,8 +237,13 @@ class MassProperties:
 
 
 class SymbolicMassProperties(MassProperties):
-    """Mass properties as entries of a symbolic vector ``p``: those entries of
-    :attr:`.InertialParameters.vector` that are in the mask ``free`` (10 B,); the others are zero.
+    """Mass properties as entries of a symbolic vector ``p``.
+
+    Parameters
+    ----------
+    free
+        (10 B,) mask of the entries of :attr:`.InertialParameters.vector` that are in ``p``; the
+        other entries are zero.
     """
 
     def __init__(self, free: npt.NDArray[np.bool_]) -> None:

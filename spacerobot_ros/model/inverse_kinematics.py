@@ -40,8 +40,18 @@ _RADIAN_LENGTH = 0.5
 
 
 class FixedBaseArm:
-    """An arm on a fixed base, whose pose is given in W; ``axes`` of the end-effector ``link`` are
-    controlled, by default all.
+    """An arm on a fixed base.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    link
+        Link of the end-effector.
+    base
+        Base pose in W.
+    axes
+        Controlled end-effector axes; default: all.
     """
 
     def __init__(

@@ -140,8 +140,15 @@ def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
 def tree_kinematics(
     robot: RobotDescription, mass_properties: MassProperties | None = None
 ) -> TreeKinematics:
-    """Build the symbolic kinematics of a robot; by default, the mass properties are constants from
-    its description."""
+    """Build the symbolic kinematics of a robot.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    mass_properties
+        Mass properties of the bodies; by default, constants from the description.
+    """
     mass_properties = mass_properties or MassProperties(robot)
     q = ca.SX.sym("q", len(robot.joint_names))
     theta = joint_positions(robot, q)
@@ -192,8 +199,14 @@ class LinkPlacement:
     """Poses in W of frames fixed to links, from the base pose and the link poses.
 
     The poses are evaluated in CasADi's virtual machine: the few hundred operations take less time
-    than one matrix product in numpy. Each of the frames has the index of its link (of ``links``
-    links) and its pose in the link.
+    than one matrix product in numpy.
+
+    Parameters
+    ----------
+    links
+        Number of links.
+    frames
+        Link index of each frame, and the frame's pose in the link.
 
     Attributes
     ----------
@@ -217,8 +230,15 @@ class LinkPlacement:
         self.poses = self._function.outputs[0].reshape(len(frames), 7)
 
     def update(self, base: Array, link_R: Array, link_r: Array) -> None:
-        """Place the frames, given the base link pose (7,) in W, and the attitudes side by side
-        (3, 3 L) and positions (3, L), m, of the links in B."""
+        """Place the frames.
+
+        Parameters
+        ----------
+        base
+            (7,) base link pose in W.
+        link_R, link_r
+            (3, 3 L) attitudes side by side and (3, L) link positions in B, m.
+        """
         self._base[:], self._R[...], self._r[...] = base, link_R, link_r.reshape(self._r.shape)
         self._function.evaluate()
 
@@ -237,11 +257,15 @@ def joints_outward(robot: RobotDescription) -> list[Joint]:
 
 
 class ForwardKinematics:
-    """Link poses of a robot from its joint positions, without compilation, to draw the robot or
-    publish its frames.
+    """Link poses of a robot from its joint positions.
 
     Transforms (k, 7) are rows of a position (m) followed by a quaternion (x, y, z, w). Quaternions
     depend on half the joint angle, so they are continuous over several revolutions.
+
+    Parameters
+    ----------
+    robot
+        The robot.
 
     Attributes
     ----------
@@ -290,8 +314,12 @@ class ForwardKinematics:
         return np.concatenate([position, attitude], axis=-1)
 
     def link_poses(self, q: Array) -> tuple[Array, Array]:
-        """Return ``R_BL`` (..., L, 3, 3) and ``r_BL_B`` (..., L, 3), m, of all :attr:`links`, at
-        joint positions (..., n), m or rad.
+        """Return ``R_BL`` (..., L, 3, 3) and ``r_BL_B`` (..., L, 3), m, of all :attr:`links`.
+
+        Parameters
+        ----------
+        q
+            Joint positions (..., n), m or rad.
         """
         many = q.shape[:-1]
         fixed = np.broadcast_to(self.fixed_transforms, (*many, *self.fixed_transforms.shape))
@@ -306,8 +334,12 @@ class ForwardKinematics:
         return R, r
 
     def poses_in_world(self, base: Array, q: Array) -> tuple[Array, Array]:
-        """Return ``R_WL`` (..., L, 3, 3) and ``r_WL`` (..., L, 3), m, of all :attr:`links`, given
-        base poses (..., 7) in the world and joint positions (..., n).
+        """Return ``R_WL`` (..., L, 3, 3) and ``r_WL`` (..., L, 3), m, of all :attr:`links`.
+
+        Parameters
+        ----------
+        base, q
+            Base poses (..., 7) in the world, and joint positions (..., n).
         """
         R_BL, r_BL_B = self.link_poses(q)
         R_WB = matrices_from_quaternions(base[..., 3:])[..., None, :, :]

@@ -57,7 +57,15 @@ from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
 class ModelFunctions:
-    """All functions of one robot model; by default, its mass properties are constants."""
+    """All functions of one robot model.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    mass_properties
+        Mass properties of the bodies as symbols; by default, they are constants.
+    """
 
     def __init__(
         self, robot: RobotDescription, mass_properties: SymbolicMassProperties | None = None

@@ -100,8 +100,14 @@ class PayloadEstimate:
 
 
 def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
-    """Return A (6, 10), which maps a body's parameters to its momenta, given the motion of the
-    parameter frame L; ``about`` (3,), m, is the reference point of the angular momentum in W.
+    """Return A (6, 10), which maps a body's parameters to its momenta.
+
+    Parameters
+    ----------
+    motion
+        Motion of the parameter frame L.
+    about
+        (3,) reference point of the angular momentum in W, m.
     """
     R = motion.R_WT
     v, omega = R.T @ motion.v, R.T @ motion.omega

@@ -92,7 +92,11 @@ class SpaceRobot:
         All variants of the robot with different values share their compiled functions. If the
         values are unchanged, the robot itself is returned.
 
-        Raises RobotDescriptionError; see :meth:`.InertialParameters.require_physical`.
+        Raises
+        ------
+        RobotDescriptionError
+            A value is not finite, a mass is negative, all masses are zero, or an inertia is not
+            physical.
         """
         parameters.require_physical([body.name for body in self.description.bodies])
         if np.array_equal(parameters.vector, self.inertial.vector):
@@ -129,7 +133,13 @@ class SpaceRobot:
         return self._call_function("center_of_mass", q)[0]
 
     def link_pose(self, link: str, q: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return ``(R_BL (3, 3), r_BL_B (3,))`` of a link frame relative to the base."""
+        """Return ``(R_BL (3, 3), r_BL_B (3,))`` of a link frame relative to the base.
+
+        Raises
+        ------
+        KeyError
+            There is no such link.
+        """
         index = self._model.link_index(link)
         R, r = self._call_function("link_poses", q)
         return R[:, 3 * index : 3 * index + 3], r.reshape((3, -1), order="F")[:, index]
@@ -227,6 +237,11 @@ class SpaceRobot:
         """Return ``0J+`` (6, 6 + n) for a link frame origin (paper 4, eq. 10), in the base frame.
 
         The matrix maps ``[v_cm; omega; qdot]`` to linear and angular velocity.
+
+        Raises
+        ------
+        KeyError
+            There is no such link.
         """
         self._model.link_index(link)
         return self._call_function(f"jacobian:{link}", q)[0]
@@ -236,6 +251,11 @@ class SpaceRobot:
 
         The matrix maps ``qdot`` to linear and angular velocity in the world, while the base moves
         according to the momenta (Umetani and Yoshida's generalised Jacobian).
+
+        Raises
+        ------
+        KeyError
+            There is no such link.
         """
         J = self.jacobian(link, q)
         # The centre of mass is at rest, and the base rotates at -A qdot.

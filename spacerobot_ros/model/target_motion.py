@@ -117,8 +117,13 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class RelativeMotionOverTime:
-    """Motion of a frame E relative to a frame G at given times (K,), in G: the position, m, and
-    rotation vector of ``R_GE``, rad, (K, 6), and their first and second derivatives.
+    """Motion of a frame E relative to a frame G at given times (K,), in G.
+
+    Attributes
+    ----------
+    values, rates, accelerations
+        (K, 6) position, m, and rotation vector of ``R_GE``, rad, and their first and second
+        derivatives.
     """
 
     values: Array
@@ -182,10 +187,18 @@ def _jacobian_terms(phi: Array, phidot: Array) -> tuple[Array, Array, Array, Arr
 
 
 class RelativePath:
-    """A path of a frame E relative to a frame G, from an initial motion (K = 1) to rest at a
-    position (3,), m, where the attitudes of E and G coincide; ``duration`` is in s.
+    """A path of a frame E relative to a frame G, from a given motion to rest at a pose.
 
     Position and rotation vector are fifth-order polynomials in time.
+
+    Parameters
+    ----------
+    start
+        Initial motion (K = 1).
+    position
+        (3,) position at the end, m, where the attitudes of E and G coincide.
+    duration
+        Duration, s.
     """
 
     def __init__(self, start: RelativeMotionOverTime, position: Array, duration: float) -> None:
@@ -242,7 +255,14 @@ def _evaluate_polynomials(coefficients: Array, t: Array) -> list[Array]:
 
 
 class TorqueFreeMotion:
-    """Motion of a free target, starting from a measured motion of its root link frame.
+    """Motion of a free target, starting from a measured state.
+
+    Parameters
+    ----------
+    body
+        The target.
+    motion
+        State of the target's root link frame.
 
     Attributes
     ----------
@@ -403,10 +423,21 @@ def _rotate_vectors(R: Array, vectors: Array) -> Array:
 class PathInWorld:
     """A path that is short in W; relative to the rotating frame G, it leads around the body.
 
-    The position is a fifth-order polynomial in W, from the motion ``moving`` (K = 1) to that of a
-    point (3,), m, fixed in the grapple frame G of the target. The attitude relative to G follows
-    ``relative``, with the same endpoints. The path starts ``start`` s after the state from which
-    the target motion is predicted.
+    The position is a fifth-order polynomial in W, from a given motion to the motion of a point
+    fixed in G; the attitude relative to G follows ``relative``.
+
+    Parameters
+    ----------
+    relative
+        Path relative to G with the same endpoints.
+    target
+        The target with grapple frame G.
+    start
+        Start time, s since the state from which the target motion is predicted.
+    moving
+        Initial motion in W (K = 1).
+    position
+        (3,) end point in G, m.
     """
 
     def __init__(

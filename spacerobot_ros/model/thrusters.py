@@ -136,8 +136,15 @@ class ThrusterTable:
 
 
 def find_thrusters(source: str, robot: RobotDescription) -> ThrusterTable:
-    """Return the table from :data:`IN_URDF` (:func:`thrusters_of_urdf`) or from a YAML file
-    (:func:`load_thrusters`)."""
+    """Return the table from :data:`IN_URDF` or from a YAML file.
+
+    Raises
+    ------
+    ParameterError
+        The file or a thruster in it is invalid.
+    RobotDescriptionError
+        A thruster in the URDF is invalid, or the URDF has no thrusters.
+    """
     return thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
 
 
@@ -439,7 +446,10 @@ class ThrusterModulator:
     def exclude(self, name: str) -> None:
         """Stop using a (broken) thruster; the other thrusters produce the wrench if possible.
 
-        Raises ParameterError; see :meth:`ThrusterTable.index`.
+        Raises
+        ------
+        ParameterError
+            There is no thruster with that name.
         """
         self.allocation.exclude(self.table.index(name))
         self._excluded += (name,)

@@ -217,7 +217,12 @@ def parse_robot(text: str) -> RobotDescription:
 def with_held_joints(robot: RobotDescription, positions: Array | None = None) -> RobotDescription:
     """Return a robot with locked joints as one rigid body; its URDF is changed accordingly.
 
-    The positions (n,), m or rad, are in joint order; by default zero, or the nearest limit.
+    Parameters
+    ----------
+    robot
+        The robot.
+    positions
+        (n,) m or rad, in joint order; by default zero, or the nearest limit.
 
     Raises
     ------
@@ -386,7 +391,10 @@ def nearest_inertias(path: Path) -> tuple[str, dict[str, float]]:
     An impossible inertia is replaced by the nearest possible inertia in the Frobenius norm. Also
     return the relative change in inertia of each such link, in that norm.
 
-    Raises RobotDescriptionError if the file cannot be read, or is not URDF.
+    Raises
+    ------
+    RobotDescriptionError
+        The file cannot be read, or is not URDF.
     """
     text = _read_text(path)
     links = {each.name: each for each in _read_tree(text).links}

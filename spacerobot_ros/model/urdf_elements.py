@@ -425,11 +425,21 @@ def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLim
 
 
 def disabled_pairs(root: Element, links: list[str], source: str) -> frozenset[frozenset[str]]:
-    """Return the pairs of links whose contacts are ignored according to the elements of an SRDF, or
-    of a URDF that contains SRDF elements.
+    """Return the pairs of links whose contacts are ignored according to SRDF elements.
 
-    Raises RobotDescriptionError if an element names an unknown link; ``source`` is the subject of
-    its message.
+    Parameters
+    ----------
+    root
+        Root of an SRDF, or of a URDF that contains SRDF elements.
+    links
+        Link names of the robot.
+    source
+        Subject of the error message about an unknown link.
+
+    Raises
+    ------
+    RobotDescriptionError
+        An element names an unknown link.
     """
     quiet = {
         _read_link_name(each, "link", links, source)

@@ -112,9 +112,16 @@ def visuals_of(
 ) -> tuple[Visual, ...]:
     """Return all drawable visuals of a robot.
 
-    If the robot has no visuals, links are drawn as balls and joint offsets as bars. Only the given
-    ``meshes``, by URI and in the mesh frames, are drawn; if a mesh has more than ``most`` faces, it
-    is simplified.
+    If the robot has no visuals, links are drawn as balls and joint offsets as bars.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    meshes
+        Mesh triangles by URI, in the mesh frames; other meshes are omitted.
+    most
+        Largest number of faces per mesh; finer meshes are simplified.
     """
     found = []
     for link in robot.links:
@@ -213,8 +220,14 @@ def meshes_from_files(
 ) -> dict[str, TriangleMesh]:
     """Return a robot's meshes that can be read on this machine, by URI.
 
-    A mesh with more than ``most`` faces is simplified; ``on_error`` is called with a message for
-    each mesh that cannot be read.
+    Parameters
+    ----------
+    robot
+        The robot.
+    most
+        Largest number of faces per mesh; finer meshes are simplified.
+    on_error
+        Function that is called with a message for each mesh that cannot be read.
     """
     found = {}
     for resource in _mesh_uris(robot):
@@ -253,8 +266,19 @@ def with_attached_meshes(urdf: str, attachments: Mapping[str, bytes], folder: Pa
     """Return a URDF string in which meshes that exist only in a bag are replaced by files, for
     programs that read files; other meshes keep their names.
 
-    ``attachments`` are those of :func:`meshes_for_bag`; ``folder`` is the folder for the files.
-    Raises OSError if a file cannot be written.
+    Parameters
+    ----------
+    urdf
+        The URDF string.
+    attachments
+        Bag attachments, as returned by :func:`meshes_for_bag`.
+    folder
+        Folder for the files.
+
+    Raises
+    ------
+    OSError
+        A file cannot be written.
     """
 
     def write_mesh(resource: str) -> Path | None:

@@ -118,12 +118,17 @@ _MAX_CYCLE_INSTANTS = 300
 
 
 class KeyFrames(NamedTuple):
-    """Recorded states to show, in order from the first to the last; the motion in between is
-    interpolated.
+    """Recorded states to show; the motion between these states is interpolated.
 
-    ``error`` is the largest deviation of an omitted state from the interpolation, in tolerances,
-    and ``every`` the number of cycles per shown state between the cycles shown in full; 0 if all
-    cycles are shown in full.
+    Attributes
+    ----------
+    indices
+        State indices, ascending, including the first and last recorded state.
+    error
+        Largest deviation of an omitted state from the interpolation, in tolerances.
+    every
+        Number of cycles per shown state between the cycles shown in full, always at the same phase;
+        0 if all cycles are shown in full.
     """
 
     indices: Indices
@@ -132,11 +137,15 @@ class KeyFrames(NamedTuple):
 
 
 def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
-    """Choose at most a thousand key frames of a motion (N, k), in tolerances, such that linear
-    interpolation is accurate enough.
+    """Choose at most a thousand key frames such that linear interpolation is accurate enough.
 
-    All but the first and last few equal ``cycles`` are sampled at the same phase: otherwise fast
-    loops would look like slow loops (aliasing).
+    Parameters
+    ----------
+    motion
+        The visible motion (N, k), with each column divided by its tolerance.
+    cycles
+        Its equal cycles. All but the first and last few cycles are sampled at the same phase:
+        otherwise fast loops would look like slow loops (aliasing).
     """
     shown, every = np.arange(len(motion)), 0
     if cycles is not None and cycles.count > 2 * FULL_CYCLES:

@@ -28,11 +28,19 @@ _FLATNESS_STATES = 25
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body in the scene, with a unique name, its solids in the body frame, and a color
-    ``#rrggbb``; empty if each solid has its own.
+    """A rigid body in the scene.
 
-    ``poses`` (K, 7) are in the world at the scene instants, m and quaternion; (1, 7) if the body is
-    at rest.
+    Attributes
+    ----------
+    name
+        Its unique name.
+    visuals
+        Solids of the body, in the body frame.
+    poses
+        World poses (K, 7) of the body at the scene instants, m and quaternion; (1, 7) if it is at
+        rest.
+    color
+        ``#rrggbb``; empty if each solid has its own color.
     """
 
     name: str
@@ -52,11 +60,18 @@ def robot_bodies(
     q: Array,
     most: int,
 ) -> list[Body]:
-    """Return the robot links that have solids, with the colours of the joints that move them, at
-    base poses (K, 7) in the world and joint positions (K, n), m or rad.
+    """Return the robot links that have solids, with the colours of the joints that move them.
 
-    ``meshes`` are the triangles of the robot's meshes by URI, and ``most`` is the largest number
-    of mesh faces.
+    Parameters
+    ----------
+    robot
+        The robot.
+    meshes
+        Triangles of its meshes, by URI.
+    base, q
+        (K, 7) base poses in the world, and (K, n) joint positions, m or rad.
+    most
+        Largest number of mesh faces.
     """
     visuals = visuals_of(robot, meshes, most)
     found = []

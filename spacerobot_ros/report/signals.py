@@ -64,11 +64,19 @@ def thinned(signal: Signal, slices: int) -> Signal:
 
 
 def simplified(motion: Signal, most: int) -> tuple[Indices, float]:
-    """Drop samples of a motion, in tolerances, that lie on lines between other samples
-    (Douglas-Peucker); the samples farthest from such lines are kept first.
+    """Drop samples that lie on lines between other samples (Douglas-Peucker); the samples farthest
+    from such lines are kept first.
 
-    Return the kept samples, at most ``most`` in addition to a few dozen that are always kept, and
-    the largest distance of a dropped sample, in tolerances.
+    Parameters
+    ----------
+    motion
+        The motion, with each column divided by its tolerance.
+    most
+        Largest number of samples to keep, in addition to a few dozen that are always kept.
+
+    Returns
+    -------
+    The kept samples, and the largest distance of a dropped sample, in tolerances.
     """
     bounds = np.unique(np.linspace(0, len(motion) - 1, _INITIAL_STRETCHES + 1).astype(int)).tolist()
     if len(bounds) < 2:
@@ -128,10 +136,16 @@ def continuous(poses: Array) -> Array:
 
 
 def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Array]:
-    """Return the world poses (K, 7) of all links, with the base link first, for base poses (K, 7)
-    in the world and joint positions (K, n), m or rad.
+    """Return the world poses (K, 7) of all links, with the base link first.
 
     Link quaternions are continuous if the base quaternions are.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    base, q
+        (K, 7) base poses in the world, and (K, n) joint positions, m or rad.
     """
     from scipy.spatial.transform import Rotation
 

@@ -33,9 +33,17 @@ plane the first is visible."""
 
 
 class PlacedSolid(NamedTuple):
-    """A solid in the world: triangle corners (F, 3, 3) and their outward normals (F, 3), ends
-    (E, 2, 3) of its sharp edges and normals (E, 2, 3) of the two adjacent faces, and its colour
-    (3,), red, green and blue, 0 to 1.
+    """A solid in the world.
+
+    Attributes
+    ----------
+    corners, normals
+        (F, 3, 3) triangle corners, and outward normals (F, 3).
+    edges, edge_normals
+        (E, 2, 3) ends of sharp edges, and normals (E, 2, 3) of the two adjacent faces; an edge is
+        visible if one of these faces is visible.
+    fill
+        (3,) color: red, green and blue, 0 to 1.
     """
 
     corners: Array
@@ -98,8 +106,17 @@ class View:
 
 
 class Canvas:
-    """Pixels over a rectangle in the image plane of a view, ``low`` to ``high`` (2,) in m;
-    ``width`` is the number of pixels across."""
+    """Pixels over a rectangle in the image plane, ``low`` to ``high`` (2,) in m.
+
+    Parameters
+    ----------
+    view
+        The projection.
+    low, high
+        Corners of the rectangle.
+    width
+        Pixels across.
+    """
 
     def __init__(self, view: View, low: Array, high: Array, width: int) -> None:
         self._view = view

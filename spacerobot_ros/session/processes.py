@@ -463,7 +463,13 @@ class _ServiceTimeoutError(SpaceRobotError):
 
 
 class KillTimeline:
-    """Schedule for killing and restarting nodes; the kills are ordered by time."""
+    """Schedule for killing and restarting nodes.
+
+    Parameters
+    ----------
+    kills
+        Ordered by time.
+    """
 
     def __init__(self, kills: Sequence[Kill]) -> None:
         self._kills, self._time = kills, -math.inf

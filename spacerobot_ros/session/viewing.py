@@ -33,8 +33,14 @@ _NICENESS = 5
 
 
 class Viewer(NodeProcess):
-    """A viewer process, restarted if it dies; its log and its parameters are in ``folder``. For
-    the other arguments, see :func:`viewing`.
+    """A viewer process, restarted if it dies.
+
+    Parameters
+    ----------
+    parameters, show, namespace
+        As for :func:`viewing`.
+    folder
+        Folder for the log and the parameters of the viewer.
     """
 
     def __init__(

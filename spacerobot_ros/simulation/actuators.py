@@ -97,6 +97,13 @@ class ThrusterPlant(WrappedPlant):
         """Advance one tick under joint efforts (n,) and a commanded base wrench (6,).
 
         Returns whether any joint was limited.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the plant does not advance.
+        SpaceRobotError
+            The wrapped plant cannot advance.
         """
         wanted = np.broadcast_to(np.asarray(wrench, dtype=float), (6,))
         for command in (effort, wanted):
@@ -185,12 +192,24 @@ class PlantWithFaults(WrappedPlant):
         self._update_active()
 
     def inject(self, text: str) -> None:
-        """Add faults while the plant runs; see :meth:`.Timeline.inject`."""
+        """Add faults, one per line, while the plant runs; ``clear`` removes all faults.
+
+        Raises
+        ------
+        ParameterError
+            A line is not a valid fault for this robot; none of the lines is added.
+        """
         self.timeline.inject(text, self.time)
         self._update_active()
 
     def disturb(self, text: str) -> None:
-        """Add disturbances while the plant runs; see :meth:`.Timeline.inject`."""
+        """Add disturbances, one per line, while the plant runs; ``clear`` removes them all.
+
+        Raises
+        ------
+        ParameterError
+            A line is not a valid disturbance for this robot; none of the lines is added.
+        """
         self._disturbances.inject(text, self.time)
         self._update_active()
 
@@ -299,8 +318,16 @@ PLANTS: dict[str, type[VelocityPlant | EffortPlant]] = {
 def build_plant(
     robot: SpaceRobot, config: PlantConfig, initial: InitialState | None = None
 ) -> PlantWithFaults:
-    """Build a plant from its configuration, including thrusters and faults; ``initial`` is the
-    initial state, if it differs from the one in the configuration.
+    """Build a plant from its configuration, including thrusters and faults.
+
+    Parameters
+    ----------
+    robot
+        The model.
+    config
+        The plant parameters.
+    initial
+        Initial state, if it differs from the one in the configuration.
 
     Raises
     ------

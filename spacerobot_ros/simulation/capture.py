@@ -85,7 +85,16 @@ def target_parameters(text: str) -> dict[str, Any]:
 class Target:
     """A free rigid body: it moves with constant momenta, or under orbit or table loads.
 
-    Its mass properties ``inertia`` and the pose of its grapple frame are in its root link frame T.
+    Attributes
+    ----------
+    description
+        The body.
+    inertia
+        Mass properties in the root link frame T.
+    grapple
+        Grapple frame pose in T.
+    initial
+        Its initial motion.
     """
 
     def __init__(
@@ -275,9 +284,16 @@ class CapturePlant(WrappedPlant):
         self._update()
 
     def resume(self, state: InitialState, payload: Payload | None, body: BodyMotion) -> None:
-        """Continue from a later state of a flight, in which the target moves like ``body``.
+        """Continue from a later state of a flight.
 
-        The momenta of the robot's state include the held body, the ``payload``, if any.
+        Parameters
+        ----------
+        state
+            Robot state; its momenta include the held body.
+        payload
+            The body that the robot holds; None if the target floats freely.
+        body
+            Target motion.
 
         Raises
         ------

@@ -48,8 +48,16 @@ _OBSTACLE = "obstacle"
 
 @dataclass(frozen=True)
 class ClearanceStatus:
-    """The smallest distance between two links at one simulated time, as published on ``clearance``;
-    m, or, if the links touch, the negative contact depth.
+    """The smallest distance between two links at one time, as published on ``clearance``.
+
+    Attributes
+    ----------
+    distance
+        m; if the links touch, the negative contact depth.
+    links
+        The two links.
+    time_s
+        Simulated time, s.
     """
 
     distance: float
@@ -168,11 +176,16 @@ class ClearanceMonitor:
     def measure(
         self, link_R: Array, link_r: Array, pose: Array, time_s: float
     ) -> tuple[ClearanceStatus, list[Event]]:
-        """Return the clearance at a simulated time, s, and an event for each contact that began or
-        ended.
+        """Return the clearance, and an event for each contact that began or ended.
 
-        The attitudes (3, 3 L) and positions (3, L), m, of the links are in B; ``pose`` (7,) is that
-        of the base in W.
+        Parameters
+        ----------
+        link_R, link_r
+            Attitudes (3, 3 L) and positions (3, L), m, of the links in B.
+        pose
+            (7,) position, m, and quaternion (x, y, z, w) of the base in W.
+        time_s
+            Simulated time, s.
         """
         R = link_R.reshape(1, 3, -1, 3).swapaxes(1, 2)[:, self._order]
         links = R, link_r.reshape(3, -1).T[np.newaxis, self._order]
@@ -250,9 +263,17 @@ class FlightClearance:
         """Return the clearance of a flight; None if the flight has no states, or if no link pair is
         checked.
 
-        ``q`` are times (N,), s, and positions (N, n), m or rad, of the named joints; ``pose`` are
-        times (M,) and base poses (M, 7). If there are obstacles, only their common times are used.
-        See :class:`~spacerobot_ros.collision.geometry.CollisionGeometry` for ``mesh_of``.
+        Parameters
+        ----------
+        robot
+            The robot.
+        joint_names
+            The names of the columns of ``q``.
+        q, pose
+            Times (N,), s, and joint positions (N, n), m or rad; times (M,) and base poses (M, 7).
+            If there are obstacles, only the times common to ``q`` and ``pose`` are used.
+        mesh_of
+            As for :class:`~spacerobot_ros.collision.geometry.CollisionGeometry`.
         """
         (time, shapes), names, base = q, list(joint_names), None
         if robot.world is not None:

@@ -150,6 +150,13 @@ class CommandSource:
 class CommandValidator:
     """Accepts or refuses commands to a plant, counts refusals, and latches faults.
 
+    Parameters
+    ----------
+    plant
+        The commanded plant.
+    config
+        The plant configuration: time mode, timeout, limits, and the reasons that latch a fault.
+
     Raises
     ------
     ParameterError
@@ -213,10 +220,22 @@ class CommandValidator:
     def accept_or_refuse(
         self, source: CommandSource, stamp_ns: int, values: Array | CommandError, now_ns: int
     ) -> Refusal | None:
-        """Accept a command, and return None, or refuse it.
+        """Accept or refuse a command.
 
-        ``values`` are its values, or the error if the message is malformed; ``now_ns`` is the
-        simulated time of the plant's state.
+        Parameters
+        ----------
+        source
+            Its source.
+        stamp_ns
+            Its stamp.
+        values
+            Its values, or the error if the message is malformed.
+        now_ns
+            Simulated time of the plant's state.
+
+        Returns
+        -------
+        Refusal or None The refusal; None if the command was accepted.
         """
         unset = False
         if self._lockstep:
@@ -293,9 +312,16 @@ class CommandValidator:
         """Brake the joints and turn off the thrusters until :meth:`rearm`; the first of several
         faults is reported.
 
-        Commands for states before the fault are refused even after :meth:`rearm`; ``now_ns`` is the
-        simulated time of the plant's state. The reason is as in :attr:`fault_reason`; the clause
-        completes "a fault is latched:".
+        Commands for states before the fault are refused even after :meth:`rearm`.
+
+        Parameters
+        ----------
+        reason
+            The value of a :class:`Reason`, ``abort`` or ``watchdog``.
+        clause
+            The fault as text; it completes "a fault is latched:".
+        now_ns
+            Simulated time of the plant's state.
         """
         if not self.fault:
             self.fault, self.fault_reason = clause, reason

@@ -65,8 +65,15 @@ class JointStops:
     """Advances the state of :mod:`spacerobot_ros.model.composite_rigid_body`, and enforces joint
     stops.
 
-    ``integration_step`` is the longest Runge-Kutta step, s. If external loads act (``loaded``), the
-    state vector ends with the time, and the command vector ends with the loads.
+    Parameters
+    ----------
+    robot
+        The model.
+    integration_step
+        Longest Runge-Kutta step, s.
+    loaded
+        Whether external loads act; if so, the state vector ends with the time, and the command
+        vector ends with the loads.
     """
 
     def __init__(self, robot: SpaceRobot, integration_step: float, *, loaded: bool = False) -> None:
@@ -301,6 +308,13 @@ class EffortPlant(CompiledPlant):
         it rotates with the base during the tick. A joint that reaches its limit stops there without
         rebound and is held while something pushes it outwards. Returns whether any joint was
         limited.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the plant does not advance.
+        SpaceRobotError
+            The motion is no longer finite; the plant does not advance.
         """
         n = self.robot.n
         self._state[:] = self._next_state

@@ -117,9 +117,16 @@ class FaultTargets:
 
 
 def parse_fault(line: str, targets: FaultTargets, now: float = 0.0) -> Fault:
-    """Parse a fault line (see the module docstring) for a plant with these targets.
+    """Parse a fault line.
 
-    A fault without a start time begins at ``now`` (s).
+    Parameters
+    ----------
+    line
+        The line; see the module docstring.
+    targets
+        Targets of this plant.
+    now
+        Start time of the fault if the line specifies none, s.
 
     Raises
     ------
@@ -209,9 +216,16 @@ class Disturbance:
 
 
 def parse_disturbance(line: str, links: Sequence[str], now: float = 0.0) -> Disturbance:
-    """Parse a disturbance line (see the module docstring) for a robot with these links.
+    """Parse a disturbance line.
 
-    A disturbance without a start time begins at ``now`` (s).
+    Parameters
+    ----------
+    line
+        The line; see the module docstring.
+    links
+        Link names of the robot.
+    now
+        Start time of the disturbance if the line specifies none, s.
 
     Raises
     ------
@@ -272,8 +286,16 @@ def parse_times(
 ) -> tuple[float, float]:
     """Return the start and end (s) from the last words of a line, ``[at SECONDS] [until SECONDS]``.
 
-    ``before`` is the preceding part of the line, for messages; ``now`` is the start time (s) if the
-    words specify none.
+    Parameters
+    ----------
+    words
+        The words.
+    before
+        The preceding part of the line, for messages.
+    now
+        Start time if the words specify none, s.
+    refusal
+        Function that returns the error for the line.
 
     Raises
     ------
@@ -326,9 +348,15 @@ Entry = TypeVar("Entry", Fault, Disturbance)
 
 
 class Timeline(Generic[Entry]):
-    """Timed entries of one plant, one per line.
+    """Timed entries of one plant.
 
-    The second argument of ``parse`` is the start time (s) if the line specifies none.
+    Parameters
+    ----------
+    lines
+        One entry per line.
+    parse
+        Function that parses an entry line; the second argument is the start time if the line
+        specifies none, s.
     """
 
     def __init__(self, lines: Iterable[str], parse: Callable[[str, float], Entry]) -> None:
@@ -355,7 +383,10 @@ class Timeline(Generic[Entry]):
         """Add the entries in a string, one per line, or remove all entries (``clear``), including
         future entries.
 
-        Raises ParameterError; see :meth:`read`.
+        Raises
+        ------
+        ParameterError
+            As for :meth:`read`.
         """
         if text.strip() == "clear":
             self.entries.clear()

@@ -21,7 +21,19 @@ _PLANE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Loads from the robot's environment, constant during a flight, as in :class:`.LoadLayout`."""
+    """Loads from the robot's environment, constant during a flight.
+
+    Attributes
+    ----------
+    mean_motion
+        Mean motion of the circular orbit, rad/s; zero if there is no orbit.
+    quaternion_WO
+        (4,) attitude (x, y, z, w) of the orbital frame in W at time zero.
+    gravity_W
+        (3,) uniform acceleration, m/s^2.
+    friction
+        Viscous friction force on a body divided by the body's momentum, 1/s.
+    """
 
     mean_motion: float = 0.0
     quaternion_WO: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
@@ -96,7 +108,14 @@ class Surroundings:
             )
 
     def require_flat(self, name: str, motion: BodyMotion, inertia: Inertia) -> None:
-        """Reject a free body, with mass properties in its frame, that would leave the table plane.
+        """Reject a free body that would leave the table plane.
+
+        Parameters
+        ----------
+        name
+            Name of the body.
+        motion, inertia
+            Its motion, and its mass properties in its frame.
 
         Raises
         ------
@@ -120,16 +139,24 @@ class Surroundings:
 class PlantLoads:
     """The loads on a robot, updated in place; initially there are no wrenches.
 
+    Parameters
+    ----------
+    robot
+        The model.
+    surroundings
+        Constant loads; None: none.
+
     Attributes
     ----------
     vector
         All values, in the order of :class:`.LoadLayout`.
     in_link, in_world
-        Its wrenches (L, 6), in the order of ``robot.link_names``.
+        (L, 6) force (N) and torque (N m) at each link origin, in the order of
+        ``robot.link_names``; one array is in link components, the other in W.
     last
         ``vector`` of the last tick.
     surroundings
-        The constant loads; by default none.
+        The constant loads.
     """
 
     def __init__(self, robot: SpaceRobot, surroundings: Surroundings | None = None) -> None:

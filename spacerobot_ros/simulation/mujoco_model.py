@@ -262,7 +262,17 @@ def _set_options(mujoco: Any, model: Any, step: float) -> None:
 
 
 class MujocoLoads:
-    """External loads on the bodies of links in MuJoCo; see :mod:`.model.external_loads`."""
+    """External loads on robot bodies in MuJoCo; see :mod:`.model.external_loads`.
+
+    Parameters
+    ----------
+    mujoco
+        The module.
+    model, data
+        MuJoCo's model and state.
+    links
+        Link names of the robot.
+    """
 
     def __init__(self, mujoco: Any, model: Any, data: Any, links: Sequence[str]) -> None:
         self._mujoco, self._model, self._data = mujoco, model, data

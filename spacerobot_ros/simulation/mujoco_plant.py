@@ -210,6 +210,13 @@ class MujocoPlant:
         """Advance one tick under joint velocities, or under joint efforts and a base wrench (6,).
 
         Returns whether any joint was limited.
+
+        Raises
+        ------
+        CommandError
+            A command is not finite; the plant does not advance.
+        SpaceRobotError
+            The motion is no longer finite.
         """
         n, robot = self.robot.n, self.robot
         wanted = np.broadcast_to(np.asarray(command, dtype=float), (n,))

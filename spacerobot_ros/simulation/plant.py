@@ -252,7 +252,13 @@ class InitialState:
 
     @classmethod
     def of(cls, config: PlantConfig) -> InitialState:
-        """Return the configured initial state; empty lists select defaults."""
+        """Return the configured initial state; empty lists select defaults.
+
+        Raises
+        ------
+        ParameterError
+            The position is specified twice.
+        """
         return cls(
             position=np.array(config.initial_position or (0.0, 0.0, 0.0)),
             quaternion=np.array(config.initial_orientation or (0.0, 0.0, 0.0, 1.0)),
@@ -278,21 +284,39 @@ class InitialState:
             )
 
     def attitude(self) -> Array:
-        """Return the unit quaternion (x, y, z, w) of the base attitude."""
+        """Return the unit quaternion (x, y, z, w) of the base attitude.
+
+        Raises
+        ------
+        ParameterError
+            The quaternion is zero or not finite.
+        """
         try:
             return unit_quaternion(self.quaternion)
         except ValueError as error:
             raise ParameterError(f"The initial orientation is refused: {error}.") from None
 
     def momenta(self) -> Array:
-        """Return linear and angular momentum (6,)."""
+        """Return linear and angular momentum (6,).
+
+        Raises
+        ------
+        ParameterError
+            A momentum is not finite.
+        """
         momenta = np.concatenate([self.linear_momentum, self.angular_momentum])
         if not np.all(np.isfinite(momenta)):
             raise ParameterError("The initial momenta must be finite.")
         return momenta
 
     def shape(self, robot: SpaceRobot) -> Array:
-        """Return the joint positions (n,)."""
+        """Return the joint positions (n,).
+
+        Raises
+        ------
+        ParameterError
+            The number of joints is wrong, or a position violates its limits.
+        """
         if self.joint_positions is None:
             return np.clip(np.zeros(robot.n), robot.lower, robot.upper)
         q = _require_joint_values(robot, self.joint_positions, "positions")
@@ -307,13 +331,25 @@ class InitialState:
         return q
 
     def rates(self, robot: SpaceRobot) -> Array:
-        """Return the joint velocities (n,)."""
+        """Return the joint velocities (n,).
+
+        Raises
+        ------
+        ParameterError
+            The number of joints is wrong, or a velocity is not finite.
+        """
         if self.joint_velocities is None:
             return np.zeros(robot.n)
         return _require_joint_values(robot, self.joint_velocities, "velocities")
 
     def system_position(self, robot: SpaceRobot) -> Array:
-        """Return the position of the system's centre of mass in W (3,), m."""
+        """Return the position of the system's centre of mass in W (3,), m.
+
+        Raises
+        ------
+        ParameterError
+            The position is not finite, or the configuration or the orientation is invalid.
+        """
         if self.center_of_mass is not None:
             r_WC_W = np.asarray(self.center_of_mass, dtype=float)
         else:

@@ -226,6 +226,13 @@ class TargetSensors:
 class ReportedState:
     """A plant's measured and true state, as published on its topics.
 
+    Parameters
+    ----------
+    plant
+        The plant.
+    config
+        The plant configuration: sensors and end-effector.
+
     Attributes
     ----------
     sensors

@@ -153,7 +153,13 @@ _FORMAT = KeyValueFormat(
 class PlantMonitor:
     """Derives the status of a plant, and the events between successive statuses.
 
-    In lockstep, the plant waits for commands and is therefore never ``resting``.
+    Parameters
+    ----------
+    commands, plant
+        The plant and its command validator.
+    config
+        Configuration of the plant. In lockstep, the plant waits for commands and is therefore never
+        ``resting``.
     """
 
     def __init__(
@@ -177,9 +183,19 @@ class PlantMonitor:
         self._commands, self._plant, self._config = commands, plant, config
 
     def update(self, activity: PlantState, time_s: float) -> list[Event]:
-        """Update the status at a simulated time (s), and return the events since the last update.
+        """Update the status.
 
-        The plant's ``activity`` is inactive, running, paused or failed.
+        Parameters
+        ----------
+        activity
+            Plant activity: inactive, running, paused or failed.
+        time_s
+            Simulated time, s.
+
+        Returns
+        -------
+        list[Event]
+            Events since the last update; empty if the status is unchanged.
         """
         before, commands, capturing = self.status, self._commands, self._plant.capturing
         captures, payload = [], ""

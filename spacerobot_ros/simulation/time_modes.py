@@ -15,8 +15,14 @@ class RealTime:
     """Schedules ticks by the wall clock, and counts late ticks and commands.
 
     A tick is late if it is taken after the next one is due. A command is late if it arrives after
-    the due time of the tick that follows its state. ``period_ns`` is the simulated duration of a
-    tick, ns, and ``factor`` simulated over wall time.
+    the due time of the tick that follows its state.
+
+    Parameters
+    ----------
+    period_ns
+        Simulated duration of a tick, ns.
+    factor
+        Simulated over wall time.
     """
 
     def __init__(self, period_ns: int, factor: float = 1.0) -> None:

@@ -93,8 +93,14 @@ class GoalEditor:
     controller goal is for the base and for the controller's end-effector: the end-effector gizmo
     follows the base gizmo, and can be moved separately.
 
-    The number fields are added to the current GUI container of the ``server``; ``defer`` queues
-    user changes, and ``on_note`` is called with the reason if an input is rejected.
+    Parameters
+    ----------
+    server
+        Page server; the number fields are added to the current GUI container.
+    defer
+        Queues user changes.
+    on_note
+        Function called with the reason if an input is rejected.
     """
 
     def __init__(
@@ -193,8 +199,16 @@ class GoalEditor:
         self._origin = Origin.ROBOT
 
     def follow(self, goals: Mapping[Part, Goal], now: float) -> None:
-        """Show the last goals sent by any client, by robot part, once per goal; ``now`` is the wall
-        time, s. A goal that a user is editing is kept."""
+        """Show the last goals sent by any client, once per goal. A goal that a user is editing is
+        kept.
+
+        Parameters
+        ----------
+        goals
+            Goals by robot part.
+        now
+            Wall time, s.
+        """
         before = self._followed
         links = {aim.link: aim for goal in goals.values() for aim in goal.end_effectors}
         same = goals.keys() == before.keys() and all(goals[x].equals(before[x]) for x in goals)

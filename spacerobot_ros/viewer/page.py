@@ -144,7 +144,13 @@ class TimeLine:
 
 
 class LookBack:
-    """Slider for looking back over a flight, and a button to return to the current state."""
+    """Slider for looking back over a flight, and a button to return to the current state.
+
+    Attributes
+    ----------
+    time_s
+        Simulated time shown to the user, s; None: the present.
+    """
 
     def __init__(self, gui: viser.GuiApi, defer: Defer) -> None:
         self.time_s: float | None = None
@@ -549,8 +555,20 @@ def view_beside_panel(at: Array, away: Array, aspect: float) -> tuple[Array, Arr
 
 
 class Page:
-    """The page, which shows the same content in all browsers, with its goal ``editor`` and its menu
-    of ``faults``."""
+    """The page, which shows the same content in all browsers.
+
+    Parameters
+    ----------
+    server
+        Server of the page.
+    config
+        Its parameters.
+
+    Attributes
+    ----------
+    editor, faults
+        The goal editor and the fault menu.
+    """
 
     def __init__(self, server: viser.ViserServer, config: ViewerConfig) -> None:
         self._server, self._config = server, config

@@ -74,12 +74,19 @@ class Verdict(Enum):
 
 @dataclass(frozen=True, eq=False)
 class GoalCheck:
-    """Result of a goal check: a verdict, and a message for the user, including the reason if the
-    goal is rejected.
+    """Result of a goal check.
 
-    ``shape`` and ``base`` are the predicted joint positions (n,), m or rad, and base pose (7,) at
-    the end; None if there is no prediction. ``source`` is the planned motion on which the result is
-    based, if this motion is already being executed.
+    Attributes
+    ----------
+    verdict
+        The verdict.
+    message
+        Message for the user, including the reason if the goal is rejected.
+    shape, base
+        Predicted (n,) joint positions, m or rad, and (7,) base pose at the end; None if
+        there is no prediction.
+    source
+        The planned motion on which the result is based, if this motion is already being executed.
     """
 
     verdict: Verdict
@@ -91,12 +98,21 @@ class GoalCheck:
 
 @dataclass(frozen=True)
 class GoalQuestion:
-    """A goal to check for the base of a robot, its links, or both, and the data on which the check
-    is based, with planner parameters as JSON strings by name.
+    """A goal to check, and the data on which the check is based.
 
-    ``tool`` is the goal of a ``link`` for a controller; None: a planner flies. A controller does
-    not plan, so the check is whether the arm can reach this goal. ``axes`` are the link axes that
-    the controller controls; errors along other axes are ignored.
+    Attributes
+    ----------
+    urdf
+        Description of the robot.
+    parameters
+        Planner parameters, as JSON strings by name.
+    state, goal
+        Start state of the robot, and the goal for its base, its links, or both.
+    tool, link
+        Link goal for a controller. A controller does not plan, so the check is whether the arm can
+        reach this goal. None: a planner flies.
+    axes
+        Link axes that the controller controls; errors along other axes are ignored.
     """
 
     urdf: str
@@ -114,10 +130,16 @@ def make_question(
     robot: RobotDescription | None,
     parameters: Mapping[str, Mapping[str, str]],
 ) -> GoalQuestion | str:
-    """Return a reachability question for goals by robot part, or the reason why no question is
-    possible.
+    """Return a reachability question for goals, or the reason why no question is possible.
 
-    ``parameters`` are those of ``planner`` and ``controller``, as JSON strings by name, if known.
+    Parameters
+    ----------
+    state, goals
+        The state of the stack, and the goals by robot part.
+    robot
+        The robot; None: unknown.
+    parameters
+        Parameters of ``planner`` and ``controller``, as JSON strings by name, if known.
     """
     measured = state.measured
     if measured is None or robot is None:

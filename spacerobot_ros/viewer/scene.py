@@ -65,10 +65,20 @@ def xyzw(quaternion: Array) -> Array:
 
 
 class RobotDrawing:
-    """A robot drawn in a scene, with its base at a node path: the robot itself, or the ghost at its
-    goal, all of whose parts have a ``color``; None: the URDF colors.
+    """A drawn robot: the robot itself, or the ghost at its goal.
 
-    ``on_note`` is called with a message about each mesh that cannot be drawn.
+    Parameters
+    ----------
+    scene
+        Scene to draw in.
+    path
+        Node path of the base of the robot.
+    robot
+        The robot.
+    color
+        Color of all parts; None: the URDF colors.
+    on_note
+        Function called with a message about each mesh that cannot be drawn.
     """
 
     def __init__(
@@ -196,7 +206,15 @@ def reach_of(robot: RobotDescription) -> float:
 
 
 class Lines:
-    """Connected points in the scene, such as a path, at a node path."""
+    """Connected points in the scene, such as a path.
+
+    Parameters
+    ----------
+    scene, path
+        Scene to draw in, and node path.
+    color
+        Color of the line.
+    """
 
     def __init__(self, scene: viser.SceneApi, path: str, color: Color) -> None:
         empty = np.zeros((1, 2, 3), np.float32)
@@ -225,8 +243,14 @@ class Lines:
 def plume_lines(table: ThrusterTable, names: tuple[str, ...], duty: Array, length: float) -> Array:
     """Return active thruster plumes as segments (k, 2, 3) in the base frame, m.
 
-    ``duty`` is the fraction of time each thruster is on, 0 to 1, and ``length`` the length of a
-    plume, m, at a duty cycle of 1.
+    Parameters
+    ----------
+    table
+        The robot's thrusters.
+    names, duty
+        Thruster names, and the fraction of time each thruster is on, 0 to 1.
+    length
+        Plume length, m, at a duty cycle of 1.
     """
     segments = []
     for name, part in zip(names, duty, strict=True):
@@ -242,8 +266,19 @@ BACKDROPS = ("Space", "Grid")
 
 
 class Surroundings:
-    """Sky or grid around a ``center`` (3,), m, for a robot of size ``reach``, m (see
-    :func:`reach_of`); paths; and plumes, attached to the node path of the robot's base."""
+    """Sky or grid, paths and plumes.
+
+    Parameters
+    ----------
+    scene
+        Scene to draw in.
+    reach
+        Robot size, m; see :func:`reach_of`.
+    robot_path
+        Node path of the robot's base, to which the plumes are attached.
+    center
+        (3,) point above the grid, m.
+    """
 
     def __init__(self, scene: viser.SceneApi, reach: float, robot_path: str, center: Array) -> None:
         cell = 10.0 ** np.floor(np.log10(reach)) / 2

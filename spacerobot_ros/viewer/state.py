@@ -51,8 +51,15 @@ class Measured:
 
 @dataclass(frozen=True)
 class Momenta:
-    """Total momenta (6,) in the world, linear (kg m/s), then angular (kg m^2/s): summed over the
-    bodies, and expected from thrust and other external forces; None: they are constant."""
+    """Total momenta in the world: linear (kg m/s), then angular (kg m^2/s).
+
+    Attributes
+    ----------
+    actual
+        (6,) summed over the bodies.
+    expected
+        (6,) momenta expected from thrust and other external forces; None: they are constant.
+    """
 
     actual: Array
     expected: Array | None

@@ -58,7 +58,12 @@ class ModelBasedLaw(ControlLaw):
       along v follows the joints of that motion instead, with critical damping.
 
     Eq. (28) then holds for the other directions only, and :attr:`status` reports it.
-    ``posture_stiffness`` acts if the reference includes joints.
+
+    Parameters
+    ----------
+    robot, outputs, gains, options
+        See :class:`ControlLaw`; Kp in 1/s^2, Kd in 1/s. ``posture_stiffness`` acts if the reference
+        includes joints.
     """
 
     name: ClassVar[str] = "model_based"

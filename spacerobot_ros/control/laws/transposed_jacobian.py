@@ -36,8 +36,13 @@ class TransposedJacobianLaw(ControlLaw):
     feedforward (:meth:`.ControlLaw.automatic_effort`).
 
     If there are fewer outputs than degrees of freedom, eq. (29) does not act on the remaining
-    motion: arms continue to swing. ``joint_damping`` subtracts ``joint_damping * qdot`` from the
-    joint efforts.
+    motion: arms continue to swing.
+    ``joint_damping`` subtracts ``joint_damping * qdot`` from the joint efforts.
+
+    Parameters
+    ----------
+    robot, outputs, gains, options
+        See :class:`ControlLaw`; Kp in N/m (N m/rad), Kd in N s/m (N m s/rad).
     """
 
     name: ClassVar[str] = "transposed_jacobian"

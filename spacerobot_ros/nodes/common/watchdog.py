@@ -86,8 +86,12 @@ class Watchdog:
     A node is monitored from its first heartbeat until it reports that it is inactive. While a
     node is busy, no heartbeat is expected. If this node itself was suspended, all timeouts restart.
 
-    A node is silent after ``timeout``, a wall time in s, without a heartbeat; ``clock`` returns the
-    wall time, s.
+    Parameters
+    ----------
+    timeout
+        Wall time, s, without a heartbeat after which a node is considered silent.
+    clock
+        Function that returns the wall time, s.
     """
 
     def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic) -> None:
