@@ -229,9 +229,19 @@ def plan_approach(
     If the target body blocks the way, the end-effector takes a path that is short in W, to the
     standoff or to a standoff at two or three times the distance, or starts later.
 
-    ``held`` is the end-effector reference before the approach; if it moves, the approach starts
-    immediately. The limits are those of the reference in W. If the target body is unknown,
-    ``clearance`` is None.
+    Parameters
+    ----------
+    target
+        The target's motion.
+    held
+        The end-effector reference before the approach; if it moves, the approach starts
+        immediately.
+    options, limits
+        The standoff, and reference limits in W.
+    reach
+        The arm.
+    clearance
+        Distances from the target body; None if the body is unknown.
 
     Raises
     ------
