@@ -295,13 +295,17 @@ def tool(words: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[byte
     FileNotFoundError
         There is no such program.
     """
+    before, options = termination(), {"stdin": subprocess.DEVNULL, **options}
+    # An exception while the program starts would leave it running.
     with (
-        _on_first_signal(None),
-        subprocess.Popen(
-            words, stdin=subprocess.DEVNULL, start_new_session=True, **options
-        ) as process,
+        _on_first_signal(lambda: None) as guard,
+        subprocess.Popen(words, start_new_session=True, **options) as process,
     ):
         try:
+            if guard is not None:
+                guard.on_request = None
+                if guard.ending is not None and guard.ending is not before:
+                    raise guard.ending
             yield process
         finally:
             if process.poll() is None:

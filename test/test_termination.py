@@ -224,12 +224,12 @@ time.sleep(600)
     assert end_child(child, {signal.SIGINT: 0.3, signal.SIGTERM: 0.3}) == code
 
 
-TOOL = ["sh", "-c", "echo ready; sleep 600 & sleep 600"]
-
-
-def test_a_tool_and_what_it_starts_end_with_the_process() -> None:
+@pytest.mark.parametrize("first", ["", "kill -TERM $PPID; "])
+def test_a_tool_and_what_it_starts_end_with_the_process(first: str) -> None:
+    """Also if the signal comes while the tool starts."""
+    command = f"echo ready; {first}sleep 600 & sleep 600"
     text = f"""
-with guarded(), graceful_shutdown(), tool({TOOL!r}) as process:
+with guarded(), graceful_shutdown(), tool(["sh", "-c", {command!r}]) as process:
     process.wait()
 """
     with script(text) as process:
