@@ -161,7 +161,7 @@ class Parameter:
     def _check_numbers(self, value: Any) -> tuple[float, ...] | tuple[str, ...]:
         named = _named_entries(value) if self.by_name else None
         if named is not None:
-            numbers = replace(self, by_name=False)._check_numbers(named.values())
+            numbers = replace(self, by_name=False)._check_numbers(list(named.values()))
             return tuple(f"{name}:{x!r}" for name, x in zip(named, numbers, strict=True))
         try:
             numbers = tuple(float(x) for x in value)

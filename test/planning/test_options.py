@@ -209,7 +209,8 @@ OUT_OF_RANGE = r"finite numbers from 0 to 1e\+09"
     [
         ("joint_margin", "text", OF_BOTH_FORMS),
         *[("joint_margin", ["a:1", x], OF_BOTH_FORMS) for x in ("2", 2.0, "a:2")],
-        *[("joint_margin", x, "a list of numbers") for x in ({"a": "x"}, {"a": [1]}, ["a:x"])],
+        *[("joint_margin", x, r"is \['x'\]; it must be a list") for x in ({"a": "x"}, ["a:x"])],
+        ("joint_margin", {"a": [1]}, "a list of numbers"),
         *[("max_acceleration", {"a": x}, OUT_OF_RANGE) for x in (-1.0, 1e10, float("nan"))],
         # Without names of joints numbers alone will do.
         ("keep_out", {"a": 1.0}, r"it must be a list of numbers \(m or rad\)\.$"),
