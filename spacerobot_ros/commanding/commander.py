@@ -27,6 +27,7 @@ from spacerobot_ros.commanding.plant_state import (
     Pairing,
     PlantChange,
     PlantListener,
+    PlantRested,
     PlantStopped,
     Stamped,
     StampFilter,
@@ -188,7 +189,7 @@ class Commander(ABC):
     def drop_robot(self, why: str) -> None:
         """Discard the goals and the robot; later goals wait for another robot."""
         if self.executive is not None:
-            self.give_up_goals(PlantStopped(why))
+            self.give_up_goals(why)
             self._reset_executive()
         self.robot = self.executive = self._decoder = self._described = None
         self._robot_refusal = ""
@@ -549,9 +550,11 @@ class Commander(ABC):
         """React to a status from the named plant."""
         for change in self.plant.update(status, name):
             if isinstance(change, PlantStopped):
-                self.give_up_goals(change)
-                continue
-            if change is PlantChange.RESET:
+                self.give_up_goals(change.reason)
+            elif isinstance(change, PlantRested):
+                if self.executive is not None:
+                    self.executive.plant_rested(change.commanded_until_ns, change.since_ns)
+            elif change is PlantChange.RESET:
                 self.states.forget_pose()
                 self._contradicted_ns = _NEVER_NS
                 if self.executive is not None:
@@ -599,17 +602,14 @@ class Commander(ABC):
                 self.host.log("error", f"plant/status: {error}")
         return robot
 
-    def give_up_goals(self, stopped: PlantStopped) -> None:
+    def give_up_goals(self, why: str) -> None:
         """Abort the goals, because the plant ignores commands or is silent."""
-        if stopped.commanded_until_ns is None:
-            self._goal_file.delete()
+        self._goal_file.delete()
         if self.executive is not None:
-            self.executive.plant_stopped(
-                stopped.reason, stopped.commanded_until_ns, stopped.rests_since_ns
-            )
+            self.executive.plant_stopped(why)
             self._forward_outputs()
-        elif self._waiting_goals and stopped.commanded_until_ns is None:
-            self._abort_waiting(f"Aborted by the plant: {stopped.reason}")
+        elif self._waiting_goals:
+            self._abort_waiting(f"Aborted by the plant: {why}")
 
     # -- differences --------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from statistics import fmean, median
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
@@ -329,16 +329,25 @@ class PlantStopped:
     ----------
     reason
         Message of the plant.
-    commanded_until_ns
-        If the plant is at rest because no command arrived: stamp of the last command; None: the
-        plant ignores all commands.
-    rests_since_ns
-        Time at which the plant came to rest, if known.
     """
 
     reason: str
-    commanded_until_ns: int | None = None
-    rests_since_ns: int = 0
+
+
+@dataclass(frozen=True)
+class PlantRested:
+    """The plant brought its joints to rest, because no command arrived in time.
+
+    Parameters
+    ----------
+    commanded_until_ns
+        Stamp of the last command, ns.
+    since_ns
+        Time at which the plant came to rest, ns; if unknown, that of the last command.
+    """
+
+    commanded_until_ns: int
+    since_ns: int
 
 
 class PlantChange(Enum):
@@ -348,6 +357,9 @@ class PlantChange(Enum):
     """Commands are accepted again."""
     RESET = "reset"
     """The robot is back in its initial state."""
+
+
+PlantReport: TypeAlias = PlantStopped | PlantRested | PlantChange
 
 
 class PlantListener:
@@ -383,14 +395,14 @@ class PlantListener:
         """Whether the plant is paused."""
         return self.status.state is PlantState.PAUSED
 
-    def update(self, status: PlantStatus, name: str = "plant") -> list[PlantStopped | PlantChange]:
+    def update(self, status: PlantStatus, name: str = "plant") -> list[PlantReport]:
         """Process the next status of the named plant; return the changes to react to.
 
         Statuses may be missed; the plant's counters reveal the changes in between.
         """
         before, heard, was_blocked = self.status, self._heard, bool(self.refusal_of_goals)
         self.status, self._name, self._heard = status, name, True
-        changes: list[PlantStopped | PlantChange] = []
+        changes: list[PlantReport] = []
         if self.refusal_of_goals:
             if not was_blocked or status.latched_fault != before.latched_fault:
                 fault = status.latched_fault
@@ -406,12 +418,12 @@ class PlantListener:
         if status.timeouts > before.timeouts or (
             status.reason == "timeout" and before.reason != "timeout"
         ):
-            since, why = status.time_s, status.message
+            since = status.time_s
             last = since if status.last_command_s is None else status.last_command_s
             if status.reason != "timeout":
-                since, why = last, "The joints were brought to rest: no command arrived in time."
+                since = last
             if math.isfinite(last) and math.isfinite(since):
-                changes.append(PlantStopped(why, round(last * SECOND), round(since * SECOND)))
+                changes.append(PlantRested(round(last * SECOND), round(since * SECOND)))
         if status.resets > before.resets:
             changes.append(PlantChange.RESET)
         if was_blocked or status.rearms > before.rearms:

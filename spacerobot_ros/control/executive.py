@@ -242,21 +242,29 @@ class ControlExecutive:
         self._next = _Next.ABORT
         return "The robot holds its pose."
 
-    def plant_stopped(
-        self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
-    ) -> bool:
+    def plant_stopped(self, why: str) -> None:
         """Abort all goals immediately, because the plant ignores commands from now on."""
-        if commanded_until_ns is not None:
-            began_ns = round(self._watch.monitor.started * SECOND)
-            if not self._pursues or commanded_until_ns < began_ns:
-                return False
-        elif not (self._pursues or self._pending):
-            return False
-        self._give_up(f"Aborted by the plant: {why}")
-        # Reported immediately, as the next measured state may be late; so is an earlier abort.
-        self._next = _Next.HOLD
-        self._report_abort()
-        return True
+        if self._pursues or self._pending:
+            self._give_up(f"Aborted by the plant: {why}")
+            # Reported immediately, as the next measured state may be late; so is an earlier abort.
+            self._next = _Next.HOLD
+            self._report_abort()
+
+    def plant_rested(self, commanded_until_ns: int, since_ns: int) -> None:
+        """Restart the motion to the goal at the next measured state, because the plant brought the
+        joints to rest after the command of ``commanded_until_ns``; later motions continue."""
+        began_ns = round(self._watch.monitor.started * SECOND)
+        if not self._pursues or commanded_until_ns < began_ns:
+            return
+        if self.servicing.task is None:
+            self._plan_next(_Next.BEGIN_ANEW)
+        else:
+            self.servicing.restart()
+        message = (
+            "The joints were brought to rest, because no command arrived in time: the motion "
+            "starts again."
+        )
+        self._publish(ControllerState.TRACKING, message, self._goal_id)
 
     def take_contacts(self, contacts: tuple[str, ...], time: float) -> None:
         """Set the links in contact from a given time (s) on; a new contact during the motion

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import time
 from collections.abc import Callable
 from importlib import import_module
@@ -102,6 +103,25 @@ def test_a_node_that_is_killed_and_started_again_flies_on(
     apart.wait_state("plant", "running")
     apart.end()
     assert not any("Traceback" in line for line in apart.complaints), apart.said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("commander", ROBOTS)
+def test_a_goal_is_reached_although_its_commander_is_suspended(
+    apart: NodesApart, commander: str
+) -> None:
+    begin(apart, commander)
+    goal = apart.send(FAR[commander])
+    apart.wait_state(commander, "executing", "tracking")
+    apart.wait_states(20)
+    process = apart.running[commander]
+    process.signal(signal.SIGSTOP)
+    assert apart.wait_state("plant", "resting")["reason"] == "timeout"
+    process.signal(signal.SIGCONT)
+    assert apart.decision(commander, goal)[0] == "reached"
+    apart.end()
+    (message,) = [text for _, text in apart.told(commander, goal) if "brought to rest" in text]
+    assert_one_sentence(message, "no command arrived in time")
 
 
 @pytest.mark.slow

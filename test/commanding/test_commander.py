@@ -16,7 +16,6 @@ from spacerobot_ros.commanding.controller import JOINT_REFERENCE, ControllerComm
 from spacerobot_ros.commanding.fly_to import FlyTo
 from spacerobot_ros.commanding.host import ArrayDecoder, CommanderActivity, StateArrays
 from spacerobot_ros.commanding.planner import PlannerCommander, TrajectoryOutput
-from spacerobot_ros.commanding.plant_state import PlantStopped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goals import END_EFFECTOR
 from spacerobot_ros.control.servicing import Task
@@ -360,7 +359,7 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
     rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
     rig.commander.activate()
     assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("waiting", "9.000000000")
-    rig.commander.give_up_goals(PlantStopped("Node '/plant' is silent."))
+    rig.commander.give_up_goals("Node '/plant' is silent.")
     assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
     assert not path.exists()
 

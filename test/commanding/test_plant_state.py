@@ -11,6 +11,7 @@ from spacerobot_ros.commanding.plant_state import (
     Pairing,
     PlantChange,
     PlantListener,
+    PlantRested,
     PlantStopped,
     Stamped,
     StampFilter,
@@ -454,19 +455,15 @@ def test_a_plant_that_fails_stops_commanders() -> None:
     assert one.update(RUNNING) == [PlantChange.OBEYS]
 
 
-def test_a_plant_that_rests_stops_what_was_commanded_before() -> None:
-    assert listener(RUNNING).update(RESTING) == [
-        PlantStopped("It is too old.", 1_500_000_000, 2_000_000_000)
-    ]
+def test_a_plant_that_rests_tells_until_when_it_was_commanded() -> None:
+    assert listener(RUNNING).update(RESTING) == [PlantRested(1_500_000_000, 2_000_000_000)]
     assert listener(RUNNING, RESTING).update(replace(RUNNING, timeouts=1)) == []
     # Missed: it runs again.
-    (stopped,) = listener(RUNNING).update(replace(RUNNING, timeouts=1, last_command_s=1.5))
-    assert isinstance(stopped, PlantStopped)
-    assert stopped.commanded_until_ns == 1_500_000_000
-    assert_one_sentence(stopped.reason, "rest")
+    again = replace(RUNNING, timeouts=1, last_command_s=1.5)
+    assert listener(RUNNING).update(again) == [PlantRested(1_500_000_000, 1_500_000_000)]
     # A plant without counters says when it came to rest.
     plain = PlantStatus(PlantState.RESTING, "It rests.", "timeout", time_s=2.0)
-    assert listener(RUNNING).update(plain) == [PlantStopped("It rests.", 2 * 10**9, 2 * 10**9)]
+    assert listener(RUNNING).update(plain) == [PlantRested(2 * 10**9, 2 * 10**9)]
     assert listener(RUNNING).update(replace(plain, reason="no_command")) == []
     assert listener(RUNNING).update(replace(plain, time_s=float("nan"))) == []
 

@@ -577,7 +577,7 @@ def test_a_plant_that_stops_ends_the_goal_at_once_and_once(file: Path) -> None:
     loop.aim(base=goal_at([1.0, 0.0, 0.0], "there"))
     loop.answer(3)
     assert file.exists()
-    assert loop.executive.plant_stopped("The plant is latched.")
+    loop.executive.plant_stopped("The plant is latched.")
     assert (loop.state, loop.status.goal_id) == ("aborted", "there")
     assert loop.status.message == "Aborted by the plant: The plant is latched."
     assert not file.exists()
@@ -586,11 +586,11 @@ def test_a_plant_that_stops_ends_the_goal_at_once_and_once(file: Path) -> None:
     np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
     loop.answer(5)
     assert loop.status.message == "Aborted by the plant: The plant is latched."
-    assert not loop.executive.plant_stopped("The plant is latched.")
+    loop.executive.plant_stopped("The plant is latched.")
     assert kinds(loop) == [("goal_accepted", "there"), ("goal_aborted", "there")]
     # A goal that waits for its first state is given up as well.
     loop.aim(base=goal_at([2.0, 0.0, 0.0], "beyond"))
-    assert loop.executive.plant_stopped("The plant has failed.")
+    loop.executive.plant_stopped("The plant has failed.")
     assert loop.status.goal_id == "beyond"
     wrench, _ = loop.answer()
     np.testing.assert_allclose(wrench, 0.0, atol=1e-12)
@@ -601,18 +601,29 @@ def test_a_plant_that_stops_before_an_abort_is_answered_decides_the_goal_once() 
     loop.aim(base=goal_at([1.0, 0.0, 0.0], "there"))
     loop.answer(3)
     loop.executive.abort()
-    assert loop.executive.plant_stopped("The plant is latched.")
+    loop.executive.plant_stopped("The plant is latched.")
     loop.answer(3)
     assert kinds(loop) == [("goal_accepted", "there"), ("goal_aborted", "there")]
 
 
-def test_a_plant_that_rested_before_a_goal_ends_only_older_ones() -> None:
-    loop = ExecutiveLoop()
+def test_a_motion_starts_again_if_the_plant_rested_during_it() -> None:
+    loop = ExecutiveLoop(profile="quintic")
     loop.answer(3)
     loop.aim(base=goal_at([1.0, 0.0, 0.0], "there"))
     loop.answer(3)
-    assert not loop.executive.plant_stopped("It is too old.", 30_000_000)
-    assert loop.executive.plant_stopped("It is too old.", 40_000_000)
+    before = loop.status
+    loop.executive.plant_rested(30_000_000, 10**12)
+    assert loop.status is before
+    loop.executive.plant_rested(40_000_000, 10**12)
+    assert (loop.state, loop.status.goal_id) == ("tracking", "there")
+    assert_one_sentence(loop.status.message, "no command arrived in time", "starts again")
+    # The reference leads from where the robot is now: it is not pulled back.
+    loop.place = np.array([0.0, 0.4, 0.0])
+    wrench, _ = loop.answer()
+    np.testing.assert_allclose(wrench[:3], 0.0, atol=1e-3)
+    loop.place = np.array([0.0, 0.8, 0.0])
+    assert loop.answer()[0][1] < -1.0
+    assert kinds(loop) == [("goal_accepted", "there")]
 
 
 def test_a_held_pose_is_not_flown_back_to_after_a_latch() -> None:
@@ -620,7 +631,7 @@ def test_a_held_pose_is_not_flown_back_to_after_a_latch() -> None:
     loop.aim(base=goal_at([0.0, 0.0, 0.0], "here"))
     loop.answer(5)
     assert loop.state == "reached"
-    assert not loop.executive.plant_stopped("The plant is latched.")
+    loop.executive.plant_stopped("The plant is latched.")
     loop.place = np.array([0.4, 0.0, 0.0])
     loop.executive.on_plant_obeying()
     wrench, _ = loop.answer()

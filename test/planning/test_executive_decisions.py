@@ -42,6 +42,7 @@ from support.planner_phases import (
     stuck,
     until,
 )
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.events import EventKind
@@ -193,7 +194,7 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     loop = start()
     loop.goal_file = GoalFile(str(tmp_path / "goal.json"))
     loop.goal_file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(goal_at(NEAR), "goal-1")}))
-    assert loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
+    loop.executive.plant_stopped("The plant is latched: a fuse is blown.")
     loop.tick()
     status = loop.statuses[-1]
     assert (status.state, status.goal_id) == (PlannerState.ABORTED, "goal-1")
@@ -204,7 +205,9 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
     loop.tick(60)
     assert not any(loop.speeds[-60:])
     assert loop.statuses[-1] is status
-    assert not loop.executive.plant_stopped("The plant is latched still.")
+    loop.executive.plant_stopped("The plant is latched still.")
+    loop.tick()
+    assert loop.statuses[-1] is status
     status = loop.decide(OTHER)
     assert (status.state, status.goal_id) == (PlannerState.REACHED, "goal-2")
 
@@ -212,37 +215,59 @@ def test_a_plant_that_stops_ends_the_goal_with_its_reason(
 def test_braking_for_an_aborted_goal_ends_where_the_plant_stops() -> None:
     loop = braking()
     before = len(loop.statuses)
-    assert not loop.executive.plant_stopped("The plant is latched.")
+    loop.executive.plant_stopped("The plant is latched.")
     loop.tick(20)
     assert not any(loop.speeds[-20:])
     assert len(loop.statuses) == before
 
 
-def test_a_plant_that_rested_before_the_goal_was_commanded_ends_nothing() -> None:
+def test_a_motion_is_replanned_if_the_plant_rested_during_it() -> None:
     """While a plan is made at once no command comes, and a plant in real time rests."""
     loop = resting(ticks=40)
     loop.tick(10)
     loop.propose_goal(NEAR)
     loop.tick()
     (start,) = loop.starts
-    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 10**12)
-    assert not loop.executive.plant_stopped("Too late.", start.stamp_ns - TICK_NS, 0)
-    assert loop.executive.plant_stopped("Too late.", start.stamp_ns, 10**12)
-    # A goal that nothing was commanded for is not touched.
+    loop.executive.plant_rested(start.stamp_ns - TICK_NS, 10**12)
+    loop.executive.plant_rested(start.stamp_ns - TICK_NS, 0)
+    loop.tick(10)
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL]
+    loop.executive.plant_rested(loop.measured.stamp_ns, 10**12)
+    # A motion from rest to what is left, which is no correction.
+    reached = loop.until(PlannerState.REACHED)
+    assert (reached.goal_id, reached.corrections) == ("goal-1", 0)
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.REPLAN]
+    (notice,) = [each for each in loop.statuses if "brought to rest" in each.message]
+    assert_one_sentence(notice.message, "no command arrived in time", "replanned")
+    # A goal that nothing was commanded for, or that is decided, is not touched.
+    loop.executive.plant_rested(loop.measured.stamp_ns, 10**12)
+    assert loop.statuses[-1] is reached
     loop.propose_goal(OTHER)
-    assert not loop.executive.plant_stopped("Too late.", loop.measured.stamp_ns, 10**12)
+    loop.executive.plant_rested(loop.measured.stamp_ns, 10**12)
     assert loop.executive.phase is Phase.MEASURING
 
 
-@pytest.mark.parametrize(("rests_after", "aborted"), [(0, True), (500_000_000, False)])
-def test_a_plant_that_rested_before_joints_were_taken_for_stuck_tells_why(
-    rests_after: int, aborted: bool
-) -> None:
+def test_a_plan_in_the_background_outlives_a_plant_that_rests() -> None:
+    """A search that keeps commands late must not be begun again and again."""
+    loop = executing(held=True, ticks=40)
+    loop.tick(5)
+    loop.propose_goal(OTHER)
+    until(loop, Phase.PLANNING).tick(5)
+    loop.executive.plant_rested(loop.measured.stamp_ns, loop.measured.stamp_ns + 1)
+    assert loop.executive.phase is Phase.PLANNING
+
+
+@pytest.mark.parametrize(("rests_after", "again"), [(0, True), (500_000_000, False)])
+def test_joints_that_a_plant_held_are_not_taken_for_stuck(rests_after: int, again: bool) -> None:
     """What it did while the plan without these joints was made is that plan's fault."""
     loop = until(stuck(long_flight()), Phase.PLANNING)
     planned_from = loop.measured.stamp_ns - TICK_NS
-    last, rests = planned_from - TICK_NS, planned_from + rests_after
-    assert loop.executive.plant_stopped("It is too old.", last, rests) == aborted
+    loop.plant.hold(np.zeros(3, dtype=bool))
+    loop.executive.plant_rested(planned_from - TICK_NS, planned_from + rests_after)
+    if again:
+        loop.held.release()
+    until(loop, Phase.PLANNING)
+    assert (not loop.held.tasks[-1].stuck_joint_positions) == again
 
 
 @pytest.mark.parametrize("seconds", [1e6, 12.0, -3.0])

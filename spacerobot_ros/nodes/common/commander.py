@@ -21,7 +21,7 @@ from std_msgs.msg import String
 
 from spacerobot_ros.commanding.commander import Commander
 from spacerobot_ros.commanding.goal_follower import Status
-from spacerobot_ros.commanding.plant_state import PlantStopped, Stamped
+from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.messages.builders import StateFrames
@@ -188,7 +188,7 @@ class CommanderNode(FlightNode):
         """Drop all goals if the plant is silent and the parameters require this."""
         super().on_silence(silence)
         if self.config.watchdog_action == "abort" and not silence.over:
-            self.commander.give_up_goals(PlantStopped(silence.message))
+            self.commander.give_up_goals(silence.message)
 
     # -- the host of the commander ------------------------------------------------------------
 

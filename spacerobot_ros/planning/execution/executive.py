@@ -178,35 +178,36 @@ class Executive:
         self._add_abort(f"Aborted {why}. {message}", latest)
         return message
 
-    def plant_stopped(
-        self, why: str, commanded_until_ns: int | None = None, rests_since_ns: int = 0
-    ) -> bool:
-        """Abort all goals immediately, because the plant no longer accepts commands.
-
-        If the plant is at rest because no commands arrived, two kinds of goals continue: goals for
-        which nothing had been commanded, and goals whose planning took so long that no state was
-        processed. A goal that was about to replace another goal is planned from rest.
-        """
-        successor = None
-        if commanded_until_ns is not None:
-            active = self._active_goal
-            if active is None or commanded_until_ns < active.begins_ns:
-                return False
-            if commanded_until_ns < self._commanded_from_ns < rests_since_ns:
-                return False
-            self._drop_plan()
-            successor = self._new_goal
+    def plant_stopped(self, why: str) -> None:
+        """Abort all goals immediately, because the plant no longer accepts commands."""
         if self.phase is Phase.IDLE:
-            return False
+            return
         given_up = self._latest_goal
-        if successor is not None:
-            given_up = None if self._active_goal is None else self._active_goal.identified
         self._forget_goals()
-        self._new_goal = successor
         self._stop_motion(Event.PLANT_STOPPED)
         if given_up is not None:
             self._add_abort(f"Aborted by the plant: {why}", given_up)
-        return given_up is not None
+
+    def plant_rested(self, commanded_until_ns: int, since_ns: int) -> None:
+        """Replan the motion for the current goal, because the plant brought the joints to rest
+        after the command of ``commanded_until_ns``.
+
+        Motions continue if they began later, or if their planning took so long that no state was
+        processed.
+        """
+        active = self._active_goal
+        if active is None or commanded_until_ns < active.begins_ns:
+            return
+        if commanded_until_ns >= self._commanded_from_ns:
+            concerned = self._tracker.is_active
+        else:
+            concerned = since_ns <= self._commanded_from_ns
+        if concerned:
+            self._tracker.stuck = []  # The plant stopped joints that may be free.
+            self._plan_again(
+                "The joints were brought to rest, because no command arrived in time: the motion "
+                "is replanned."
+            )
 
     def schedule_ended(self, why: str = "", *, final: bool = False) -> None:
         """End the schedule at the next state, because the robot's own controller has ended it.

@@ -280,7 +280,9 @@ class Event(Enum):
     FAILED = "failed"  # All corrections are used, or the measured state is not finite.
     ABORTED = "aborted"  # The goal is given up on request.
     PLANT_STOPPED = "plant stopped"  # The plant does not obey commands: the goal is given up.
-    PLANT_RESET = "plant reset"  # The plant was reset, or its robot has captured or released.
+    PLANT_RESET = "plant reset"
+    """The plant was reset, its robot has captured or released, or its joints were brought to rest
+    because commands were late."""
     DEACTIVATED = "deactivated"
 
 
