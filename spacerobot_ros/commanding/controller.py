@@ -26,6 +26,7 @@ from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import CommandError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
+from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
 from spacerobot_ros.times import SECOND
@@ -227,13 +228,20 @@ class ControllerCommander(Commander):
         super().take_joints(stamp_ns, joints)
 
     def rehearse(self) -> None:
-        """Rehearse a goal and a pose loss, so that no function is compiled in flight.
+        """Rehearse a goal and a pose loss, also with a captured target, so that no function is
+        compiled in flight.
 
         Otherwise compilation could keep the plant waiting longer than its ``command_timeout``.
         """
-        robot = self.robot
-        if robot is None:
+        if self.robot is None:
             return
+        self._rehearse_with(self.robot)
+        link = self.robot.description.end_effector(self.config.end_effector_frame)
+        if self._target is not None and link:
+            inertia = self._target.bodies[0].inertia
+            self._rehearse_with(Payload.in_generic_pose(link, inertia).attached_to(self.robot))
+
+    def _rehearse_with(self, robot: SpaceRobot) -> None:
         controller = build_controller(robot, self.config)
         controller.gains_checked = True  # The first measured state is more informative.
         executive = ControlExecutive(controller, self.config)

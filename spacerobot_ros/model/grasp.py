@@ -24,8 +24,12 @@ from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotvec_from_quaternion,
+    unit_quaternion,
 )
 from spacerobot_ros.model.space_robot import SpaceRobot
+
+_GENERIC_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9])), np.ones(3))
+"""A pose in which no inertia entry of a held body is zero."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,14 @@ class Payload:
 
     link: str
     inertia: Inertia
+
+    @classmethod
+    def in_generic_pose(cls, link: str, inertia: Inertia) -> Payload:
+        """Return a body, with its inertia in its own frame, in a pose without zero inertia entries.
+
+        Robots that hold the body in any pose use the functions that this one compiles.
+        """
+        return cls(link, inertia.moved(_GENERIC_POSE))
 
     def attached_to(self, robot: SpaceRobot) -> SpaceRobot:
         """Return the robot that holds the body: joints, links and limits are unchanged.

@@ -145,6 +145,7 @@ class CoordinatedControlNode(CommanderNode):
     def _on_target_description(self, message: String) -> None:
         try:
             self.commander.use_target(parse_robot(message.data))
+            self.commander.rehearse()
         except SpaceRobotError as error:
             self.get_logger().error(f"target/robot_description: {error}")
 

@@ -45,9 +45,6 @@ from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.plant import Flags, InitialState, Plant, WrappedPlant
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
 
-_GENERIC_POSE = Pose(matrix_from_quaternion(unit_quaternion([0.1, 0.2, 0.3, 0.9])), np.ones(3))
-"""A pose in which no inertia entry of a held body is zero."""
-
 
 def load_target(config: TargetConfig) -> RobotDescription | None:
     """Return the configured target; None if there is no target.
@@ -253,7 +250,7 @@ class CapturePlant(WrappedPlant):
         """Call all functions of a capture once: compiling them later would delay the flight."""
         robot, motion, inertia = self.robot, self._motion(), self.target.inertia
         grasp_impact(robot, self.link, motion, self._body(), inertia)
-        joined = Payload(self.link, inertia.moved(_GENERIC_POSE)).attached_to(robot)
+        joined = Payload.in_generic_pose(self.link, inertia).attached_to(robot)
         _summed_momenta(joined, motion)
         self._build(joined, InitialState(joint_positions=initial.shape(robot)))
 
