@@ -319,6 +319,7 @@ class Commander(ABC):
 
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
         self._fly_to.accepted(goal.goal_id)
+        self._goal_file.add_waiting(key, goal)
         if self.executive is None:
             self._waiting_goals[key] = goal
             self._report_waiting_goal(goal, "The goal waits for a robot on robot_description.")

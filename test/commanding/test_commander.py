@@ -17,7 +17,7 @@ from spacerobot_ros.commanding.fly_to import FlyTo
 from spacerobot_ros.commanding.host import ArrayDecoder, CommanderActivity, StateArrays
 from spacerobot_ros.commanding.planner import PlannerCommander, TrajectoryOutput
 from spacerobot_ros.control.config import ControllerConfig
-from spacerobot_ros.control.goals import END_EFFECTOR
+from spacerobot_ros.control.goals import END_EFFECTOR, GOAL_KEYS
 from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import EventKind
@@ -361,6 +361,36 @@ def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
     assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("waiting", "9.000000000")
     rig.commander.give_up_goals("Node '/plant' is silent.")
     assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("kind", [PlannerCommander, ControllerCommander])
+def test_goals_that_wait_are_on_file(kind: type, robot: SpaceRobot, tmp_path: Path) -> None:
+    path = tmp_path / "goal.json"
+    given: dict[type, Any] = {
+        PlannerCommander: (PlannerConfig, METHOD),
+        ControllerCommander: (ControllerConfig, {}),
+    }
+    config_class, settings = given[kind]
+
+    def restarted() -> Rig:
+        rig = Rig(kind, config(config_class, resume_file=str(path), **settings), robot.n)
+        rig.commander.activate()
+        return rig
+
+    def on_file() -> str:
+        return GoalFile(str(path), GOAL_KEYS).load()[BASE_GOAL_KEY].goal_id
+
+    first = restarted()
+    for stamp in (7, 8):
+        first.commander.receive_goal(BASE_GOAL_KEY, stamp, 0, lambda: GOAL)
+        assert on_file() == f"{stamp}.000000000"
+    # Neither has been pursued when this process is killed.
+    second = restarted()
+    assert second.host.statuses[-1].goal_id == "8.000000000"
+    second.commander.receive_goal(BASE_GOAL_KEY, 9, 0, lambda: GOAL)
+    assert on_file() == "9.000000000"
+    second.commander.abort()
     assert not path.exists()
 
 

@@ -230,6 +230,8 @@ def test_a_goal_stays_on_file_until_it_is_decided(tmp_path: Path) -> None:
     file.end("1.0", refused=True)
     assert not path.exists()
     file.pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "3.0")}))
+    file.add_waiting(BASE_GOAL_KEY, IdentifiedGoal(GOAL, "4.0"))
+    assert file.load()[BASE_GOAL_KEY].goal_id == "3.0"
     restarted = GoalFile(str(path))
     restarted.load()
     restarted.end("2.0", refused=True)

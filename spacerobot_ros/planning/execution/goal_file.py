@@ -86,9 +86,19 @@ class GoalFile:
         self._keys = keys
         self._ids: frozenset[str] = frozenset()
         """Goal ids in the file."""
+        self._waiting: dict[str, IdentifiedGoal] = {}
+        """Goals in the file that are not pursued yet."""
+
+    def add_waiting(self, key: str, goal: IdentifiedGoal) -> None:
+        """Write a goal that waits to be pursued, unless the file contains goals being pursued."""
+        if not self._ids or self._waiting:
+            waiting = {**self._waiting, key: goal}
+            self.pursue(PursuedGoals(waiting))
+            self._waiting = waiting
 
     def pursue(self, pursued: PursuedGoals) -> str:
         """Atomically write the goals to resume; return a message if that fails, else empty text."""
+        self._waiting = {}
         kept = {key: goal for key, goal in pursued.goals.items() if goal.resumes}
         self._ids = frozenset(goal.goal_id for goal in kept.values())
         if not kept:
@@ -113,7 +123,7 @@ class GoalFile:
 
     def delete(self) -> None:
         """Delete the file, because its goals were reached, failed or aborted."""
-        self._ids = frozenset()
+        self._ids, self._waiting = frozenset(), {}
         if self._path is not None:
             with suppress(OSError):
                 self._path.unlink()
@@ -131,6 +141,7 @@ class GoalFile:
         try:
             goals = self._parse_goals(read_private(self._path).decode())
             self._ids = frozenset(goal.goal_id for goal in goals.values())
+            self._waiting = goals
             return goals
         except FileNotFoundError:
             return {}
