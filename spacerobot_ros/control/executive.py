@@ -119,6 +119,7 @@ class ControlExecutive:
         self._was_measured = False
         self.servicing.end()
         self._after_tasks: dict[str, IdentifiedGoal] = {}
+        self._carried_id: str | None = None
         self._requested: tuple[Task, ...] | None = None
         """Tasks requested without a goal, waiting for the next measured state."""
         self._guided = False
@@ -315,6 +316,7 @@ class ControlExecutive:
         """Restart the goal at the next measured state, or hold the pose of that state if there is
         no goal."""
         self.servicing.end()
+        self._carried_id = None
         if self._pursues and self._after_tasks:
             self._pending = {**self._after_tasks, **self._pending}
         self._begin_anew_or_hold()
@@ -510,7 +512,7 @@ class ControlExecutive:
             self._begin_tasks(time, self._requested)
             self._requested = None
         elif self._pending and servicing.task is None:
-            if not servicing.before_goals:
+            if not servicing.before_goals or self._carries_pending:
                 self._begin_goals(time, state)
                 return
             self._begin_tasks(time, servicing.before_goals)
@@ -525,7 +527,10 @@ class ControlExecutive:
             case TaskState.DONE if self._pending:
                 self._refuse_goals_by_state(state)
                 if self._pending:
-                    self._begin_goals(time, state, carried=True)
+                    self._carried_id = self._latest_id()
+                    # Until the motion is planned, the pose is held.
+                    self._holds_until_planned = True
+                    self._begin_goals(time, state)
                 else:
                     self._hold_pose(time, state, aborted=False)
             case TaskState.DONE:
@@ -556,6 +561,7 @@ class ControlExecutive:
 
     def _begin_tasks(self, time: float, tasks: tuple[Task, ...]) -> None:
         self.servicing.begin(tasks)
+        self._carried_id = None
         self._watch.forget_touch(time)
         self._begin_tracking(time)
         self._wait_for_tasks()
@@ -585,10 +591,15 @@ class ControlExecutive:
         else:
             self._report_abort()
 
-    def _begin_goals(self, time: float, state: ControlState, *, carried: bool = False) -> None:
+    @property
+    def _carries_pending(self) -> bool:
+        """Whether the tasks before the pending goals are done."""
+        return self._latest_id() == self._carried_id
+
+    def _begin_goals(self, time: float, state: ControlState) -> None:
         """Start towards the pending goals, after tasks from the measured pose."""
-        pending, controller = self._pending, self.controller
-        if carried and not self._planning.active:
+        pending, controller, carried = self._pending, self.controller, self._carries_pending
+        if carried and not (self._goals or self._planning.active):
             # The tasks have moved the robot away from the earlier reference.
             controller.hold_here(time, state)
         job = None
@@ -600,7 +611,8 @@ class ControlExecutive:
         again = self._goal_id == self._latest_id() and bool(pursued)
         self._goal_id = self._latest_id()
         self._goals = with_later_goals(pursued, pending)
-        self._after_tasks = dict(pending) if carried else {}
+        if not again:
+            self._after_tasks = dict(pending) if carried else {}
         self._take_tolerance(next(reversed(pending.values())).tolerance)
         if BASE_GOAL_KEY not in pursued:
             self._watch.asked[BASE_GOAL_KEY] = frozenset()

@@ -202,6 +202,27 @@ def test_states_are_answered_while_a_thread_plans() -> None:
     np.testing.assert_allclose(rig.reference().position, second.position, atol=1e-9)
 
 
+@pytest.mark.parametrize("in_background", [False, True])
+def test_tasks_before_a_goal_are_done_once(in_background: bool) -> None:
+    rig = Follower(
+        plan_in_background=in_background, tasks="detumble", settle_time=0.04, status_period=0.02
+    )
+    executive, goal = rig.executive, Goal.from_rotvec([0.9, 0.1, 0.3], [0.2, 0.1, 0.4])
+    rig.pursue(goal, "first")
+    assert rig.fly(until=rig.time + 60.0) is ControllerState.REACHED
+    np.testing.assert_allclose(rig.reference().position, goal.position, atol=1e-9)
+    kinds = [each.kind for each in rig.events]
+    assert kinds.count(EventKind.DETUMBLE_STARTED) == kinds.count(EventKind.DETUMBLED) == 1
+    # The motion to the same goal is planned again without the tasks, to another goal with them.
+    rig.pursue(Goal.from_rotvec([0.5, -0.9, 0.4], [-0.3, 0.2, 0.1]), "second")
+    rig.fly(until=rig.time + 6.0)
+    assert executive.controller.profile is not None, "it is on its way"
+    executive.plant_rested(round(1e9 * rig.time), round(1e9 * rig.time))
+    assert rig.fly(until=rig.time + 60.0) is ControllerState.REACHED
+    kinds = [each.kind for each in rig.events]
+    assert kinds.count(EventKind.DETUMBLE_STARTED) == kinds.count(EventKind.DETUMBLED) == 2
+
+
 def test_a_goal_is_not_reached_while_its_motion_is_planned_again_after_a_reset() -> None:
     rig = Follower(plan_in_background=True, settle_time=0.04)
     goal = Goal.from_rotvec([1.3, 0.2, 0.1], [0.2, 0.1, 0.4])
