@@ -19,6 +19,7 @@ from spacerobot_ros.commanding.controller import (
     ControllerCommander,
 )
 from spacerobot_ros.commanding.goal_follower import Status
+from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.goals import END_EFFECTOR
 from spacerobot_ros.control.servicing import Task
@@ -83,7 +84,7 @@ class CoordinatedControlNode(CommanderNode):
         self.create_subscription(
             String, "target/robot_description", self._on_target_description, LATCHED
         )
-        self.create_subscription(
+        self.inputs[TARGET_ODOMETRY] = self.create_subscription(
             Odometry,
             TARGET_ODOMETRY,
             lambda raw: commander.receive_target(first_time_ns(raw), raw),
@@ -104,6 +105,13 @@ class CoordinatedControlNode(CommanderNode):
                 self.commander.receive_reference(topic, first_time_ns(raw), raw)
 
             self.inputs[topic] = self.create_subscription(kind, topic, take, STREAM, raw=True)
+
+    def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
+        """Return the messages queued in the subscriptions to odom and joint_states; queued target
+        odometry is processed before them, which callbacks of a busy executor come too late for."""
+        for raw in self.waiting(TARGET_ODOMETRY):
+            self.commander.receive_target(first_time_ns(raw), raw)
+        return super().waiting_states()
 
     def start_message(self) -> str:
         """Return a log message with the robot, the law and the goal topic."""

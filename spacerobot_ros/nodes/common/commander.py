@@ -217,18 +217,21 @@ class CommanderNode(FlightNode):
         return bool(self.inputs[topic].get_publisher_count())
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
-        """Return the messages queued in the subscriptions to odom and joint_states.
+        """Return the messages queued in the subscriptions to odom and joint_states; statuses of the
+        plant are processed before them.
 
         If no joint state is queued, odom messages stay queued.
         """
-        joints = [*map(self._joined, self._waiting("joint_states"))]
-        odoms = self._waiting("odom") if joints else []
+        self._process_waiting_statuses()
+        joints = [*map(self._joined, self.waiting("joint_states"))]
+        odoms = self.waiting("odom") if joints else []
         return (
             [Stamped(first_time_ns(raw), raw) for raw in odoms],
             [Stamped(first_time_ns(raw), raw) for raw in joints if raw is not None],
         )
 
-    def _waiting(self, topic: str) -> list[bytes]:
+    def waiting(self, topic: str) -> list[bytes]:
+        """Return the messages queued in an input, serialised."""
         found: list[bytes] = []
         handle, kind = self.inputs[topic].handle, self.inputs[topic].msg_type
         with handle:
@@ -362,13 +365,17 @@ class CommanderNode(FlightNode):
                 ),
             )
 
-    def _process_waiting_messages(self) -> None:
-        """Process waiting statuses, and a deferred state once its time is accepted."""
-        commander, handle = self.commander, self._statuses.subscription.handle
+    def _process_waiting_statuses(self) -> None:
+        handle = self._statuses.subscription.handle
         # A busy executor may lose a callback.
         with handle:
             while (taken := handle.take_message(DiagnosticStatus, False)) is not None:
                 self._on_plant_status(taken[0])
+
+    def _process_waiting_messages(self) -> None:
+        """Process waiting statuses, and a deferred state once its time is accepted."""
+        commander = self.commander
+        self._process_waiting_statuses()
         if self._statuses.outdated and not self._has_foreign_statuses():
             self._statuses.renew()
         if self._descriptions is not None:
