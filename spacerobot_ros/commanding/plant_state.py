@@ -369,6 +369,8 @@ class PlantListener:
         self.status = PlantStatus(PlantState.RUNNING)
         """The latest status; before the first, the status of a plant that accepts commands."""
         self._heard, self._name = False, "plant"
+        self._time_s = -math.inf
+        """Time of the latest status of an active plant."""
 
     @property
     def refusal_of_goals(self) -> str:
@@ -401,6 +403,11 @@ class PlantListener:
         Statuses may be missed; the plant's counters reveal the changes in between.
         """
         before, heard, was_blocked = self.status, self._heard, bool(self.refusal_of_goals)
+        reset = heard and status.resets > before.resets
+        if status.state not in (PlantState.INACTIVE, PlantState.FAILED):
+            # Time goes back if another process has taken the plant's place.
+            reset |= status.time_s < self._time_s
+            self._time_s = status.time_s
         self.status, self._name, self._heard = status, name, True
         changes: list[PlantReport] = []
         if self.refusal_of_goals:
@@ -408,7 +415,7 @@ class PlantListener:
                 fault = status.latched_fault
                 changes.append(PlantStopped(f"{fault}." if fault else status.message))
             # A plant that ignores all commands may still be reset, immediately and to another pose.
-            if heard and status.resets > before.resets:
+            if reset:
                 changes.append(PlantChange.RESET)
             return changes
         if not heard:
@@ -424,7 +431,7 @@ class PlantListener:
                 since = last
             if math.isfinite(last) and math.isfinite(since):
                 changes.append(PlantRested(round(last * SECOND), round(since * SECOND)))
-        if status.resets > before.resets:
+        if reset:
             changes.append(PlantChange.RESET)
         if was_blocked or status.rearms > before.rearms:
             changes.append(PlantChange.OBEYS)

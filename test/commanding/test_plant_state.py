@@ -457,7 +457,7 @@ def test_a_plant_that_fails_stops_commanders() -> None:
 
 def test_a_plant_that_rests_tells_until_when_it_was_commanded() -> None:
     assert listener(RUNNING).update(RESTING) == [PlantRested(1_500_000_000, 2_000_000_000)]
-    assert listener(RUNNING, RESTING).update(replace(RUNNING, timeouts=1)) == []
+    assert listener(RUNNING, RESTING).update(replace(RUNNING, timeouts=1, time_s=2.5)) == []
     # Missed: it runs again.
     again = replace(RUNNING, timeouts=1, last_command_s=1.5)
     assert listener(RUNNING).update(again) == [PlantRested(1_500_000_000, 1_500_000_000)]
@@ -480,10 +480,17 @@ def test_pauses_and_restarts_stop_nothing() -> None:
     assert not one.paused
 
 
+def test_a_plant_that_is_started_again_is_reset() -> None:
+    one = listener(RUNNING, replace(RUNNING, time_s=9.0))
+    assert one.update(PlantStatus(PlantState.INACTIVE, "The plant is inactive.")) == []
+    assert one.update(replace(RUNNING, time_s=0.5)) == [PlantChange.RESET]
+    assert one.update(replace(RUNNING, time_s=0.75)) == []
+
+
 def test_a_reset_is_reported_once() -> None:
     one = listener(RUNNING)
     assert one.update(replace(RUNNING, resets=1)) == [PlantChange.RESET]
-    assert one.update(replace(RUNNING, resets=1, time_s=9.0)) == []
+    assert one.update(replace(RUNNING, resets=1, time_s=1.0)) == []
     # A plant that obeys nothing is reset as well.
     assert PlantChange.RESET not in one.update(replace(LATCHED, resets=1))
     assert one.update(replace(LATCHED, resets=2)) == [PlantChange.RESET]
