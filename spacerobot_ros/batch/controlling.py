@@ -23,8 +23,8 @@ from spacerobot_ros.control.reference import (
 )
 from spacerobot_ros.control.state import ControlState, PoseReference, Reference
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.integration import state_slices
 from spacerobot_ros.model.symbolic_rotations import quaternion_from_rotvec, quaternion_multiply
 from spacerobot_ros.times import SECOND
 

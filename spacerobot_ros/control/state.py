@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.model.composite_rigid_body import state_slices
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, count_steps
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, count_steps, state_slices
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -185,7 +184,7 @@ class DeadReckoning:
     held actuation (Runge-Kutta 4). Differences between the model and the real robot accumulate over
     :attr:`elapsed`.
 
-    The integrated state is the state of :mod:`spacerobot_ros.model.composite_rigid_body`, with both
+    The integrated state is the state of :mod:`spacerobot_ros.model.integration`, with both
     momenta and the centre of mass, which joint motion does not change. Measured joint positions and
     rates replace the predicted ones, and the base rotates according to the connection ``A``. Errors
     then accumulate only in the effects of the thrusters.

@@ -20,24 +20,12 @@ on composite j required by the motion alone, at ``qddot = 0``.
 For chains of up to about eight joints, this method takes fewer operations than the articulated-body
 algorithm, although the cost of the latter grows only linearly.
 
-:func:`state_rate` computes the motion under joint efforts and a base wrench, with the total momenta
-as part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
-joint positions, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular
-momentum about the system's centre of mass (kg m^2/s), and position of the centre of mass (m), the
-last three in W. The base twist is not a state: it follows from the momenta and joint rates. Without
-thrusters, the momenta are therefore constant to the last bit, for any step size:
-
-* ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
-* ``K qddot = Q`` with the ``omega_WB_B`` that follows from the momenta.
-
-The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (N) and torque (N m)
-at the base link origin, in the base frame. The attitude is integrated in R^4 and normalised
-after each Runge-Kutta step.
-
-Under external loads (:mod:`spacerobot_ros.model.external_loads`), the state ends with the time (s),
-and the command ends with the load vector. For the load ``F_k`` on composite k and the friction d,
-``S_j' F_j - B_j' F_0 - d (K qdot)_j`` is added to ``Q_j``; both momenta change due to ``F_0``,
-uniform gravity and friction.
+External loads on the links (:class:`ExternalLoads`; derived in docs/theory/external_loads.md) form
+one vector (:class:`LoadLayout`); all times are in plant time. Frame W is in free fall on a circular
+orbit with mean motion n and does not rotate. The orbital frame O has its x axis radially outward
+and its z axis along the orbit normal; ``R_WO`` is the attitude of O at time zero, ``o`` the unit
+vector along the radius. For the load ``F_k`` on composite k and the friction d, ``S_j' F_j - B_j'
+F_0 - d (K qdot)_j`` is added to ``Q_j``.
 """
 
 from __future__ import annotations
@@ -45,12 +33,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
+import numpy as np
 
-from spacerobot_ros.model.compilation import dense_function
-from spacerobot_ros.model.external_loads import ExternalLoads, LoadLayout, external_loads
 from spacerobot_ros.model.inertial_parameters import rotational, sparse_constant, symmetric
 from spacerobot_ros.model.kinematics import TreeKinematics
-from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
+from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -230,13 +217,13 @@ def motion_forces(
     ``B_j' f_0``.
     """
     kin, qdot = parts.kin, parts.kin.spread(qdot)
-    qddot = None if qddot is None else kin.spread(qddot)
+    qddot = kin.spread(ca.SX(kin.n, 1) if qddot is None else qddot)
     omegas, alphas = [omega], [ca.SX(3, 1)]
     A, accelerations = [_angular_operator(omega, ca.SX(3, 1))], [ca.SX(3, 1)]
     for k in range(1, kin.moving_body_count + 1):
         i = kin.parent(k)
         rate = kin.axis[k] * qdot[k - 1]
-        push = ca.SX(3, 1) if qddot is None else kin.axis[k] * qddot[k - 1]
+        push = kin.axis[k] * qddot[k - 1]
         # A difference of origins would keep CasADi from cancelling and sharing terms.
         arm = kin.R[i] @ sparse_constant(kin.robot.bodies[k].origin.r)
         if kin.is_revolute(k):
@@ -272,65 +259,49 @@ def shape_forces(
     qdot: ca.SX,
     external: ca.SX,
     tau: ca.SX,
-    loads: ExternalLoads | None = None,
+    loads: ExternalLoads,
 ) -> tuple[ca.SX, ca.SX]:
     """Return ``Q`` (n,) of ``K qddot = Q`` and the remaining moment (3,) on the base.
 
     ``external`` (6,) is the external moment (N m) and force (N) on the base, in the base frame,
     about the system's centre of mass; ``tau`` (n,) are the joint efforts (N or N m).
     """
-    f = motion_forces(system.parts, omega, qdot)
-    if loads is not None:
-        f = tuple(force - load for force, load in zip(f, loads.composites, strict=True))
-        tau = tau - loads.friction * (system.K @ qdot)
+    kin, moving = system.parts.kin, range(1, system.parts.kin.moving_body_count + 1)
+    of_motion = motion_forces(system.parts, omega, qdot)
+    f = [force - load for force, load in zip(of_motion, loads.composites, strict=True)]
     excess = f[0] - external
-    kin = system.parts.kin
+    by_joint = ca.vertcat(ca.SX(0, 1), *(ca.dot(system.parts.S[k], f[k]) for k in moving))
+    by_base = ca.vertcat(ca.SX(0, 1), *(ca.dot(system.B[k], excess) for k in moving))
+    tau = tau - loads.friction * (system.K @ qdot)
     if kin.robot.has_mimic_joints:
-        along = [
-            ca.dot(system.B[k], excess) - ca.dot(system.parts.S[k], f[k])
-            for k in range(1, kin.moving_body_count + 1)
-        ]
-        return tau + kin.gather(ca.vertcat(*along)), -excess[:3]
-    Q = [
-        tau[k - 1] - ca.dot(system.parts.S[k], f[k]) + ca.dot(system.B[k], excess)
-        for k in range(1, kin.n + 1)
-    ]
-    return ca.vertcat(*Q), -excess[:3]
+        return tau + kin.gather(by_base - by_joint), -excess[:3]
+    return tau - by_joint + by_base, -excess[:3]
 
 
 def joint_efforts(
-    kin: TreeKinematics,
-    qdot: ca.SX,
-    qddot: ca.SX,
-    L_B: ca.SX | None = None,
-    loads: ExternalLoads | None = None,
+    kin: TreeKinematics, qdot: ca.SX, qddot: ca.SX, L_B: ca.SX, loads: ExternalLoads
 ) -> ca.SX:
     """Return the efforts (n,), N or N m, of a free robot for joint rates ``qdot`` (n,) and
     accelerations ``qddot`` (n,): inverse dynamics.
 
     ``L_B`` (3,) is the angular momentum about the system's centre of mass, kg m^2/s in base
-    components; None: zero. The base rotates and accelerates such that both momenta are constant:
+    components. The base rotates and accelerates such that both momenta are constant:
     its acceleration is ``-diag(D, M 1)^-1 f_0``, where ``f_0`` is the external force that the joint
     motion alone would require. So ``tau_j = S_j' f_j - P_j' diag(D, M 1)^-1 f_0``, and no joint
     inertia matrix is needed. At zero momentum, the same path in half the time requires four times
-    the efforts. ``loads`` are external loads, if any.
+    the efforts.
     """
     parts = composites(kin)
     D = SymmetricFactor(parts.D)
-    relative = -(parts.D_q @ qdot) if L_B is None else L_B - parts.D_q @ qdot
-    f = motion_forces(parts, D.solve(relative), qdot, qddot)
-    if loads is not None:
-        f = tuple(force - load for force, load in zip(f, loads.composites, strict=True))
+    of_motion = motion_forces(parts, D.solve(L_B - parts.D_q @ qdot), qdot, qddot)
+    f = [force - load for force, load in zip(of_motion, loads.composites, strict=True)]
     base = ca.vertcat(D.solve(f[0][:3]), f[0][3:] * kin.per_mass)
     along = (
         ca.dot(S, force) - ca.dot(P, base)
         for S, P, force in zip(parts.S[1:], parts.P[1:], f[1:], strict=True)
     )
-    efforts = kin.gather(ca.vertcat(*along))
-    if loads is None:
-        return efforts
     momentum = parts.D_qq @ qdot - parts.D_q.T @ D.solve(parts.D_q @ qdot)
-    return efforts + loads.friction * momentum
+    return kin.gather(ca.vertcat(*along)) + loads.friction * momentum
 
 
 def external_force(kin: TreeKinematics, wrench_B: ca.SX) -> ca.SX:
@@ -348,7 +319,7 @@ def composite_dynamics(
     """Return ``z0ddot = [v_cm_dot; omega_dot; qddot]`` (6 + n,), base components (eq. 19)."""
     system = shape_system(kin)
     external = external_force(kin, wrench_B)
-    Q, moment = shape_forces(system, omega, qdot, external, tau)
+    Q, moment = shape_forces(system, omega, qdot, external, tau, ExternalLoads.none(kin))
     qddot = SymmetricFactor(system.K).solve(Q)
     return ca.vertcat(
         external[3:] / kin.total_mass - ca.cross(omega, v_cm),
@@ -357,120 +328,128 @@ def composite_dynamics(
     )
 
 
-def state_slices(n: int) -> tuple[slice, ...]:
-    """Return the state slices of ``q, quaternion_WB, qdot, p_W, L_W, r_WC_W``."""
-    ends = [n, n + 4, 2 * n + 4, 2 * n + 7, 2 * n + 10, 2 * n + 13]
-    return tuple(slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
-
-
-def shape_equations(kin: TreeKinematics, *, loaded: bool = False) -> ca.Function:
-    """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
-    equations = _equations(kin, loaded=loaded)
-    inputs = equations.inputs | kin.mass_properties.inputs
-    name = "loaded_shape_equations" if loaded else "shape_equations"
-    return dense_function(name, inputs, {"K": equations.system.K, "Q": equations.Q})
-
-
-def state_rate(kin: TreeKinematics, *, holding: bool = False, loaded: bool = False) -> ca.Function:
-    """Return the function ``(x, command) -> x_dot``.
-
-    If ``holding``, the function takes a third argument ``free`` (n,): 1 for a moving joint, 0 for a
-    joint held at its current rate. If ``loaded``, external loads are included.
-    """
-    free = ca.SX.sym("free", kin.n) if holding else ca.DM.ones(kin.n)
-    equations = _equations(kin, loaded=loaded)
-    system = equations.system
-    _, quaternion, qdot, p_W, L_W, _ = (equations.inputs["x"][part] for part in state_slices(kin.n))
-    # A held joint is absent from the equations of other joints; its own equation is qddot = 0.
-    K = system.K * (free @ free.T)
-    for j in range(kin.n):
-        K[j, j] = system.K[j, j]
-    R_WB = matrix_from_quaternion(quaternion)
-    p_dot, L_dot = R_WB @ equations.external[3:], R_WB @ equations.external[:3]
-    if equations.loads is not None:
-        by_loads = equations.loads.momentum_rates(R_WB, p_W, L_W, kin.total_mass)
-        p_dot, L_dot = p_dot + by_loads[0], L_dot + by_loads[1]
-    x_dot = ca.vertcat(
-        qdot,
-        quaternion_rate(quaternion, equations.omega),
-        SymmetricFactor(K).solve(equations.Q * free),
-        p_dot,
-        L_dot,
-        p_W / kin.total_mass,
-        *([1.0] if loaded else []),
-    )
-    inputs = equations.inputs | ({"free": free} if holding else {}) | kin.mass_properties.inputs
-    name = "holding_rate" if holding else "flight_rate"
-    return dense_function(f"loaded_{name}" if loaded else name, inputs, {"x_dot": x_dot})
-
-
-def servo_rate(kin: TreeKinematics) -> ca.Function:
-    """Return the function ``(x, qdot, loads) -> x_dot`` for a robot whose servos hold ``qdot``
-    under external loads.
-
-    ``x = [q; quaternion_WB; p_W; L_W; r_WC_W; time]``, (n + 14,); ``loads`` is a vector laid out by
-    :class:`.LoadLayout`.
-    """
-    parts = {"quaternion": 4, "p_W": 3, "L_W": 3, "r_WC_W": 3, "time": 1}
-    symbols = {name: ca.SX.sym(name, count) for name, count in parts.items()}
-    quaternion, p_W, L_W, r_WC_W, time = symbols.values()
-    qdot = ca.SX.sym("qdot", kin.n)
-    vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
-    bodies = composites(kin)
-    loads = external_loads(kin, bodies.J, quaternion, r_WC_W, vector, time)
-    R_WB = matrix_from_quaternion(quaternion)
-    omega = SymmetricFactor(bodies.D).solve(R_WB.T @ L_W - bodies.D_q @ qdot)
-    x_dot = ca.vertcat(
-        qdot,
-        quaternion_rate(quaternion, omega),
-        *loads.momentum_rates(R_WB, p_W, L_W, kin.total_mass),
-        p_W / kin.total_mass,
-        1.0,
-    )
-    x = ca.vertcat(kin.q, *symbols.values())
-    inputs = {"x": x, "qdot": qdot, "loads": vector, **kin.mass_properties.inputs}
-    return dense_function("loaded_servo_rate", inputs, {"x_dot": x_dot})
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """The equations of motion in a state: the symbols ``x`` and ``command`` by name, the shape
-    system, ``omega_WB_B``, the base wrench as moment over force ``external``, ``Q``, and the
-    external loads, if any.
-    """
-
-    inputs: dict[str, ca.SX]
-    system: ShapeSystem
-    omega: ca.SX
-    external: ca.SX
-    Q: ca.SX
-    loads: ExternalLoads | None
-
-
-def _equations(kin: TreeKinematics, *, loaded: bool) -> _Equations:
-    quaternion, qdot, p_W, L_W, r_WC_W = (
-        ca.SX.sym(name, part.stop - part.start)
-        for name, part in zip(
-            ("quaternion", "qdot", "p_W", "L_W", "r_WC_W"), state_slices(kin.n)[1:], strict=True
-        )
-    )
-    command = ca.SX.sym("command", kin.n + 6)
-    tau, wrench_B = command[: kin.n], command[kin.n :]
-    x = ca.vertcat(kin.q, quaternion, qdot, p_W, L_W, r_WC_W)
-    system = shape_system(kin)
-    loads = None
-    if loaded:
-        vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
-        time = ca.SX.sym("time")
-        loads = external_loads(kin, system.parts.J, quaternion, r_WC_W, vector, time)
-        x, command = ca.vertcat(x, time), ca.vertcat(command, vector)
-    external = external_force(kin, wrench_B)
-    omega = system.base_motion(matrix_from_quaternion(quaternion).T @ L_W, qdot)
-    Q, _ = shape_forces(system, omega, qdot, external, tau, loads)
-    return _Equations({"x": x, "command": command}, system, omega, external, Q, loads)
-
-
 def _angular_operator(omega: ca.SX, alpha: ca.SX) -> ca.SX:
     """Return ``hat(alpha) + hat(omega)^2`` (3, 3)."""
     squares = symmetric(omega @ omega.T)
     return ca.skew(alpha) - rotational(squares)
+
+
+# -- external loads ------------------------------------------------------------------------------
+
+
+class LoadLayout:
+    """Slices of the load vector for a robot with L links.
+
+    Attributes
+    ----------
+    in_link, in_world
+        Force (N) and torque (N m) at the origin of every link, in link components and in W
+        components: (6 L,) each.
+    mean_motion
+        Mean motion of the orbit, rad/s; zero if there is no gravity gradient.
+    quaternion_WO
+        Attitude (x, y, z, w) of the orbital frame in W at time zero.
+    gravity_W
+        Uniform acceleration (3,), m/s^2.
+    friction
+        Viscous friction force on a body divided by the body's momentum, 1/s.
+    time
+        Time at the beginning of the tick, s.
+    size
+        Length of the vector.
+    """
+
+    def __init__(self, links: int) -> None:
+        ends = np.cumsum([6 * links, 6 * links, 1, 4, 3, 1, 1]).tolist()
+        self.in_link, self.in_world, self.mean_motion, self.quaternion_WO, *rest = map(
+            slice, [0, *ends], ends
+        )
+        self.gravity_W, self.friction, self.time = rest
+        self.size: int = ends[-1]
+
+
+@dataclass(frozen=True)
+class ExternalLoads:
+    """Loads in a state, as expressions in the base frame.
+
+    Attributes
+    ----------
+    composites
+        Moment and force (6,) about the system's centre of mass on every composite (a body and all
+        bodies that it carries), due to the wrenches and the gravity gradient.
+    gravity_W, friction
+        Uniform acceleration (3,) in W, m/s^2, and friction divided by momentum, 1/s. Both loads are
+        proportional to mass, so they affect momenta and joints independently.
+    """
+
+    composites: tuple[ca.SX, ...]
+    gravity_W: ca.SX
+    friction: ca.SX
+
+    @classmethod
+    def none(cls, kin: TreeKinematics) -> ExternalLoads:
+        """Return loads that are zero."""
+        return cls((ca.SX(6, 1),) * len(kin.robot.bodies), ca.SX(3, 1), ca.SX(1, 1))
+
+    def momentum_rates(
+        self, R_WB: ca.SX, p_W: ca.SX, L_W: ca.SX, mass: float | ca.SX
+    ) -> tuple[ca.SX, ca.SX]:
+        """Return the rates of change of both total momenta due to the loads, N and N m, in W."""
+        moment, force = self.composites[0][:3], self.composites[0][3:]
+        return (
+            R_WB @ force + mass * self.gravity_W - self.friction * p_W,
+            R_WB @ moment - self.friction * L_W,
+        )
+
+
+def external_loads(
+    kin: TreeKinematics,
+    second_moments: tuple[ca.SX, ...],
+    quaternion: ca.SX,
+    r_WC_W: ca.SX,
+    loads: ca.SX,
+    time: ca.SX,
+) -> ExternalLoads:
+    """Return the loads in a state.
+
+    Parameters
+    ----------
+    kin
+        The kinematics.
+    second_moments
+        (3, 3) second moment of mass of every body about its own centre, in the base frame.
+    quaternion
+        (4,) of ``R_WB``.
+    r_WC_W
+        (3,) position of the system's centre of mass, m.
+    loads
+        The vector of :class:`LoadLayout`.
+    time
+        Time, s.
+    """
+    links = [link.name for link in kin.robot.links]
+    layout = LoadLayout(len(links))
+    R_BW = matrix_from_quaternion(quaternion).T
+    forces = [ca.SX(6, 1) for _ in kin.robot.bodies]
+    in_link, in_world = (
+        ca.reshape(loads[part], 6, len(links)) for part in (layout.in_link, layout.in_world)
+    )
+    for i, link in enumerate(links):
+        R_BL, r_BL_B, body = kin.frame(link)
+        force = R_BL @ in_link[:3, i] + R_BW @ in_world[:3, i]
+        torque = R_BL @ in_link[3:, i] + R_BW @ in_world[3:, i]
+        forces[body] += ca.vertcat(torque + ca.cross(r_BL_B - kin.r_BC_B, force), force)
+    n = loads[layout.mean_motion]
+    angle = n * time
+    radius_O = ca.vertcat(ca.cos(angle), ca.sin(angle), 0)
+    o = R_BW @ (matrix_from_quaternion(loads[layout.quaternion_WO]) @ radius_O)
+    r_WC_B = R_BW @ r_WC_W
+    for k, J in enumerate(second_moments):
+        arm = kin.com[k] - kin.r_BC_B
+        r = r_WC_B + arm
+        force = kin.mass(k) * n**2 * (3 * ca.dot(o, r) * o - r)
+        moment = ca.cross(arm, force) + 3 * n**2 * ca.cross(o, rotational(J) @ o)
+        forces[k] += ca.vertcat(moment, force)
+    for k in range(kin.moving_body_count, 0, -1):
+        forces[kin.parent(k)] += forces[k]
+    return ExternalLoads(tuple(forces), loads[layout.gravity_W], loads[layout.friction])

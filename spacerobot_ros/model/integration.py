@@ -1,19 +1,55 @@
-"""Fourth-order Runge-Kutta steps under held commands, as CasADi functions."""
+"""Rates of a robot's state, and fourth-order Runge-Kutta steps under held commands, as CasADi
+functions.
+
+:func:`state_rate` computes the motion under joint efforts and a base wrench, with the total momenta
+as part of the state. The state is ``x = [q; quaternion_WB; qdot; p_W; L_W; r_WC_W]``, (2 n + 13,):
+joint positions, attitude (x, y, z, w), joint rates, total linear momentum (kg m/s), total angular
+momentum about the system's centre of mass (kg m^2/s), and position of the centre of mass (m), the
+last three in W. The base twist is not a state: it follows from the momenta and joint rates. Without
+thrusters, the momenta are therefore constant to the last bit, for any step size:
+
+* ``p_W_dot = R_WB f``, ``L_W_dot = R_WB (n + (r_origin - c) x f)``, ``r_WC_W_dot = p_W / M``;
+* ``K qddot = Q`` with the ``omega_WB_B`` that follows from the momenta.
+
+The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (N) and torque (N m)
+at the base link origin, in the base frame. The attitude is integrated in R^4 and normalised
+after each Runge-Kutta step.
+
+Under external loads (:class:`.ExternalLoads`), the state ends with the time (s),
+and the command ends with the load vector. Both momenta change due to the load on
+the whole robot, uniform gravity and friction.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
+from typing import TypeVar
 
 import casadi as ca
 
 from spacerobot_ros.errors import ParameterError
-from spacerobot_ros.model.composite_rigid_body import SymmetricFactor
+from spacerobot_ros.model.compilation import dense_function
+from spacerobot_ros.model.composite_rigid_body import (
+    ExternalLoads,
+    LoadLayout,
+    SymmetricFactor,
+    composites,
+    external_force,
+    external_loads,
+    shape_forces,
+    shape_system,
+)
 from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
 DEFAULT_INTEGRATION_STEP = 0.01
 """Longest Runge-Kutta step for the attitude under held joint velocities, s."""
+
+
+Expression = TypeVar("Expression", ca.SX, ca.MX)
 
 
 def count_steps(control_period: float, integration_step: float) -> int:
@@ -31,6 +67,18 @@ def count_steps(control_period: float, integration_step: float) -> int:
     return max(1, math.ceil(control_period / integration_step - 1e-9))
 
 
+def runge_kutta(
+    rate: Callable[[float, Expression], Expression], x: Expression, h: Expression
+) -> Expression:
+    """Return ``x`` after a step ``h`` without normalisation; ``rate(share, x)`` is the derivative
+    at a share of the step."""
+    k1 = rate(0.0, x)
+    k2 = rate(0.5, x + h / 2 * k1)
+    k3 = rate(0.5, x + h / 2 * k2)
+    k4 = rate(1.0, x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
 def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     """Return one fourth-order Runge-Kutta step ``(x, held arguments of rate, h) -> x``.
 
@@ -43,11 +91,7 @@ def runge_kutta_step(rate: ca.Function, attitude: slice) -> ca.Function:
     """
     x, held = _symbols_for_inputs(rate)
     h = ca.MX.sym("h")
-    k1 = rate(x, *held)
-    k2 = rate(x + h / 2 * k1, *held)
-    k3 = rate(x + h / 2 * k2, *held)
-    k4 = rate(x + h * k3, *held)
-    x_next = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    x_next = runge_kutta(lambda _, at: rate(at, *held), x, h)
     x_next[attitude] = x_next[attitude] / ca.norm_2(x_next[attitude])
     p = [held.pop()] if rate.name_in(rate.n_in() - 1) == "p" else []
     inputs = [x, *held, h, *p]
@@ -97,21 +141,17 @@ def attitude_step(locked_inertia: ca.Function) -> ca.Function:
     qdot, L_W, h = ca.SX.sym("qdot", n), ca.SX.sym("L_W", 3), ca.SX.sym("h")
     q, quaternion = x[:n], x[n:]
     # Two of the four stages are evaluated at the middle of the step.
-    shapes = [locked_inertia(q + fraction * h * qdot, *p) for fraction in (0.0, 0.5, 1.0)]
+    shapes = {share: locked_inertia(q + share * h * qdot, *p) for share in (0.0, 0.5, 1.0)}
 
-    def rate(stage: int, at: ca.SX) -> ca.SX:
-        D, D_q = shapes[stage]
+    def rate(share: float, at: ca.SX) -> ca.SX:
+        D, D_q = shapes[share]
         L_B = matrix_from_quaternion(at).T @ L_W - D_q @ qdot
         # The factor needs no roots and a quarter of the divisions, which take most of the time in
         # vector registers. Recorded flights used Cholesky's, which is equal up to rounding.
         solve = SymmetricFactor(D).solve if p else partial(solve_positive_definite, D)
         return quaternion_rate(at, solve(L_B))
 
-    k1 = rate(0, quaternion)
-    k2 = rate(1, quaternion + h / 2 * k1)
-    k3 = rate(1, quaternion + h / 2 * k2)
-    k4 = rate(2, quaternion + h * k3)
-    turned = quaternion + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    turned = runge_kutta(rate, quaternion, h)
     x_next = ca.vertcat(q + h * qdot, turned / ca.norm_2(turned))
     return ca.Function("attitude_step", [x, qdot, L_W, h, *p], [ca.cse(x_next)])
 
@@ -121,3 +161,96 @@ def _symbols_for_inputs(function: ca.Function) -> tuple[ca.MX, list[ca.MX]]:
         ca.MX.sym(function.name_in(i), function.size1_in(i)) for i in range(function.n_in())
     )
     return x, held
+
+
+# -- rates ---------------------------------------------------------------------------------------
+
+
+def state_slices(n: int) -> tuple[slice, ...]:
+    """Return the state slices of ``q, quaternion_WB, qdot, p_W, L_W, r_WC_W``."""
+    ends = [n, n + 4, 2 * n + 4, 2 * n + 7, 2 * n + 10, 2 * n + 13]
+    return tuple(slice(a, b) for a, b in zip([0, *ends], ends, strict=False))
+
+
+def shape_equations(kin: TreeKinematics, *, loaded: bool) -> ca.Function:
+    """Return the function ``(x, command) -> (K, Q)`` of ``K qddot = Q``."""
+    inputs, K, Q, *_ = _equations(kin, loaded=loaded)
+    name = "loaded_shape_equations" if loaded else "shape_equations"
+    return dense_function(name, inputs | kin.mass_properties.inputs, {"K": K, "Q": Q})
+
+
+def state_rate(kin: TreeKinematics, *, holding: bool, loaded: bool) -> ca.Function:
+    """Return the function ``(x, command) -> x_dot``.
+
+    If ``holding``, the function takes a third argument ``free`` (n,): 1 for a moving joint, 0 for a
+    joint held at its current rate. If ``loaded``, external loads are included.
+    """
+    inputs, K, Q, rates, later_rates = _equations(kin, loaded=loaded)
+    if holding:
+        inputs["free"] = free = ca.SX.sym("free", kin.n)
+        # A held joint is absent from the equations of other joints; its own equation is qddot = 0.
+        diagonal = ca.diag(K)
+        K, Q = K * (free @ free.T), Q * free
+        for j in range(kin.n):
+            K[j, j] = diagonal[j]
+    x_dot = ca.vertcat(*rates, SymmetricFactor(K).solve(Q), *later_rates)
+    name = "holding_rate" if holding else "flight_rate"
+    inputs |= kin.mass_properties.inputs
+    return dense_function(f"loaded_{name}" if loaded else name, inputs, {"x_dot": x_dot})
+
+
+def servo_rate(kin: TreeKinematics) -> ca.Function:
+    """Return the function ``(x, qdot, loads) -> x_dot`` for a robot whose servos hold ``qdot``
+    under external loads.
+
+    ``x = [q; quaternion_WB; p_W; L_W; r_WC_W; time]``, (n + 14,); ``loads`` is a vector laid out by
+    :class:`.LoadLayout`.
+    """
+    parts = {"quaternion": 4, "p_W": 3, "L_W": 3, "r_WC_W": 3, "time": 1}
+    symbols = {name: ca.SX.sym(name, count) for name, count in parts.items()}
+    quaternion, p_W, L_W, r_WC_W, time = symbols.values()
+    qdot = ca.SX.sym("qdot", kin.n)
+    vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
+    bodies = composites(kin)
+    loads = external_loads(kin, bodies.J, quaternion, r_WC_W, vector, time)
+    R_WB = matrix_from_quaternion(quaternion)
+    omega = SymmetricFactor(bodies.D).solve(R_WB.T @ L_W - bodies.D_q @ qdot)
+    x_dot = ca.vertcat(
+        qdot,
+        quaternion_rate(quaternion, omega),
+        *loads.momentum_rates(R_WB, p_W, L_W, kin.total_mass),
+        p_W / kin.total_mass,
+        1.0,
+    )
+    x = ca.vertcat(kin.q, *symbols.values())
+    inputs = {"x": x, "qdot": qdot, "loads": vector, **kin.mass_properties.inputs}
+    return dense_function("loaded_servo_rate", inputs, {"x_dot": x_dot})
+
+
+def _equations(
+    kin: TreeKinematics, *, loaded: bool
+) -> tuple[dict[str, ca.SX], ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
+    """Return the symbols ``x`` and ``command`` by name, ``K``, ``Q``, and the components of
+    ``x_dot`` before and after ``qddot``."""
+    quaternion, qdot, p_W, L_W, r_WC_W = (
+        ca.SX.sym(name, part.stop - part.start)
+        for name, part in zip(
+            ("quaternion", "qdot", "p_W", "L_W", "r_WC_W"), state_slices(kin.n)[1:], strict=True
+        )
+    )
+    command = ca.SX.sym("command", kin.n + 6)
+    tau, wrench_B = command[: kin.n], command[kin.n :]
+    x = ca.vertcat(kin.q, quaternion, qdot, p_W, L_W, r_WC_W)
+    system, loads = shape_system(kin), ExternalLoads.none(kin)
+    if loaded:
+        vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
+        time = ca.SX.sym("time")
+        loads = external_loads(kin, system.parts.J, quaternion, r_WC_W, vector, time)
+        x, command = ca.vertcat(x, time), ca.vertcat(command, vector)
+    external, R_WB = external_force(kin, wrench_B), matrix_from_quaternion(quaternion)
+    omega = system.base_motion(R_WB.T @ L_W, qdot)
+    Q, _ = shape_forces(system, omega, qdot, external, tau, loads)
+    p_dot, L_dot = loads.momentum_rates(R_WB, p_W, L_W, kin.total_mass)
+    later = [R_WB @ external[3:] + p_dot, R_WB @ external[:3] + L_dot, p_W / kin.total_mass]
+    inputs, rates = {"x": x, "command": command}, [qdot, quaternion_rate(quaternion, omega)]
+    return inputs, system.K, Q, rates, [*later, 1.0] if loaded else later

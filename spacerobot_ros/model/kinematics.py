@@ -65,11 +65,11 @@ class TreeKinematics:
 
     def spread(self, rates: ca.SX) -> ca.SX:
         """Return joint rates (m, ...) for coordinate rates (n, ...): ``G rates``."""
-        return self._coupling @ rates if self.robot.has_mimic_joints else rates
+        return self._coupling @ rates
 
     def gather(self, forces: ca.SX) -> ca.SX:
         """Return generalised forces (n, ...) for joint forces (m, ...): ``G' forces``."""
-        return self._coupling.T @ forces if self.robot.has_mimic_joints else forces
+        return self._coupling.T @ forces
 
     @property
     def _coupling(self) -> ca.DM:
@@ -131,8 +131,6 @@ def _chain_pose(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
 def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
     """Return the positions (m,) of the joints that carry ``bodies[1:]``, given coordinates q
     (n,)."""
-    if not robot.has_mimic_joints:
-        return q
     G, b = robot.coupling
     return ca.sparsify(ca.DM(G)) @ q + ca.sparsify(ca.DM(b))
 

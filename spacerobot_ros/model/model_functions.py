@@ -23,13 +23,12 @@ from spacerobot_ros.model.compilation import (
     dense_function,
 )
 from spacerobot_ros.model.composite_rigid_body import (
+    ExternalLoads,
+    LoadLayout,
     composite_dynamics,
     composites,
+    external_loads,
     joint_efforts,
-    servo_rate,
-    shape_equations,
-    state_rate,
-    state_slices,
 )
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import (
@@ -41,7 +40,6 @@ from spacerobot_ros.model.dynamics import (
     momentum_of_bodies,
     point_jacobian,
 )
-from spacerobot_ros.model.external_loads import LoadLayout, external_loads
 from spacerobot_ros.model.inertial_parameters import (
     InertialParameters,
     SymbolicMassProperties,
@@ -51,6 +49,10 @@ from spacerobot_ros.model.integration import (
     attitude_step,
     divided_step,
     runge_kutta_step,
+    servo_rate,
+    shape_equations,
+    state_rate,
+    state_slices,
 )
 from spacerobot_ros.model.kinematics import tree_kinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion
@@ -196,10 +198,11 @@ class ModelFunctions:
                 z0ddot = composite_dynamics(kin, *motion, x.wrench_B, x.tau)
                 return "q v_cm_B omega_WB_B qdot wrench_B tau", {"z0ddot": z0ddot}
             case "joint_efforts":
-                return "q qdot qddot", {"tau": joint_efforts(kin, x.qdot, x.qddot)}
+                tau = joint_efforts(kin, x.qdot, x.qddot, ca.SX(3, 1), ExternalLoads.none(kin))
+                return "q qdot qddot", {"tau": tau}
             case "servo_efforts" | "loaded_servo_efforts":
                 # The efforts of servos that change the joint rates within ``h``.
-                inputs, loads = "quaternion_WB q before after L_W h", None
+                inputs, loads = "quaternion_WB q before after L_W h", ExternalLoads.none(kin)
                 if kind.startswith("loaded"):
                     inputs = f"{inputs} r_WC_W loads"
                     time = x.loads[LoadLayout(len(self.link_names)).time]

@@ -25,6 +25,7 @@ from spacerobot_ros.model.compilation import BufferedFunction, dense_function
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.grasp import BodyMotion, TargetBody
+from spacerobot_ros.model.integration import runge_kutta
 from spacerobot_ros.model.rotations import (
     cross,
     hat,
@@ -373,17 +374,14 @@ class TargetExpression(NamedTuple):
         for k, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
             J[i, j] = J[j, i] = about[k]
 
-        def rate(X: ca.SX) -> ca.SX:
+        def rate(_: float, X: ca.SX) -> ca.SX:
             R = matrix_from_quaternion(X / ca.norm_2(X))
             return quaternion_rate(X, solve_positive_definite(J, R.T @ L))
 
         elapsed = time - began
         h = elapsed / _EXPRESSION_STEPS
         for _ in range(_EXPRESSION_STEPS):
-            first = rate(X)
-            second = rate(X + h / 2 * first)
-            third = rate(X + h / 2 * second)
-            X = X + h / 6 * (first + 2 * second + 2 * third + rate(X + h * third))
+            X = runge_kutta(rate, X, h)
         X = X / ca.norm_2(X)
         R = matrix_from_quaternion(X)
         omega, center = R @ solve_positive_definite(J, R.T @ L), r + elapsed * v

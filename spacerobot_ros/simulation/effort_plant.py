@@ -1,6 +1,6 @@
 """The effort-driven plant: free-flying dynamics under joint efforts and a base wrench.
 
-The total momenta are states (:mod:`spacerobot_ros.model.composite_rigid_body`): without thrust and
+The total momenta are states (:mod:`spacerobot_ros.model.integration`): without thrust and
 external loads they are constant to the last bit. If a joint reaches a limit during a tick, the tick
 is repeated with inelastic stops.
 
@@ -33,10 +33,9 @@ from typing_extensions import override
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.composite_rigid_body import state_slices
+from spacerobot_ros.model.composite_rigid_body import LoadLayout
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.external_loads import LoadLayout
-from spacerobot_ros.model.integration import repeat_step
+from spacerobot_ros.model.integration import repeat_step, state_slices
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.plant import CompiledPlant, Flags, body_outputs
@@ -62,7 +61,7 @@ strongly driven joints push each other off their stops ever more often."""
 
 
 class JointStops:
-    """Advances the state of :mod:`spacerobot_ros.model.composite_rigid_body`, and enforces joint
+    """Advances the state of :mod:`spacerobot_ros.model.integration`, and enforces joint
     stops.
 
     Parameters
@@ -281,7 +280,7 @@ class EffortPlant(CompiledPlant):
 
     @property
     def state(self) -> Array:
-        """The state (2 n + 13,) of :mod:`spacerobot_ros.model.composite_rigid_body` from which the
+        """The state (2 n + 13,) of :mod:`spacerobot_ros.model.integration` from which the
         next step starts; it may be modified in place.
         """
         return self._next_state

@@ -9,14 +9,28 @@ import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
+from spacerobot_ros.model.composite_rigid_body import LoadLayout
 from spacerobot_ros.model.description import Array, Inertia, Pose, plane_normal
-from spacerobot_ros.model.external_loads import LoadLayout, mean_motion_at
 from spacerobot_ros.model.grasp import BodyMotion
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 
 _PLANE_TOLERANCE = 1e-9
 """Largest component in the table plane of the normal to a planar robot's plane of motion."""
+
+EARTH_GRAVITATION = 3.986004418e14
+"""Earth's gravitational parameter, m^3/s^2."""
+
+EARTH_RADIUS = 6378137.0
+"""Earth's equatorial radius, m (WGS 84)."""
+
+
+def mean_motion_at(altitude: float) -> float:
+    """Return the mean motion of a circular orbit around the Earth, rad/s.
+
+    ``altitude`` is the height above the equatorial radius, m.
+    """
+    return math.sqrt(EARTH_GRAVITATION / (EARTH_RADIUS + altitude) ** 3)
 
 
 @dataclass(frozen=True)

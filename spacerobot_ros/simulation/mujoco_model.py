@@ -13,8 +13,8 @@ from spacerobot_ros.collision import CollisionGeometry, Solid
 from spacerobot_ros.collision.geometry import solids_of
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.lazy import optional_module
+from spacerobot_ros.model.composite_rigid_body import LoadLayout
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
-from spacerobot_ros.model.external_loads import LoadLayout
 from spacerobot_ros.model.rotations import (
     cross,
     matrix_from_quaternion,
@@ -262,7 +262,7 @@ def _set_options(mujoco: Any, model: Any, step: float) -> None:
 
 
 class MujocoLoads:
-    """External loads on robot bodies in MuJoCo; see :mod:`.model.external_loads`.
+    """External loads on robot bodies in MuJoCo; see :class:`.ExternalLoads`.
 
     Parameters
     ----------

@@ -18,10 +18,10 @@ from support.slow import some_fast
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Inertia
-from spacerobot_ros.model.external_loads import mean_motion_at
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.model.rotations import matrix_from_rpy
 from spacerobot_ros.resources import robot_file
+from spacerobot_ros.simulation.loads import mean_motion_at
 
 SEEDS = range(20, 24)
 

@@ -25,8 +25,7 @@ from support.wheels import HULL, WHEELS, text, wheeled_robot
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import BufferedFunction
-from spacerobot_ros.model.composite_rigid_body import state_slices
-from spacerobot_ros.model.integration import repeat_step
+from spacerobot_ros.model.integration import repeat_step, state_slices
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.resources import robot_file

@@ -19,14 +19,13 @@ from spacerobot_ros.collision import CollisionGeometry, LinkPair, ObstaclePair
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
-from spacerobot_ros.model.external_loads import EARTH_GRAVITATION
 from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.clearance import ClearanceMonitor, ClearanceStatus
 from spacerobot_ros.simulation.config import OrbitConfig, PlantConfig, TableConfig
-from spacerobot_ros.simulation.loads import PlantLoads, Surroundings
+from spacerobot_ros.simulation.loads import EARTH_GRAVITATION, PlantLoads, Surroundings
 
 DUMBBELL = (
     '<robot name="dumbbell"><link name="bar"><inertial><mass value="2.0"/><inertia ixx="0.3" '

@@ -32,6 +32,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.compilation import source_hash
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.dynamics import momentum_derivatives, solve_positive_definite
+from spacerobot_ros.model.integration import runge_kutta
 from spacerobot_ros.model.symbolic_rotations import (
     half_angle_vector,
     matrix_from_quaternion,
@@ -200,7 +201,7 @@ def thrust_stages(robot: SpaceRobot, levels: int, kind: EndKind) -> Stages:
         source_hash(
             *(__name__, shooting.__name__, momentum_derivatives.__module__),
             *(solve_positive_definite.__module__, quaternion_multiply.__module__),
-            TargetExpression.__module__,
+            *(TargetExpression.__module__, runge_kutta.__module__),
         ),
         robot.equations_key,
         f"levels {levels}",
