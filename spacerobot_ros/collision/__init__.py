@@ -1,14 +1,15 @@
 """Distances between a robot's bodies: solids, pairs, exact checks, and solver functions."""
 
-from spacerobot_ros.collision.distances import Solid
+from spacerobot_ros.collision.distances import Solid, unread_mesh_notes
 from spacerobot_ros.collision.geometry import (
+    Approach,
     BasePoses,
     CollisionGeometry,
     LinkPair,
     ObstaclePair,
-    unread_mesh_notes,
+    nearest_approach,
+    nearest_approaches,
 )
-from spacerobot_ros.collision.nearest import Approach, nearest_approach, nearest_approaches
 
 __all__ = [
     "Approach",

@@ -1,18 +1,21 @@
-"""Collision geometry: the solids of a robot, and pairs that may come into contact.
-
-A link uses the shapes of its ``<collision>`` elements or, if it has none, of its ``<visual>``
-elements. Meshes, closed or open, are replaced by their convex hulls.
+"""Collision geometry: pairs of solids that may come into contact, and their nearest approaches.
 
 A pair is omitted if its solids belong to one body or to neighbouring bodies, if an SRDF disables
 it, or if its solids touch in all of 1000 random configurations (a modelling artefact).
+
+While a command is held, two solids move relative to each other by at most v per tick
+(``CollisionGeometry.largest_lever_arms``). So their distance during the tick is at least
+``(d_0 + d_1 - v) / 2``, where d_0 and d_1 are the distances at the ends of the tick. Ticks for
+which this bound is below the clearance are bisected until v is small. For obstacles, the base
+motion also matters: within a tick, the base moves along a straight line and rotates about one axis.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,14 +25,15 @@ from spacerobot_ros.collision.distances import (
     DistanceFunction,
     Solid,
     distance_function,
+    nearest_points,
+    solids_of,
+    unread_mesh_notes,
 )
-from spacerobot_ros.collision.rounded_box import RoundedBox, nearest_points
-from spacerobot_ros.errors import MeshError, enumeration
+from spacerobot_ros.errors import numbers, quantity
 from spacerobot_ros.model.description import Array, Joint, JointKind, Pose, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
 from spacerobot_ros.model.rotations import matrices_from_quaternions
-from spacerobot_ros.model.visuals import Visual, solid_mesh
 
 _SHAPES, _SEED = 1000, 0
 """Number and seed of the random configurations used to find pairs that are always in contact."""
@@ -39,6 +43,9 @@ _COAXIAL_TOLERANCE = 1e-9
 
 _UNKNOWN_BASE_DISTANCE = 1e9
 """Distance to obstacles if the base pose is unknown, m; large, so that obstacles are ignored."""
+
+_MOTION_RESOLUTION = 5e-4
+"""Largest relative motion of a pair between two evaluations of its distance, m."""
 
 
 class LinkPair(NamedTuple):
@@ -92,38 +99,6 @@ class BasePoses(NamedTuple):
         """Attitudes ``R_BW`` (N, 3, 3) and positions ``r_BW_B`` (N, 3) of the world, m."""
         R_BW = np.swapaxes(matrices_from_quaternions(self.quaternion), 1, 2)
         return R_BW, -np.einsum("nab,nb->na", R_BW, self.position)
-
-
-@dataclass(frozen=True)
-class UnreadMesh:
-    """An unreadable mesh: some contacts of its link are not detected.
-
-    Attributes
-    ----------
-    link
-        Name of its link.
-    reason
-        A sentence with the reason.
-    is_collision_shape
-        Whether the mesh belongs to a ``<collision>`` and not only to a ``<visual>``.
-    """
-
-    link: str
-    reason: str
-    is_collision_shape: bool
-
-
-def unread_mesh_notes(meshes: Sequence[UnreadMesh]) -> list[str]:
-    """Return a one-sentence warning for each reason why meshes cannot be read."""
-    links: dict[str, list[str]] = {}
-    for each in meshes:
-        links.setdefault(each.reason, []).append(each.link)
-    notes = []
-    for reason, named in links.items():
-        quoted = enumeration(f"'{name}'" for name in dict.fromkeys(named))
-        which = "link" if len(set(named)) == 1 else "links"
-        notes.append(f"Some contacts of {which} {quoted} are not detected: {reason}")
-    return notes
 
 
 Poses = tuple[Array, Array]
@@ -324,17 +299,6 @@ class CollisionGeometry:
             distances[at[nearer]], pairs[at[nearer]] = found[nearer], pair
         return distances, pairs
 
-    def keep_apart(self, poses: Poses, required: Array) -> bool:
-        """Whether all pairs keep their ``required`` distances (P,), m, at all sets of poses."""
-        R, r = poses
-        bounds = self.lower_bounds(poses) - required
-        least = bounds.min(axis=0)
-        for pair in np.argsort(least, kind="stable")[: np.count_nonzero(least < 0)].tolist():
-            at = np.flatnonzero(bounds[:, pair] < 0)
-            if (self.distances(pair, (R[at], r[at])) < required[pair]).any():
-                return False
-        return True
-
     def links_in_contact(self, poses: Poses) -> frozenset[LinkPair]:
         """Return the pairs of links in contact at one set of poses."""
         near = np.flatnonzero(self.lower_bounds(poses)[0] <= 0).tolist()
@@ -458,87 +422,165 @@ def _solid_in_world(obstacle: Solid, pose: Pose) -> Solid:
     )
 
 
-# -- solids -------------------------------------------------------------------------------------
+# -- nearest approaches while commands are held ----------------------------------------------------
 
 
-def solids_of(
-    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
-) -> tuple[tuple[Solid, ...], tuple[str, ...], tuple[UnreadMesh, ...]]:
-    """Return the solids of a robot, notes on links whose geometry may be unexpected, and meshes
-    that cannot be read. See :class:`CollisionGeometry` for ``mesh_of``.
+@dataclass(frozen=True)
+class Approach:
+    """Nearest approach of a pair.
+
+    Attributes
+    ----------
+    links
+        Names of the links.
+    pair
+        Index of the pair in :attr:`CollisionGeometry.pairs`.
+    distance
+        m; negative: penetration depth.
+    tick
+        Time of the approach, in ticks from the first configuration.
+    shape
+        (n,) configuration at that time, m or rad.
+    place_on_obstacle
+        (3,) nearest obstacle point in W, m; None for two links.
     """
-    solids: list[Solid] = []
-    notes: list[str] = []
-    unread: list[UnreadMesh] = []
-    drawn = [link.name for link in robot.links if link.shapes and not link.collisions]
-    if drawn and any(link.collisions for link in robot.links):
-        names = ", ".join(f"'{name}'" for name in drawn[:3]) + ", ..." * (len(drawn) > 3)
-        notes.append(f"Links without <collision> use the shapes of their <visual>: {names}.")
-    elif drawn:
-        notes.append("No link has a <collision>: distances are computed from the <visual> shapes.")
-    for link in robot.links:
-        body = robot.frames[link.name][0]
-        for shape in link.collisions or link.shapes:
-            if shape.kind == "mesh":
-                try:
-                    vertices = mesh_of(shape).vertices
-                except MeshError as error:
-                    unread.append(UnreadMesh(link.name, str(error), bool(link.collisions)))
-                    continue
-                hull = _convex_hull(vertices)
-                vertices = vertices if hull is None else vertices[hull.vertices]
-                enclosure = RoundedBox.around(shape, vertices)
-                solids.append(Solid(link.name, body, shape, enclosure, vertices))
-            elif max(shape.size) > 0:
-                solids.append(Solid(link.name, body, shape, RoundedBox.around(shape)))
-    return tuple(solids), tuple(notes), tuple(unread)
+
+    links: LinkPair
+    pair: int
+    distance: float
+    tick: float
+    shape: Array
+    place_on_obstacle: Array | None = None
+
+    def __str__(self) -> str:
+        where = ""
+        if self.place_on_obstacle is not None:
+            where = f" near ({numbers(self.place_on_obstacle, 3)}) m"
+        if self.distance <= 0:
+            return f"{self.links.subject} touch, {quantity(-self.distance, 'm')} deep{where}"
+        return f"{self.links.subject} come within {quantity(self.distance, 'm')}{where}"
 
 
-def _convex_hull(points: Array) -> Any:
-    """Return the convex hull of points (V, 3) by scipy; None if they are coplanar."""
-    # Slow to import, and few robots have meshes.
-    from scipy.spatial import ConvexHull, QhullError
+@dataclass(frozen=True)
+class _Path:
+    """A path of shapes (N + 1, n) at the ticks, with the base poses if obstacles matter, else None.
 
-    try:
-        return ConvexHull(points)
-    except QhullError:
+    ``largest_motions`` (N, P) are the largest relative motions of pairs in each tick, m, and
+    ``lower_bounds`` (N, P) lower bounds on their distances in each tick, m.
+    """
+
+    positions: Array
+    base: BasePoses | None
+    largest_motions: Array
+    lower_bounds: Array
+
+    @classmethod
+    def of(cls, geometry: CollisionGeometry, positions: Array, base: BasePoses | None) -> _Path:
+        if len(positions) == 1:
+            twice = np.zeros(2, dtype=np.int64)
+            positions, base = positions[twice], None if base is None else base.rows(twice)
+        bounds = geometry.lower_bounds(geometry.poses(positions, base))
+        reaches, from_base = geometry.largest_lever_arms(positions)
+        moved = np.abs(np.diff(geometry.moving_positions(positions), axis=0))
+        motion = moved @ reaches.T
+        if base is not None and geometry.with_obstacles.any():
+            straight = np.linalg.norm(np.diff(base.position, axis=0), axis=1)
+            # Quaternions contain half the angle.
+            chord = np.linalg.norm(np.diff(base.quaternion, axis=0), axis=1)
+            turned = 4 * np.arcsin(np.minimum(np.minimum(chord, np.sqrt(4 - chord**2)) / 2, 1.0))
+            motion += np.outer(turned, from_base) + np.outer(straight, geometry.with_obstacles)
+        return cls(positions, base, motion, (bounds[:-1] + bounds[1:] - motion) / 2)
+
+    def interpolated(self, ticks: Array) -> tuple[Array, BasePoses | None]:
+        """Return configurations (K, n) and base poses at times (K,) in ticks."""
+        before = np.minimum(ticks.astype(int), len(self.positions) - 2)
+        share = (ticks - before)[:, np.newaxis]
+        shapes = (1 - share) * self.positions[before] + share * self.positions[before + 1]
+        return shapes, None if self.base is None else self.base.between(before, share)
+
+
+def nearest_approaches(
+    geometry: CollisionGeometry,
+    positions: Array,
+    required: Array,
+    base: BasePoses | None = None,
+) -> list[Approach]:
+    """Return the nearest approaches of all pairs that come closer than allowed, nearest first.
+
+    Parameters
+    ----------
+    geometry
+        The solids and pairs.
+    positions
+        (N + 1, n) configurations at the ticks, interpolated linearly in between, m or rad.
+    required
+        (P,) smallest allowed distances of the pairs, m; minus infinity: any distance.
+    base
+        Base poses at the ticks; None: obstacles are ignored.
+    """
+    if not len(geometry.pairs):
+        return []
+    path = _Path.of(geometry, positions, base)
+    near = np.flatnonzero(path.lower_bounds.min(axis=0) < required)
+    found = (_nearest(geometry, path, p, required[p]) for p in near.tolist())
+    return sorted((each for each in found if each), key=lambda each: each.distance)
+
+
+def nearest_approach(
+    geometry: CollisionGeometry, positions: Array, base: BasePoses | None = None
+) -> Approach | None:
+    """Return the nearest approach of all pairs along a path (N + 1, n); None: no pairs.
+
+    ``base`` contains the base poses at the ticks; None: obstacles are ignored.
+    """
+    if not len(geometry.pairs):
         return None
+    path = _Path.of(geometry, positions, base)
+    least = path.lower_bounds.min(axis=0)
+    best: Approach | None = None
+    for pair in np.argsort(least, kind="stable").tolist():
+        if best is not None and least[pair] >= best.distance:
+            break
+        limit = np.inf if best is None else best.distance
+        best = _nearest(geometry, path, pair, limit) or best
+    return best
 
 
-# -- as triangles, for pages and pictures ---------------------------------------------------------
+def _nearest(geometry: CollisionGeometry, path: _Path, pair: int, limit: float) -> Approach | None:
+    """Return the nearest approach of a pair; None if it does not come nearer than limit."""
 
+    def distances(ticks: Array) -> Array:
+        return geometry.distances(pair, geometry.poses(*path.interpolated(ticks)))
 
-def collision_visuals(
-    robot: RobotDescription, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
-) -> tuple[Visual, ...]:
-    """Return the solids used for distances: hulls of meshes, except for unreadable ones.
-
-    See :class:`~spacerobot_ros.collision.geometry.CollisionGeometry` for ``mesh_of``.
-    """
-    solids, _, _ = solids_of(robot, mesh_of)
-    return tuple(Visual(each.link, each.body, each.shape, _mesh_of(each)) for each in solids)
-
-
-def obstacle_visuals(
-    world: RobotDescription | None, mesh_of: Callable[[Shape], TriangleMesh] = shape_mesh
-) -> tuple[tuple[Visual, Pose], ...]:
-    """Return solids of obstacles, each with its link pose in W; see :func:`collision_visuals`."""
-    if world is None:
-        return ()
-    return tuple((each, world.frames[each.link][1]) for each in collision_visuals(world, mesh_of))
-
-
-def _mesh_of(solid: Solid) -> TriangleMesh:
-    """Return the triangles of a solid; none for a flat hull."""
-    points = solid.vertices
-    if points is None:
-        return solid_mesh(solid.shape)
-    hull = _convex_hull(points)
-    if hull is None:
-        return TriangleMesh(points, np.zeros((0, 3), np.int32))
-    faces = hull.simplices.astype(np.int32)
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    # Corners are in counterclockwise order when viewed from outside.
-    inward = np.einsum("ka,ka->k", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return TriangleMesh(points, faces)
+    close = path.lower_bounds[:, pair] < limit
+    starts = np.flatnonzero(close)
+    if not len(starts):
+        return None
+    ticks = np.flatnonzero(np.append(close, False) | np.append(False, close)).astype(float)
+    known = distances(ticks)
+    least = int(np.argmin(known))
+    best, at = float(known[least]), float(ticks[least])
+    index = np.searchsorted(ticks, starts)
+    left, right = starts.astype(float), starts + 1.0
+    d_0, d_1, v = known[index], known[index + 1], path.largest_motions[starts, pair]
+    while True:
+        # Only where the distance may be smaller than all known ones, and relevant.
+        open_ = ((d_0 + d_1 - v) / 2 < min(best, limit)) & (v > _MOTION_RESOLUTION)
+        if not open_.any():
+            break
+        left, right, d_0, d_1, v = (x[open_] for x in (left, right, d_0, d_1, v))
+        middle = (left + right) / 2
+        d = distances(middle)
+        least = int(np.argmin(d))
+        if d[least] < best:
+            best, at = float(d[least]), float(middle[least])
+        left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
+        d_0, d_1 = np.concatenate([d_0, d]), np.concatenate([d, d_1])
+        v = np.concatenate([v, v]) / 2
+    if best >= limit:
+        return None
+    shapes, base = path.interpolated(np.array([at]))
+    place = None
+    if base is not None and geometry.with_obstacles[pair]:
+        place = geometry.nearest_point_on_obstacle(pair, shapes[0], base)
+    return Approach(geometry.links_of(pair), pair, best, at, shapes[0], place)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.collision.geometry import obstacle_visuals
+from spacerobot_ros.collision.distances import obstacle_visuals
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.control.status import ControllerStatus
 from spacerobot_ros.errors import MeshError

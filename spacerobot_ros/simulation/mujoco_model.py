@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from spacerobot_ros.collision import CollisionGeometry, Solid
-from spacerobot_ros.collision.geometry import solids_of
+from spacerobot_ros.collision.distances import solids_of
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.composite_rigid_body import LoadLayout

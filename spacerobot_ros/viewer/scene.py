@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from spacerobot_ros.collision.geometry import collision_visuals, obstacle_visuals
+from spacerobot_ros.collision.distances import collision_visuals, obstacle_visuals
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
 from spacerobot_ros.model.thrusters import ThrusterTable

@@ -16,7 +16,7 @@ from spacerobot_ros.collision import (
     nearest_approach,
     nearest_approaches,
 )
-from spacerobot_ros.collision.rounded_box import RoundedBox, widest_gaps
+from spacerobot_ros.collision.distances import RoundedBox, widest_gaps
 from spacerobot_ros.model import RobotDescription, load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_rpy

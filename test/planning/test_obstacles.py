@@ -20,7 +20,7 @@ from support.planner_phases import resting
 from support.urdf_text import numbers
 
 from spacerobot_ros.collision import CollisionGeometry
-from spacerobot_ros.collision.nearest import Approach
+from spacerobot_ros.collision.geometry import Approach
 from spacerobot_ros.collision.planes import PlaneDistances
 from spacerobot_ros.errors import ParameterError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.flight.trials import PlanningProblem

@@ -19,7 +19,7 @@ from support.made_bags import pose as pose_at
 from support.oracles import PinocchioOracle
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.collision.geometry import obstacle_visuals
+from spacerobot_ros.collision.distances import obstacle_visuals
 from spacerobot_ros.errors import MeshError
 from spacerobot_ros.flight.series import SentGoal, Signal, goal_at_end, reported_goal
 from spacerobot_ros.model.description import Array, Shape

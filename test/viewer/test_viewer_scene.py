@@ -15,7 +15,7 @@ from support.random_robots import random_chain_urdf
 from support.urdf_text import without_collisions
 from support.viewer_page import FIELD_OF_VIEW
 
-from spacerobot_ros.collision.geometry import collision_visuals
+from spacerobot_ros.collision.distances import collision_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.description import Array
