@@ -15,9 +15,12 @@ The command is ``[tau; f; n]``, (n + 6,): joint efforts (N or N m), then force (
 at the base link origin, in the base frame. The attitude is integrated in R^4 and normalised
 after each Runge-Kutta step.
 
-Under external loads (:class:`.ExternalLoads`), the state ends with the time (s),
-and the command ends with the load vector. Both momenta change due to the load on
-the whole robot, uniform gravity and friction.
+Under external loads (:class:`.ExternalLoads`, derived in docs/theory/external_loads.md), the state
+ends with the time (s), and the command ends with the load vector (:class:`LoadLayout`). Both
+momenta change due to the load on the whole robot, uniform gravity and friction. All times are in
+plant time. Frame W is in free fall on a circular orbit with mean motion n and does not rotate. The
+orbital frame O has its x axis radially outward and its z axis along the orbit normal; ``R_WO`` is
+the attitude of O at time zero, ``o`` the unit vector along the radius.
 """
 
 from __future__ import annotations
@@ -28,26 +31,25 @@ from functools import partial
 from typing import TypeVar
 
 import casadi as ca
+import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import dense_function
-from spacerobot_ros.model.composite_rigid_body import (
+from spacerobot_ros.model.dynamics import (
     ExternalLoads,
-    LoadLayout,
     SymmetricFactor,
     composites,
     external_force,
-    external_loads,
     shape_forces,
     shape_system,
+    solve_positive_definite,
 )
-from spacerobot_ros.model.dynamics import solve_positive_definite
+from spacerobot_ros.model.inertial_parameters import rotational
 from spacerobot_ros.model.kinematics import TreeKinematics
 from spacerobot_ros.model.symbolic_rotations import matrix_from_quaternion, quaternion_rate
 
 DEFAULT_INTEGRATION_STEP = 0.01
 """Longest Runge-Kutta step for the attitude under held joint velocities, s."""
-
 
 Expression = TypeVar("Expression", ca.SX, ca.MX)
 
@@ -254,3 +256,90 @@ def _equations(
     later = [R_WB @ external[3:] + p_dot, R_WB @ external[:3] + L_dot, p_W / kin.total_mass]
     inputs, rates = {"x": x, "command": command}, [qdot, quaternion_rate(quaternion, omega)]
     return inputs, system.K, Q, rates, [*later, 1.0] if loaded else later
+
+
+# -- external loads ------------------------------------------------------------------------------
+
+
+class LoadLayout:
+    """Slices of the load vector for a robot with L links.
+
+    Attributes
+    ----------
+    in_link, in_world
+        Force (N) and torque (N m) at the origin of every link, in link components and in W
+        components: (6 L,) each.
+    mean_motion
+        Mean motion of the orbit, rad/s; zero if there is no gravity gradient.
+    quaternion_WO
+        Attitude (x, y, z, w) of the orbital frame in W at time zero.
+    gravity_W
+        Uniform acceleration (3,), m/s^2.
+    friction
+        Viscous friction force on a body divided by the body's momentum, 1/s.
+    time
+        Time at the beginning of the tick, s.
+    size
+        Length of the vector.
+    """
+
+    def __init__(self, links: int) -> None:
+        ends = np.cumsum([6 * links, 6 * links, 1, 4, 3, 1, 1]).tolist()
+        self.in_link, self.in_world, self.mean_motion, self.quaternion_WO, *rest = map(
+            slice, [0, *ends], ends
+        )
+        self.gravity_W, self.friction, self.time = rest
+        self.size: int = ends[-1]
+
+
+def external_loads(
+    kin: TreeKinematics,
+    second_moments: tuple[ca.SX, ...],
+    quaternion: ca.SX,
+    r_WC_W: ca.SX,
+    loads: ca.SX,
+    time: ca.SX,
+) -> ExternalLoads:
+    """Return the loads in a state.
+
+    Parameters
+    ----------
+    kin
+        The kinematics.
+    second_moments
+        (3, 3) second moment of mass of every body about its own centre, in the base frame.
+    quaternion
+        (4,) of ``R_WB``.
+    r_WC_W
+        (3,) position of the system's centre of mass, m.
+    loads
+        The vector of :class:`LoadLayout`.
+    time
+        Time, s.
+    """
+    links = [link.name for link in kin.robot.links]
+    layout = LoadLayout(len(links))
+    R_BW = matrix_from_quaternion(quaternion).T
+    forces = [ca.SX(6, 1) for _ in kin.robot.bodies]
+    in_link, in_world = (
+        ca.reshape(loads[part], 6, len(links)) for part in (layout.in_link, layout.in_world)
+    )
+    for i, link in enumerate(links):
+        R_BL, r_BL_B, body = kin.frame(link)
+        force = R_BL @ in_link[:3, i] + R_BW @ in_world[:3, i]
+        torque = R_BL @ in_link[3:, i] + R_BW @ in_world[3:, i]
+        forces[body] += ca.vertcat(torque + ca.cross(r_BL_B - kin.r_BC_B, force), force)
+    n = loads[layout.mean_motion]
+    angle = n * time
+    radius_O = ca.vertcat(ca.cos(angle), ca.sin(angle), 0)
+    o = R_BW @ (matrix_from_quaternion(loads[layout.quaternion_WO]) @ radius_O)
+    r_WC_B = R_BW @ r_WC_W
+    for k, J in enumerate(second_moments):
+        arm = kin.com[k] - kin.r_BC_B
+        r = r_WC_B + arm
+        force = kin.mass(k) * n**2 * (3 * ca.dot(o, r) * o - r)
+        moment = ca.cross(arm, force) + 3 * n**2 * ca.cross(o, rotational(J) @ o)
+        forces[k] += ca.vertcat(moment, force)
+    for k in range(kin.moving_body_count, 0, -1):
+        forces[kin.parent(k)] += forces[k]
+    return ExternalLoads(tuple(forces), loads[layout.gravity_W], loads[layout.friction])

@@ -22,20 +22,16 @@ from spacerobot_ros.model.compilation import (
     compiled,
     dense_function,
 )
-from spacerobot_ros.model.composite_rigid_body import (
-    ExternalLoads,
-    LoadLayout,
-    composite_dynamics,
-    composites,
-    external_loads,
-    joint_efforts,
-)
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import (
+    ExternalLoads,
     base_twist,
     bias,
+    composite_dynamics,
+    composites,
     connection,
     curvature,
+    joint_efforts,
     momentum_derivatives,
     momentum_of_bodies,
     point_jacobian,
@@ -46,8 +42,10 @@ from spacerobot_ros.model.inertial_parameters import (
     possibly_nonzero_entries,
 )
 from spacerobot_ros.model.integration import (
+    LoadLayout,
     attitude_step,
     divided_step,
+    external_loads,
     runge_kutta_step,
     servo_rate,
     shape_equations,

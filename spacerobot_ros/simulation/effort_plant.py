@@ -33,9 +33,8 @@ from typing_extensions import override
 
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.composite_rigid_body import LoadLayout
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import repeat_step, state_slices
+from spacerobot_ros.model.integration import LoadLayout, repeat_step, state_slices
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.plant import CompiledPlant, Flags, body_outputs

@@ -9,9 +9,9 @@ import numpy as np
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.composite_rigid_body import LoadLayout
 from spacerobot_ros.model.description import Array, Inertia, Pose, plane_normal
 from spacerobot_ros.model.grasp import BodyMotion
+from spacerobot_ros.model.integration import LoadLayout
 from spacerobot_ros.model.rotations import matrix_from_quaternion, unit_quaternion
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 

@@ -13,8 +13,8 @@ from spacerobot_ros.collision import CollisionGeometry, Solid
 from spacerobot_ros.collision.distances import solids_of
 from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.lazy import optional_module
-from spacerobot_ros.model.composite_rigid_body import LoadLayout
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
+from spacerobot_ros.model.integration import LoadLayout
 from spacerobot_ros.model.rotations import (
     cross,
     matrix_from_quaternion,

@@ -15,9 +15,8 @@ from typing_extensions import override
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.composite_rigid_body import LoadLayout
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
+from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP, LoadLayout
 from spacerobot_ros.model.model_functions import Composition
 from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.plant import CompiledPlant, Flags, body_outputs

@@ -24,7 +24,7 @@ from support.oracles.barycentric import barycentric_inertia
 from support.random_robots import random_chain_urdf, random_robot_urdf
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.composite_rigid_body import composites
+from spacerobot_ros.model.dynamics import composites
 from spacerobot_ros.model.integration import state_slices
 from spacerobot_ros.model.kinematics import ForwardKinematics, tree_kinematics
 from spacerobot_ros.model.rotations import matrix_from_quaternion
