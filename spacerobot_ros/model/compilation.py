@@ -38,6 +38,13 @@ _FLAGS = ("-Og", "-fPIC", "-shared", "-ffp-contract=off")
 and run no faster. Fused multiply-adds are disabled, because with them results would depend on the
 processor."""
 
+Language = Literal["c", "cpp"]
+_COMPILERS = {
+    "c": ("C", "CC", "cc", "gcc", "clang"),
+    "cpp": ("C++", "CXX", "c++", "g++", "clang++"),
+}
+"""Name, environment variable and commands of the compilers of each language."""
+
 announcement_listeners: list[Callable[[str], None]] = []
 """Functions called with a message, which is also logged, when a long computation begins."""
 
@@ -157,7 +164,7 @@ def load_library(
     *,
     flags: Sequence[str] = (),
     libraries: Sequence[str] = (),
-    language: Literal["c", "cpp"] = "c",
+    language: Language = "c",
     builds: bool = True,
 ) -> _Loaded:
     """Load the shared object for a source, compiling it first if it is not cached.
@@ -186,11 +193,12 @@ def load_library(
     NoLibraryError
         The object cannot be built or loaded; the message is a clause that states the reason.
     """
-    compiler = c_compiler() if language == "c" else cxx_compiler()
+    compiler = find_compiler(language)
     if compiler is None:
-        names = {"c": "C compiler ($CC, cc, gcc or clang)"}
-        names["cpp"] = "C++ compiler ($CXX, c++, g++ or clang++)"
-        raise NoLibraryError(f"no {names[language]} was found")
+        kind, variable, *names, last = _COMPILERS[language]
+        raise NoLibraryError(
+            f"no {kind} compiler (${variable}, {', '.join(names)} or {last}) was found"
+        )
     words = [compiler, *_FLAGS, *flags]
     machine = [sysconfig.get_platform(), *platform.libc_ver()]
     key = _hash_text("\n".join([*machine, *words, *libraries, source]))
@@ -286,27 +294,15 @@ def cached_function(name: str, key: str, build: Callable[[], ca.Function]) -> ca
 
 def compilation_settings() -> tuple[str, ...]:
     """Return the compiler and the cache folder, on which compiled functions depend."""
-    return (c_compiler() or "", str(cache_directory()))
+    return (find_compiler() or "", str(cache_directory()))
 
 
-def c_compiler() -> str | None:
-    """Return the C compiler in use: ``$CC``, ``cc``, ``gcc`` or ``clang``, or None."""
-    return _compiler(os.environ.get("CC"), "cc", "gcc", "clang")
-
-
-def cxx_compiler() -> str | None:
-    """Return the C++ compiler in use: ``$CXX``, ``c++``, ``g++`` or ``clang++``, or None."""
-    return _compiler(os.environ.get("CXX"), "c++", "g++", "clang++")
-
-
-def _compiler(*candidates: str | None) -> str | None:
-    if not _is_compilation_enabled():
-        return None
-    for candidate in candidates:
-        found = shutil.which(candidate) if candidate else None
-        if found:
-            return found
-    return None
+def find_compiler(language: Language = "c") -> str | None:
+    """Return the compiler in use: ``$CC``, ``cc``, ``gcc`` or ``clang`` for C, and ``$CXX``,
+    ``c++``, ``g++`` or ``clang++`` for C++; None if there is none."""
+    _, variable, *names = _COMPILERS[language]
+    candidates = [os.environ.get(variable), *names] if _is_compilation_enabled() else []
+    return next((path for each in candidates if each and (path := shutil.which(each))), None)
 
 
 def cache_directory() -> Path:

@@ -135,27 +135,31 @@ class ThrusterTable:
         return ", ".join(lacking)
 
 
-def find_thrusters(source: str, robot: RobotDescription) -> ThrusterTable:
-    """Return the table from :data:`IN_URDF` or from a YAML file.
+def find_thrusters(source: str | Path, robot: RobotDescription) -> ThrusterTable:
+    """Return the table from :data:`IN_URDF`, the ``<thruster>`` elements in the robot's URDF, or
+    from a YAML file that contains a list ``thrusters`` and, for common values, a mapping
+    ``defaults``.
 
     Raises
     ------
     ParameterError
-        The file or a thruster in it is invalid.
+        The file cannot be read, or a thruster in it is invalid.
     RobotDescriptionError
         A thruster in the URDF is invalid, or the URDF has no thrusters.
     """
-    return thrusters_of_urdf(robot) if source == IN_URDF else load_thrusters(source, robot)
+    refused: type[SpaceRobotError] = ParameterError
+    if source == IN_URDF:
+        refused, source = RobotDescriptionError, f"The URDF of robot '{robot.name}'"
+        entries = _entries_of_urdf(robot)
+    else:
+        entries = _entries_of_file(source)
+    try:
+        return _thruster_table(entries, robot)
+    except ParameterError as error:
+        raise refused(f"{source}: {error}") from error
 
 
-def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:
-    """Read the ``<thruster>`` elements from the robot's URDF.
-
-    Raises
-    ------
-    RobotDescriptionError
-        There are no thrusters, or a thruster is invalid.
-    """
+def _entries_of_urdf(robot: RobotDescription) -> list[dict[str, Any]]:
     entries = []
     for element in ET.fromstring(robot.urdf.encode("utf-8")).findall("thruster"):
         entry: dict[str, Any] = dict(element.attrib)
@@ -173,21 +177,10 @@ def thrusters_of_urdf(robot: RobotDescription) -> ThrusterTable:
             f"The URDF of robot '{robot.name}' has no <thruster> elements; "
             "add them, or give a YAML file of thrusters."
         )
-    try:
-        return _thruster_table(entries, robot)
-    except ParameterError as error:
-        raise RobotDescriptionError(f"The URDF of robot '{robot.name}': {error}") from error
+    return entries
 
 
-def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
-    """Read a YAML file that contains a list ``thrusters`` and, for common values, a mapping
-    ``defaults``.
-
-    Raises
-    ------
-    ParameterError
-        The file cannot be read, or a thruster is invalid.
-    """
+def _entries_of_file(path: str | Path) -> list[dict[str, Any]]:
     try:
         content = load_yaml(read_regular(path).decode("utf-8"))
     except (OSError, ValueError) as error:
@@ -200,12 +193,9 @@ def load_thrusters(path: str | Path, robot: RobotDescription) -> ThrusterTable:
         raise ParameterError(
             f"The thruster file {path} must have a list 'thrusters'; 'defaults' must be a mapping."
         )
-    try:
-        if not all(isinstance(entry, dict) for entry in entries):
-            raise ParameterError("An entry of 'thrusters' is not a mapping.")
-        return _thruster_table([{**defaults, **entry} for entry in entries], robot)
-    except SpaceRobotError as error:
-        raise ParameterError(f"{path}: {error}") from error
+    if not all(isinstance(entry, dict) for entry in entries):
+        raise ParameterError(f"{path}: An entry of 'thrusters' is not a mapping.")
+    return [{**defaults, **entry} for entry in entries]
 
 
 def _thruster_table(entries: Sequence[Mapping[str, Any]], robot: RobotDescription) -> ThrusterTable:

@@ -46,7 +46,7 @@ from spacerobot_ros.model import (
     load_robot,
     parse_robot,
 )
-from spacerobot_ros.model.compilation import cxx_compiler
+from spacerobot_ros.model.compilation import find_compiler
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation import InitialState
@@ -240,7 +240,7 @@ def test_without_vector_functions_of_the_c_library_lanes_fly_as_well(
     flights = velocity_flights(robots["servicer"], 9, each=True, deadband=0.0)
     with_functions = fly_lanes(flights)
     compiler = tmp_path / "c++"
-    script = f'#!/bin/sh\ncase "$*" in *-lmvec*) exit 1;; esac\nexec {cxx_compiler()} "$@"\n'
+    script = f'#!/bin/sh\ncase "$*" in *-lmvec*) exit 1;; esac\nexec {find_compiler("cpp")} "$@"\n'
     compiler.write_text(script, encoding="utf-8")
     compiler.chmod(0o700)
     monkeypatch.setenv("CXX", str(compiler))

@@ -18,13 +18,12 @@ from spacerobot_ros.model.thrusters import (
     ThrusterAllocation,
     ThrusterModulator,
     ThrusterTable,
-    load_thrusters,
-    thrusters_of_urdf,
+    find_thrusters,
 )
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.resources import share_directory
 
-SERVICER = thrusters_of_urdf(load_robot(share_directory() / "urdf" / "servicer.urdf"))
+SERVICER = find_thrusters("urdf", load_robot(share_directory() / "urdf" / "servicer.urdf"))
 ALWAYS = np.full(24, np.inf)
 
 
@@ -181,7 +180,7 @@ GOOD: dict[str, Any] = {
 def of_yaml(folder: Path, entries: Any, **others: Any) -> ThrusterTable:
     path = folder / "table.yaml"
     path.write_text(yaml.safe_dump({"thrusters": entries, **others}), encoding="utf-8")
-    return load_thrusters(path, parse_robot(URDF.format(thrusters="")))
+    return find_thrusters(path, parse_robot(URDF.format(thrusters="")))
 
 
 def box() -> list[dict[str, Any]]:
@@ -208,7 +207,7 @@ def test_a_thruster_on_a_mounted_link_acts_on_the_base(
         '<axis xyz="2 0 0"/><thrust force="5" min_on_time="0.01" isp="200"/></thruster>'
     )
     for table in (
-        thrusters_of_urdf(parse_robot(URDF.format(thrusters=element))),
+        find_thrusters("urdf", parse_robot(URDF.format(thrusters=element))),
         of_yaml(tmp_path, [GOOD]),
     ):
         # By hand: the pod is 1 m along y of the bus and turned by a quarter about z.
@@ -260,14 +259,14 @@ def test_files_without_thrusters_are_refused(entries: Any, tmp_path: Path) -> No
     with pytest.raises(ParameterError, match=r"table\.yaml"):
         of_yaml(tmp_path, entries)
     with pytest.raises(ParameterError, match="cannot be read"):
-        load_thrusters(tmp_path / "none.yaml", parse_robot(URDF.format(thrusters="")))
+        find_thrusters(tmp_path / "none.yaml", parse_robot(URDF.format(thrusters="")))
 
 
 def test_a_urdf_without_thrusters_is_refused() -> None:
     with pytest.raises(RobotDescriptionError, match="has no <thruster> elements"):
-        thrusters_of_urdf(parse_robot(URDF.format(thrusters="")))
+        find_thrusters("urdf", parse_robot(URDF.format(thrusters="")))
     with pytest.raises(RobotDescriptionError, match="'tug': The position of thruster 'a'"):
-        thrusters_of_urdf(parse_robot(URDF.format(thrusters='<thruster name="a"/>')))
+        find_thrusters("urdf", parse_robot(URDF.format(thrusters='<thruster name="a"/>')))
 
 
 def test_what_a_table_cannot_give_is_named(tmp_path: Path) -> None:

@@ -10,13 +10,13 @@ import pytest
 from policies.network import Policy
 
 import spacerobot_ros.environments  # noqa: F401 - registers the environments
-from spacerobot_ros.model.compilation import cxx_compiler
+from spacerobot_ros.model.compilation import find_compiler
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
+@pytest.mark.skipif(find_compiler("cpp") is None, reason="there is no C++ compiler")
 def test_the_policy_of_the_examples_reaches_its_goals() -> None:
     policy = Policy.load(ROOT / "examples" / "policies" / "reorient_arm.npz")
     env = gymnasium.make_vec(

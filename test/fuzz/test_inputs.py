@@ -34,7 +34,7 @@ from spacerobot_ros.errors import (
 from spacerobot_ros.messages.readers import TemplateReader
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
-from spacerobot_ros.model.thrusters import load_thrusters, thrusters_of_urdf
+from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.nodes import NODE_TYPES, ReplayNode
 from spacerobot_ros.nodes.common.node import AUTOSTART, FlightNode
@@ -350,7 +350,7 @@ def robot() -> RobotDescription:
 @fuzz("thruster table", CHANGES, fast=40, long=800)
 def test_a_changed_table_of_thrusters(tmp_path: Path, changes: Any) -> None:
     file = write(tmp_path / "t.yaml", with_changes(TABLE, changes))
-    table = attempt("thruster table", load_thrusters, file, robot())
+    table = attempt("thruster table", find_thrusters, file, robot())
     if table is not None:
         assert np.all(np.isfinite(table.wrenches))
         assert np.all(np.isfinite(table.mass_flow))
@@ -361,7 +361,7 @@ def test_a_changed_table_of_thrusters(tmp_path: Path, changes: Any) -> None:
 def test_a_damaged_table_of_thrusters(tmp_path: Path, raw: bytes) -> None:
     path = tmp_path / "t.yaml"
     path.write_bytes(raw)
-    attempt("damaged thruster table", load_thrusters, path, robot())
+    attempt("damaged thruster table", find_thrusters, path, robot())
 
 
 # -- URDFs with elements and attributes changed: a robot whose numbers are finite, or a --------
@@ -425,7 +425,7 @@ def test_a_changed_urdf(text: str) -> None:
     for link in robot.links:
         for shape in link.shapes:
             assert np.all(np.isfinite([*shape.size, *shape.rgba]))
-    attempt("URDF", thrusters_of_urdf, robot)
+    attempt("URDF", find_thrusters, "urdf", robot)
 
 
 @fuzz("model", MUTANTS, fast=8, long=150)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from spacerobot_ros.model.compilation import c_compiler
+from spacerobot_ros.model.compilation import find_compiler
 
 
 @pytest.fixture(autouse=True)
@@ -23,6 +23,6 @@ def compiled_code(monkeypatch: pytest.MonkeyPatch, _object_directory: Path) -> P
     """Run in generated C, kept in the folder that is returned; skip where there is no compiler."""
     monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
     monkeypatch.setenv("SPACEROBOT_CACHE_DIR", str(_object_directory))
-    if c_compiler() is None:
+    if find_compiler() is None:
         pytest.skip("no C compiler")
     return _object_directory

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import c_compiler, cached_function, compiled, load_library
+from spacerobot_ros.model.compilation import cached_function, compiled, find_compiler, load_library
 from spacerobot_ros.resources import robot_file
 
 Compiler = Callable[[str], Path]
@@ -33,7 +33,7 @@ def cache(compiled_code: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
 @pytest.fixture
 def compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Compiler:
     """Return what makes the machine's C compiler a shell script; ``$CC`` in it is the real one."""
-    real = c_compiler()
+    real = find_compiler()
 
     def install(script: str) -> Path:
         path = tmp_path / "cc"

@@ -15,7 +15,7 @@ from support.thrust_flights import FOLDED, beyond, flown_by_pinocchio
 from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import RobotMotion
-from spacerobot_ros.model.thrusters import ThrusterTable, thrusters_of_urdf
+from spacerobot_ros.model.thrusters import ThrusterTable, find_thrusters
 from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
 from spacerobot_ros.planning.methods.thrust.problem import Propulsion, ThrustGoal, ThrustOptions
@@ -65,7 +65,7 @@ def test_shortest_times_and_least_impulses_are_those_of_closed_forms(rotates: bo
 
 def test_a_cube_turns_on_the_way_where_that_lets_more_thrusters_push() -> None:
     robot = SpaceRobot.from_file(robot_file("jet_cube"))
-    table = thrusters_of_urdf(robot.description)
+    table = find_thrusters("urdf", robot.description)
     # Along an axis of the body; other thrusters push along a diagonal.
     along = float(np.maximum(table.wrenches[0], 0.0).sum())
     straight = 2 * np.sqrt(1.2 * robot.total_mass / along)
@@ -178,7 +178,7 @@ def test_what_cannot_be_planned_is_refused_in_a_sentence() -> None:
     goal = ThrustGoal(beyond(START, np.array([1.0, 0.0, 0.0]), np.zeros(3)))
     with pytest.raises(UnreachableError, match=r"takes at least 11\.3\d* s, but plan\.duration"):
         cube_planner(duration=5.0).plan(REST, goal)
-    table = thrusters_of_urdf(servicer().robot.description)
+    table = find_thrusters("urdf", servicer().robot.description)
     one_way = ThrusterTable(*(getattr(table, each.name)[:1] for each in fields(table)))
     with pytest.raises(ParameterError, match="cannot produce"):
         Propulsion.of_table(one_way, 0.0)

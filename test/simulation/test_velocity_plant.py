@@ -17,7 +17,7 @@ from support.random_robots import random_robot_urdf
 
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import c_compiler
+from spacerobot_ros.model.compilation import find_compiler
 from spacerobot_ros.model.description import Inertia
 from spacerobot_ros.model.grasp import BodyMotion
 from spacerobot_ros.resources import robot_file
@@ -276,7 +276,7 @@ def test_compiled_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     momenta = {"linear_momentum": rng.normal(size=3), "angular_momentum": rng.normal(size=3)}
     interpreted = sliding_masses(**momenta)
     monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
-    if c_compiler() is None:
+    if find_compiler() is None:
         pytest.skip("no C compiler")
     robot = SpaceRobot.from_file(SLIDING_MASSES)
     compiled = VelocityPlant(robot, TICK, interpreted.initial)

@@ -9,9 +9,9 @@ import pytest
 
 from spacerobot_ros.batch.targets import THREADS_OF_HOST, CudaDevice, Target, vector_unit
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.model.compilation import cxx_compiler
+from spacerobot_ros.model.compilation import find_compiler
 
-needs_compiler = pytest.mark.skipif(cxx_compiler() is None, reason="there is no C++ compiler")
+needs_compiler = pytest.mark.skipif(find_compiler("cpp") is None, reason="there is no C++ compiler")
 
 TARGETS: dict[str, Callable[[], Target]] = {
     "registers": vector_unit,
