@@ -94,12 +94,6 @@ class BasePoses(NamedTuple):
         quaternion = (1 - share) * x[before] + share * next_
         return BasePoses(position, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
 
-    @property
-    def world(self) -> tuple[Array, Array]:
-        """Attitudes ``R_BW`` (N, 3, 3) and positions ``r_BW_B`` (N, 3) of the world, m."""
-        R_BW = np.swapaxes(matrices_from_quaternions(self.quaternion), 1, 2)
-        return R_BW, -np.einsum("nab,nb->na", R_BW, self.position)
-
 
 Poses = tuple[Array, Array]
 """Attitudes ``R_BL`` (N, L, 3, 3) and positions ``r_BL_B`` (N, L, 3) of robot links; if there are
@@ -215,7 +209,8 @@ class CollisionGeometry:
         R_BW = np.broadcast_to(np.eye(3), (*at, 3, 3))
         r_BW = np.full((*at, 3), _UNKNOWN_BASE_DISTANCE)
         if base is not None:
-            R_BW, r_BW = base.world
+            R_BW = np.swapaxes(matrices_from_quaternions(base.quaternion), 1, 2)
+            r_BW = -np.einsum("nab,nb->na", R_BW, base.position)
         return (
             np.concatenate([R, R_BW[..., np.newaxis, :, :]], axis=-3),
             np.concatenate([r, r_BW[..., np.newaxis, :]], axis=-2),
@@ -461,7 +456,6 @@ class Approach:
         return f"{self.links.subject} come within {quantity(self.distance, 'm')}{where}"
 
 
-@dataclass(frozen=True)
 class _Path:
     """A path of shapes (N + 1, n) at the ticks, with the base poses if obstacles matter, else None.
 
@@ -469,13 +463,9 @@ class _Path:
     ``lower_bounds`` (N, P) lower bounds on their distances in each tick, m.
     """
 
-    positions: Array
-    base: BasePoses | None
-    largest_motions: Array
-    lower_bounds: Array
-
-    @classmethod
-    def of(cls, geometry: CollisionGeometry, positions: Array, base: BasePoses | None) -> _Path:
+    def __init__(
+        self, geometry: CollisionGeometry, positions: Array, base: BasePoses | None
+    ) -> None:
         if len(positions) == 1:
             twice = np.zeros(2, dtype=np.int64)
             positions, base = positions[twice], None if base is None else base.rows(twice)
@@ -489,7 +479,8 @@ class _Path:
             chord = np.linalg.norm(np.diff(base.quaternion, axis=0), axis=1)
             turned = 4 * np.arcsin(np.minimum(np.minimum(chord, np.sqrt(4 - chord**2)) / 2, 1.0))
             motion += np.outer(turned, from_base) + np.outer(straight, geometry.with_obstacles)
-        return cls(positions, base, motion, (bounds[:-1] + bounds[1:] - motion) / 2)
+        self.positions, self.base, self.largest_motions = positions, base, motion
+        self.lower_bounds = (bounds[:-1] + bounds[1:] - motion) / 2
 
     def interpolated(self, ticks: Array) -> tuple[Array, BasePoses | None]:
         """Return configurations (K, n) and base poses at times (K,) in ticks."""
@@ -520,7 +511,7 @@ def nearest_approaches(
     """
     if not len(geometry.pairs):
         return []
-    path = _Path.of(geometry, positions, base)
+    path = _Path(geometry, positions, base)
     near = np.flatnonzero(path.lower_bounds.min(axis=0) < required)
     found = (_nearest(geometry, path, p, required[p]) for p in near.tolist())
     return sorted((each for each in found if each), key=lambda each: each.distance)
@@ -535,7 +526,7 @@ def nearest_approach(
     """
     if not len(geometry.pairs):
         return None
-    path = _Path.of(geometry, positions, base)
+    path = _Path(geometry, positions, base)
     least = path.lower_bounds.min(axis=0)
     best: Approach | None = None
     for pair in np.argsort(least, kind="stable").tolist():

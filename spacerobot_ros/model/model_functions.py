@@ -74,8 +74,7 @@ class ModelFunctions:
         self.link_names = tuple(link.name for link in robot.links)
         self._kin = tree_kinematics(robot, mass_properties)
         self._inertia = composites(self._kin)
-        self._symbolic: dict[str, ca.Function] = {}
-        self._compiled: dict[tuple[Hashable, ...], ca.Function] = {}
+        self._functions: dict[tuple[Hashable, ...], ca.Function] = {}
         self.derived: dict[Hashable, Any] = {}
         """Cache of objects derived from the model by other modules, by key."""
 
@@ -91,21 +90,20 @@ class ModelFunctions:
         ``compile=False`` returns the symbolic function, for building larger functions.
         """
         kind, _, argument = name.partition(":")
-        if name not in self._symbolic:
-            self._symbolic[name] = self._build(kind, argument)
+        symbolic = self.composed(name, lambda: self._build(kind, argument), compile=False)
         # Compiling the large curvature would take longer than its few calls in a plan.
         if not compile or kind == "curvature":
-            return self._symbolic[name]
-        return self.composed(name, lambda: self._symbolic[name])
+            return symbolic
+        return self.composed(name, lambda: symbolic)
 
     def composed(
         self, key: Hashable, build: Callable[[], ca.Function], *, compile: bool = True
     ) -> ca.Function:
         """Return a function composed of model functions, built and compiled once per key."""
         place = (key, *compilation_settings()) if compile else (key,)
-        if place not in self._compiled:
-            self._compiled[place] = compiled(build()) if compile else build()
-        return self._compiled[place]
+        if place not in self._functions:
+            self._functions[place] = compiled(build()) if compile else build()
+        return self._functions[place]
 
     @property
     def total_mass(self) -> float:

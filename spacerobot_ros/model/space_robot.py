@@ -366,10 +366,8 @@ class SpaceRobot:
         The function is made and compiled once per key for all robots that share the expressions:
         robots with equal mass properties, or with mass properties as an argument.
         """
-        derived = self._model.derived
-        if key not in derived:
-            derived[key] = make()
-        return derived[key], self.composed(("view", key), lambda: derived[key])
+        function = self._model.composed(("view", key), make, compile=False)
+        return function, self.composed(("view", key), lambda: function)
 
     @property
     def mass_arguments(self) -> dict[str, Array]:
