@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -87,67 +87,71 @@ class MalformedError(RobotDescriptionError):
         super().__init__(f"The robot description is not valid URDF: {flaw}; write {remedy}.")
 
 
-def _child(parent: Element, tag: str, where: str) -> Element | None:
-    """Return the only child with a tag; None: there is none. ``where`` is its link or joint."""
-    found = parent.findall(tag)
-    if len(found) > 1:
-        flaw = f"the {_owner(parent, where)} has {len(found)} elements <{tag}>"
-        raise MalformedError(flaw, "one of them")
-    return found[0] if found else None
+@dataclass(frozen=True)
+class _Part:
+    """An element of a link, joint or material, which is named in messages."""
 
+    element: Element
+    where: str
 
-def _needed_child(parent: Element, tag: str, where: str) -> Element:
-    found = _child(parent, tag, where)
-    if found is None:
-        raise MalformedError(f"the {_owner(parent, where)} has no <{tag}>", _REMEDIES[tag])
-    return found
+    @property
+    def name(self) -> str:
+        tag = self.element.tag
+        return self.where if tag in ("link", "joint") else f"<{tag}> of {self.where}"
 
+    def child(self, tag: str) -> _Part | None:
+        """Return the only child with a tag; None: there is none."""
+        found = self.element.findall(tag)
+        if len(found) > 1:
+            flaw = f"the {self.name} has {len(found)} elements <{tag}>"
+            raise MalformedError(flaw, "one of them")
+        return _Part(found[0], self.where) if found else None
 
-def _owner(element: Element, where: str) -> str:
-    return where if element.tag in ("link", "joint") else f"<{element.tag}> of {where}"
+    def needed_child(self, tag: str) -> _Part:
+        found = self.child(tag)
+        if found is None:
+            raise MalformedError(f"the {self.name} has no <{tag}>", _REMEDIES[tag])
+        return found
 
+    def text(self, name: str, default: str | None = None) -> str:
+        """Return an attribute; without a ``default``, it is required."""
+        given = self.element.get(name, default)
+        if given is None:
+            raise self._malformed(f"the {self.name} has no '{name}'", name)
+        return given
 
-def _text(element: Element, name: str, where: str, default: str | None = None) -> str:
-    """Return an attribute; without a ``default``, it is required."""
-    given = element.get(name, default)
-    if given is None:
-        flaw = f"the <{element.tag}> of {where} has no '{name}'"
-        raise MalformedError(flaw, _attribute_remedy(element, name))
-    return given
+    def numbers(self, name: str, default: str | None = None, largest: float = _MAX_NUMBER) -> Array:
+        """Return the numbers of an attribute (k,); without a ``default``, it is required."""
+        words, (count, _) = self.text(name, default).split(), _ATTRIBUTES[self.element.tag][name]
+        wrong = next((word for word in words if not _is_number(word)), None)
+        if wrong is not None:
+            flaw = f"'{name}' of the {self.name} has '{wrong}', which is not a number"
+            raise self._malformed(flaw, name)
+        if len(words) != count:
+            flaw = f"'{name}' of the {self.name} has {len(words)} numbers instead of {count}"
+            raise self._malformed(flaw, name)
+        numbers = np.array(words, dtype=float)
+        if not np.all(np.abs(numbers) <= largest):
+            finite = np.isfinite(numbers).all()
+            flaw = f"is larger than {_MAX_NUMBER:g} in its SI unit" if finite else "is not finite"
+            raise RobotDescriptionError(f"A number in the {self.name} {flaw}: {' '.join(words)}.")
+        return numbers
 
+    def number(self, name: str, default: str | None = None) -> float:
+        return float(self.numbers(name, default)[0])
 
-def _attribute_remedy(element: Element, name: str) -> str:
-    count, meaning = _ATTRIBUTES[element.tag][name]
-    numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by spaces, ")
-    return f'<{element.tag} {name}="..."/>: {numbers}{meaning}'
+    def require_known_attributes(self) -> None:
+        """Reject unknown attributes if all attributes are optional: they are misspelt."""
+        known = _ATTRIBUTES[self.element.tag]
+        if unknown := set(self.element.keys()).difference(known):
+            flaw = f"the {self.name} has the unknown attribute '{min(unknown)}'"
+            raise MalformedError(flaw, f"one of {', '.join(known)}")
 
-
-def _numbers(
-    element: Element,
-    name: str,
-    where: str,
-    default: str | None = None,
-    largest: float = _MAX_NUMBER,
-) -> Array:
-    """Return the numbers of an attribute (k,); without a ``default``, it is required."""
-    words, owner = _text(element, name, where, default).split(), f"the <{element.tag}> of {where}"
-    wrong = next((word for word in words if not _is_number(word)), None)
-    if wrong is not None:
-        flaw = f"'{name}' of {owner} has '{wrong}', which is not a number"
-        raise MalformedError(flaw, _attribute_remedy(element, name))
-    if len(words) != (count := _ATTRIBUTES[element.tag][name][0]):
-        flaw = f"'{name}' of {owner} has {len(words)} numbers instead of {count}"
-        raise MalformedError(flaw, _attribute_remedy(element, name))
-    numbers = np.array(words, dtype=float)
-    if not np.all(np.abs(numbers) <= largest):
-        finite = np.isfinite(numbers).all()
-        flaw = f"is larger than {_MAX_NUMBER:g} in its SI unit" if finite else "is not finite"
-        raise RobotDescriptionError(f"A number in {owner} {flaw}: {' '.join(words)}.")
-    return numbers
-
-
-def _number(element: Element, name: str, where: str, default: str | None = None) -> float:
-    return float(_numbers(element, name, where, default)[0])
+    def _malformed(self, flaw: str, attribute: str) -> MalformedError:
+        tag = self.element.tag
+        count, meaning = _ATTRIBUTES[tag][attribute]
+        numbers = {0: "", 1: "a number, "}.get(count, f"{count} numbers separated by spaces, ")
+        return MalformedError(flaw, f'<{tag} {attribute}="..."/>: {numbers}{meaning}')
 
 
 def _is_number(word: str) -> bool:
@@ -158,27 +162,19 @@ def _is_number(word: str) -> bool:
     return "_" not in word
 
 
-def _require_known_attributes(element: Element, where: str) -> None:
-    """Reject unknown attributes of an element whose attributes are optional: they are misspelt."""
-    known = _ATTRIBUTES[element.tag]
-    if unknown := set(element.keys()).difference(known):
-        flaw = f"the <{element.tag}> of {where} has the unknown attribute '{min(unknown)}'"
-        raise MalformedError(flaw, f"one of {', '.join(known)}")
-
-
 # -- links ------------------------------------------------------------------------------------
 
 
-def _read_pose(element: Element, where: str) -> Pose:
-    origin = _child(element, "origin", where)
+def _read_pose(part: _Part) -> Pose:
+    origin, where = part.child("origin"), part.where
     if origin is None:
         return Pose()
-    _require_known_attributes(origin, where)
-    r = _numbers(origin, "xyz", where, "0 0 0")
-    if origin.get("quat_xyzw") is None:
-        return Pose(matrix_from_rpy(_numbers(origin, "rpy", where, "0 0 0")), r)
-    quaternion = _numbers(origin, "quat_xyzw", where)
-    if origin.get("rpy") is not None:
+    origin.require_known_attributes()
+    r = origin.numbers("xyz", "0 0 0")
+    if origin.element.get("quat_xyzw") is None:
+        return Pose(matrix_from_rpy(origin.numbers("rpy", "0 0 0")), r)
+    quaternion = origin.numbers("quat_xyzw")
+    if origin.element.get("rpy") is not None:
         raise RobotDescriptionError(
             f"The origin of {where} has both 'rpy' and 'quat_xyzw': give one."
         )
@@ -189,19 +185,20 @@ def _read_pose(element: Element, where: str) -> Pose:
     return Pose(matrix_from_quaternion(quaternion / length), r)
 
 
-def read_link(name: str, link: Element, colours: dict[str, tuple[float, ...]]) -> Link:
+def read_link(name: str, element: Element, colours: dict[str, tuple[float, ...]]) -> Link:
     """Read a link; ``colours`` are those of :func:`read_colours`."""
     where = f"link '{name}'"
     inertia = Inertia()
-    if (inertial := _child(link, "inertial", where)) is not None:
-        mass = _number(_needed_child(inertial, "mass", where), "value", where)
-        about = read_inertia(_child(inertial, "inertia", where), where)
+    if (inertial := _Part(element, where).child("inertial")) is not None:
+        mass = inertial.needed_child("mass").number("value")
+        moments = inertial.child("inertia")
+        about = np.zeros((3, 3)) if moments is None else read_inertia(moments.element, where)
         if mass < 0:
             raise RobotDescriptionError(f"The mass of {where} is negative ({mass} kg).")
-        inertia = Inertia(mass, np.zeros(3), about).moved(_read_pose(inertial, where))
-    shapes = [_read_shape(each, colours, where) for each in link.findall("visual")]
-    supported = [each for each in link.findall("collision") if _is_supported(each, where)]
-    collisions = [_read_shape(each, colours, where) for each in supported]
+        inertia = Inertia(mass, np.zeros(3), about).moved(_read_pose(inertial))
+    shapes = [_read_shape(_Part(each, where), colours) for each in element.findall("visual")]
+    supported = [each for each in element.findall("collision") if _is_supported(each, where)]
+    collisions = [_read_shape(_Part(each, where), colours) for each in supported]
     return Link(name, inertia, tuple(shapes), tuple(collisions))
 
 
@@ -216,80 +213,74 @@ def _is_supported(collision: Element, where: str) -> bool:
     return form in _GEOMETRIES
 
 
-def read_inertia(moments: Element | None, where: str) -> Array:
-    """Read the moments of inertia (3, 3), kg m^2, of a link; zero without ``<inertia>``."""
-    if moments is None:
-        return np.zeros((3, 3))
+def read_inertia(moments: Element, where: str) -> Array:
+    """Read the moments of inertia (3, 3), kg m^2, of a link."""
+    part = _Part(moments, where)
     return symmetric_of_entries(
-        _number(moments, f"i{'xyz'[row]}{'xyz'[column]}", where) for row, column in INERTIA_ENTRIES
+        part.number(f"i{'xyz'[row]}{'xyz'[column]}") for row, column in INERTIA_ENTRIES
     )
 
 
 def read_colours(root: Element) -> dict[str, tuple[float, ...]]:
     """Return the RGBA colours of a robot's materials by name."""
-    return {
-        name: _read_colour(color, f"material '{name}'")
-        for material in root.findall("material")
-        if (color := material.find("color")) is not None
-        for name in (material.get("name", ""),)
-    }
+    colours = {}
+    for material in root.findall("material"):
+        if (color := material.find("color")) is not None:
+            name = material.get("name", "")
+            colours[name] = tuple(_Part(color, f"material '{name}'").numbers("rgba").tolist())
+    return colours
 
 
-def _read_colour(color: Element, where: str) -> tuple[float, ...]:
-    return tuple(_numbers(color, "rgba", where).tolist())
-
-
-def _read_shape(element: Element, colours: dict[str, tuple[float, ...]], where: str) -> Shape:
-    forms = list(_needed_child(element, "geometry", where))
+def _read_shape(part: _Part, colours: dict[str, tuple[float, ...]]) -> Shape:
+    where, forms = part.where, list(part.needed_child("geometry").element)
     remedy = f"one of {', '.join(f'<{name}>' for name in _GEOMETRIES)}"
     if len(forms) != 1:
         raise MalformedError(f"a <geometry> of {where} has {len(forms)} shapes", remedy)
-    (form,) = forms
-    if form.tag not in _GEOMETRIES:
-        raise MalformedError(f"a <geometry> of {where} is a <{form.tag}>", remedy)
+    kind, form = forms[0].tag, _Part(forms[0], where)
+    if kind not in _GEOMETRIES:
+        raise MalformedError(f"a <geometry> of {where} is a <{kind}>", remedy)
     resource = ""
-    if form.tag == "mesh":
-        resource = _text(form, "filename", where)
-        size = _numbers(form, "scale", where, "1 1 1")  # A negative scale mirrors.
+    if kind == "mesh":
+        resource = form.text("filename")
+        size = form.numbers("scale", "1 1 1")  # A negative scale mirrors.
     else:
-        size = np.concatenate([_numbers(form, name, where) for name in _ATTRIBUTES[form.tag]])
+        size = np.concatenate([form.numbers(name) for name in _ATTRIBUTES[kind]])
         if size.min() < 0:
             raise RobotDescriptionError(
                 f"A size in a <geometry> of {where} is negative: {size.tolist()}. "
                 "Give lengths in m."
             )
     rgba: tuple[float, ...] = Shape.rgba
-    if (material := _child(element, "material", where)) is not None:
-        color = _child(material, "color", where)
-        if color is not None:
-            rgba = _read_colour(color, where)
+    if (material := part.child("material")) is not None:
+        if (color := material.child("color")) is not None:
+            rgba = tuple(color.numbers("rgba").tolist())
         else:
-            rgba = colours.get(material.get("name", ""), rgba)
+            rgba = colours.get(material.element.get("name", ""), rgba)
     red, green, blue, opacity = rgba
-    pose = _read_pose(element, where)
-    return Shape(form.tag, tuple(size.tolist()), pose, (red, green, blue, opacity), resource)
+    pose = _read_pose(part)
+    return Shape(kind, tuple(size.tolist()), pose, (red, green, blue, opacity), resource)
 
 
 # -- joints -----------------------------------------------------------------------------------
 
 
-def read_joint(name: str, joint: Element, links: dict[str, Link]) -> Joint:
+def read_joint(name: str, element: Element, links: dict[str, Link]) -> Joint:
     """Read a joint between two of the links."""
     where = f"joint '{name}'"
-    kind = _read_kind(joint, where)
-    ends = {}
+    joint, ends = _Part(element, where), {}
+    kind = _read_kind(joint)
     for role in ("parent", "child"):
-        ends[role] = _text(_needed_child(joint, role, where), "link", where)
+        ends[role] = joint.needed_child(role).text("link")
         if ends[role] not in links:
             raise RobotDescriptionError(
                 f"The {role} of {where} is '{ends[role]}', but there is no such link."
                 f"{suggestion(ends[role], links)}"
             )
-    pose, axis = _read_pose(joint, where), np.array([1.0, 0.0, 0.0])
+    pose, axis = _read_pose(joint), np.array([1.0, 0.0, 0.0])
     if kind is JointKind.FIXED:
         return Joint(name, kind, ends["parent"], ends["child"], pose, axis, JointLimits())
-    if (given := _child(joint, "axis", where)) is not None:
-        axis = _numbers(given, "xyz", where)
+    if (given := joint.child("axis")) is not None:
+        axis = given.numbers("xyz")
     norm = float(np.linalg.norm(axis))
     if norm < 1e-9:
         raise RobotDescriptionError(f"The axis of {where} is zero; give it a direction.")
@@ -300,37 +291,37 @@ def read_joint(name: str, joint: Element, links: dict[str, Link]) -> Joint:
         ends["child"],
         pose,
         axis / norm,
-        _read_limits(_child(joint, "limit", where), kind, where),
-        _read_mimic(_child(joint, "mimic", where), where),
-        joint.find("wheel") is not None,
+        _read_limits(joint, kind),
+        _read_mimic(joint),
+        element.find("wheel") is not None,
     )
 
 
-def _read_kind(joint: Element, where: str) -> JointKind:
-    kinds, kind = [each.value for each in JointKind], joint.get("type")
+def _read_kind(joint: _Part) -> JointKind:
+    kinds, kind = [each.value for each in JointKind], joint.element.get("type")
     if kind is None:
         remedy = f'type="..." with one of {", ".join(kinds)}'
-        raise MalformedError(f"the {where} has no type", remedy)
+        raise MalformedError(f"the {joint.where} has no type", remedy)
     if kind not in kinds:
         raise RobotDescriptionError(
-            f"The type of {where} is '{kind}'; a free-floating tree has "
+            f"The type of {joint.where} is '{kind}'; a free-floating tree has "
             f"{enumeration(kinds)} joints. The base floats "
             "freely: remove any joint that connects it to a world, and that world's link."
         )
     return JointKind(kind)
 
 
-def _read_mimic(mimic: Element | None, where: str) -> Mimic | None:
-    if mimic is None:
+def _read_mimic(joint: _Part) -> Mimic | None:
+    if (mimic := joint.child("mimic")) is None:
         return None
-    _require_known_attributes(mimic, where)
-    leader = _text(mimic, "joint", where)
-    multiplier = _number(mimic, "multiplier", where, "1")
+    mimic.require_known_attributes()
+    leader, multiplier = mimic.text("joint"), mimic.number("multiplier", "1")
     if multiplier == 0:
         raise RobotDescriptionError(
-            f"The {where} mimics '{leader}' with multiplier 0: it does not move; make it fixed."
+            f"The {joint.where} mimics '{leader}' with multiplier 0: it does not move; make it "
+            "fixed."
         )
-    return Mimic(leader, multiplier, _number(mimic, "offset", where, "0"))
+    return Mimic(leader, multiplier, mimic.number("offset", "0"))
 
 
 def with_leaders(joints: list[Joint]) -> list[Joint]:
@@ -391,8 +382,9 @@ _NO_LIMIT = 1e4
 """Position, m or rad, beyond which a limit is treated as no limit."""
 
 
-def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLimits:
-    if limit is None:
+def _read_limits(joint: _Part, kind: JointKind) -> JointLimits:
+    where = joint.where
+    if (limit := joint.child("limit")) is None:
         if kind in (JointKind.FIXED, JointKind.CONTINUOUS):
             return JointLimits()
         raise RobotDescriptionError(
@@ -401,7 +393,7 @@ def _read_limits(limit: Element | None, kind: JointKind, where: str) -> JointLim
         )
     values = {}
     for name, default in (("lower", "0"), ("upper", "0"), ("velocity", None), ("effort", None)):
-        (number,) = _numbers(limit, name, where, default, largest=math.inf).tolist()
+        (number,) = limit.numbers(name, default, largest=math.inf).tolist()
         values[name] = number or 0.0
     for name in ("velocity", "effort"):
         if values[name] < 0:
