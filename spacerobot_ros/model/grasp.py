@@ -293,7 +293,8 @@ def frame_motion(robot: SpaceRobot, link: str, motion: RobotMotion) -> BodyMotio
     """Return the motion of a link frame."""
     R_BL, r_BL = robot.link_pose(link, motion.q)
     R_WB = motion.R_WB
-    twist = _jacobian_of_base_twist(robot, link, motion.q) @ _velocities(motion)
+    velocities = np.concatenate([motion.twist, motion.qdot])
+    twist = _jacobian_of_base_twist(robot, link, motion.q) @ velocities
     return BodyMotion(
         R_WB @ R_BL, motion.pose[:3] + R_WB @ r_BL, R_WB @ twist[:3], R_WB @ twist[3:]
     )
@@ -318,7 +319,7 @@ def grasp_impact(
     q, n, R_WB = motion.q, robot.n, motion.R_WB
     to_cm = _to_velocity_of_cm(robot, q)
     H = to_cm.T @ robot.inertia_matrix(q) @ to_cm
-    J, z = _jacobian_of_base_twist(robot, link, q), _velocities(motion)
+    J, z = _jacobian_of_base_twist(robot, link, q), np.concatenate([motion.twist, motion.qdot])
     center, R_BT = body.at(Pose(r=inertia.com)), R_WB.T @ body.R_WT
     nu = np.concatenate([R_WB.T @ center.v, R_WB.T @ center.omega])
     M = np.zeros((6, 6))
@@ -377,10 +378,6 @@ def separated_momenta(
     relative = share * second[:3] - (1.0 - share) * linear
     arm = centers[1] - centers[0]
     return np.concatenate([linear, together[3:] - second[3:] - cross(arm, relative)])
-
-
-def _velocities(motion: RobotMotion) -> Array:
-    return np.concatenate([motion.twist, motion.qdot])
 
 
 def _to_velocity_of_cm(robot: SpaceRobot, q: npt.ArrayLike) -> Array:

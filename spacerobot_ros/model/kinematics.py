@@ -22,7 +22,7 @@ from spacerobot_ros.model.description import (
     Pose,
     RobotDescription,
 )
-from spacerobot_ros.model.inertial_parameters import MassProperties
+from spacerobot_ros.model.inertial_parameters import MassProperties, sparse_constant
 from spacerobot_ros.model.rotations import matrices_from_quaternions, quaternion_from_matrix
 from spacerobot_ros.model.rotations import quaternion_multiply as numeric_multiply
 from spacerobot_ros.model.symbolic_rotations import (
@@ -73,7 +73,7 @@ class TreeKinematics:
 
     @property
     def _coupling(self) -> ca.DM:
-        return ca.sparsify(ca.DM(self.robot.coupling[0]))
+        return sparse_constant(self.robot.coupling[0])
 
     def mass(self, k: int) -> float | ca.SX:
         """Mass of body k, kg."""
@@ -125,14 +125,14 @@ class TreeKinematics:
 
 
 def _chain_pose(R: ca.SX, p: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
-    return R @ ca.sparsify(ca.DM(pose.R)), p + R @ ca.sparsify(ca.DM(pose.r))
+    return R @ sparse_constant(pose.R), p + R @ sparse_constant(pose.r)
 
 
 def joint_positions(robot: RobotDescription, q: ca.SX) -> ca.SX:
     """Return the positions (m,) of the joints that carry ``bodies[1:]``, given coordinates q
     (n,)."""
     G, b = robot.coupling
-    return ca.sparsify(ca.DM(G)) @ q + ca.sparsify(ca.DM(b))
+    return sparse_constant(G) @ q + sparse_constant(b)
 
 
 def tree_kinematics(
@@ -157,7 +157,7 @@ def tree_kinematics(
         joint = body.joint
         assert joint is not None
         R_joint, p_joint = _chain_pose(R[body.parent], p[body.parent], body.origin)
-        direction = R_joint @ ca.sparsify(ca.DM(joint.axis))
+        direction = R_joint @ sparse_constant(joint.axis)
         if joint.kind is JointKind.PRISMATIC:
             R.append(R_joint)
             p.append(p_joint + direction * theta[k - 1])
@@ -176,7 +176,8 @@ def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX
     """Return the quaternion (4,) of ``R_BL``, smooth in q because it is not converted from a
     matrix."""
     index, pose = description.frames[link]
-    quaternion, theta = _to_constant(pose.R), joint_positions(description, q)
+    quaternion = sparse_constant(quaternion_from_matrix(pose.R))
+    theta = joint_positions(description, q)
     while index > 0:
         body = description.bodies[index]
         assert body.joint is not None
@@ -184,13 +185,10 @@ def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX
             half = theta[index - 1] / 2
             turn = ca.vertcat(ca.sin(half) * ca.DM(body.joint.axis), ca.cos(half))
             quaternion = quaternion_multiply(turn, quaternion)
-        quaternion = quaternion_multiply(_to_constant(body.origin.R), quaternion)
+        turned = sparse_constant(quaternion_from_matrix(body.origin.R))
+        quaternion = quaternion_multiply(turned, quaternion)
         index = body.parent
     return quaternion
-
-
-def _to_constant(R: Array) -> ca.DM:
-    return ca.sparsify(ca.DM(quaternion_from_matrix(R)))
 
 
 class LinkPlacement:
@@ -217,8 +215,8 @@ class LinkPlacement:
         R_WB, placed = matrix_from_quaternion(base[3:]), []
         for index, pose in frames:
             R_BL = R[:, 3 * index : 3 * index + 3]
-            r_BF_B = r[:, index] + R_BL @ ca.sparsify(ca.DM(pose.r))
-            R_BF = R_BL @ ca.sparsify(ca.DM(pose.R))
+            r_BF_B = r[:, index] + R_BL @ sparse_constant(pose.r)
+            R_BF = R_BL @ sparse_constant(pose.R)
             placed += [base[:3] + R_WB @ r_BF_B, symbolic_quaternion(R_WB @ R_BF)]
         inputs = {"base": base, "link_R": R, "link_r": r}
         function = dense_function("placed", inputs, {"poses": ca.vertcat(*placed)})

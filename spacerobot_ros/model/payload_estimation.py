@@ -93,10 +93,10 @@ class PayloadEstimate:
         """The body; None if a parameter is not determined."""
         if self.undetermined:
             return None
-        mass, h, about = _mass_moment_inertia(self.parameters)
-        com = h / mass
+        mass = float(self.parameters[0])
+        com, about = self.parameters[1:4] / mass, symmetric_of_entries(self.parameters[4:])
         about_com = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
-        return Payload(self.link, Inertia(float(mass), com, about_com))
+        return Payload(self.link, Inertia(mass, com, about_com))
 
 
 def momentum_regressor(motion: BodyMotion, about: Array) -> Array:
@@ -312,18 +312,13 @@ def _most_physical_parameters(fit: _Fit) -> Array:
     return np.asarray(fit.x + found.x @ fit.undetermined)
 
 
-def _mass_moment_inertia(x: Array) -> tuple[float, Array, Array]:
-    """Return mass, first moment (3,) and inertia (3, 3) of parameters (10,)."""
-    return float(x[0]), x[1:4], symmetric_of_entries(x[4:])
-
-
 def _pseudo_inertia(x: Array) -> Array:
     """Return the pseudo-inertia matrix (4, 4) of parameters (10,)."""
-    mass, h, about = _mass_moment_inertia(x)
+    about = symmetric_of_entries(x[4:])
     J = np.empty((4, 4))
     J[:3, :3] = np.trace(about) / 2 * np.eye(3) - about
-    J[:3, 3] = J[3, :3] = h
-    J[3, 3] = mass
+    J[:3, 3] = J[3, :3] = x[1:4]
+    J[3, 3] = x[0]
     return J
 
 
