@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from spacerobot_ros import fly
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.visuals import meshes_from_files
+from spacerobot_ros.model.meshes import meshes_from_files
 from spacerobot_ros.report.scene import robot_bodies
 from spacerobot_ros.report.solids import (
     MAX_MESH_FACES,

@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DRAWING = {
     "robot in pictures": ("report/solids.py",),
     "robot in pages": ("report/player.py",),
-    "robot, shared by both": ("report/scene.py", "model/visuals.py"),
+    "robot, shared by both": ("report/scene.py", "model/meshes.py"),
 }
 """The modules that draw a robot; viewers use the shared one, too."""
 

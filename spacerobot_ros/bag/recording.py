@@ -181,8 +181,8 @@ class Recording:
     def attach_robot(self, name: str, urdf: bytes) -> None:
         """Attach a robot description, and its meshes if they exist on this machine."""
         # Importing the robot model doubles the import time of this module.
+        from spacerobot_ros.model.meshes import meshes_for_bag
         from spacerobot_ros.model.urdf import parse_robot
-        from spacerobot_ros.model.visuals import meshes_for_bag
 
         self.attach(name, urdf, "application/xml")
         if b"<mesh" in urdf:

@@ -32,8 +32,7 @@ from spacerobot_ros.errors import MeshError, enumeration
 from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model.compilation import cache_directory
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
-from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh
-from spacerobot_ros.model.visuals import Visual, solid_mesh
+from spacerobot_ros.model.meshes import TriangleMesh, Visual, shape_mesh, solid_mesh
 
 _LOG = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from spacerobot_ros.environments.tasks import RobotStates, Task
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.visuals import meshes_from_files
+from spacerobot_ros.model.meshes import meshes_from_files
 from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.report.figures import GHOST_COLOUR
 from spacerobot_ros.report.scene import Body, robot_bodies

@@ -38,8 +38,8 @@ from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics
+from spacerobot_ros.model.meshes import meshes_for_bag
 from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
-from spacerobot_ros.model.visuals import meshes_for_bag
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import SECOND

@@ -293,7 +293,7 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> dict[
     elif shape.kind == "sphere":
         size = (2 * size[0],) * 3
     elif shape.kind == "capsule":
-        from spacerobot_ros.model.visuals import solid_mesh  # Few shapes are capsules.
+        from spacerobot_ros.model.meshes import solid_mesh  # Few shapes are capsules.
 
         size, mesh = (1.0, 1.0, 1.0), solid_mesh(replace(shape, pose=Pose()))
         corners = mesh.vertices[mesh.faces].reshape(-1, 3).tolist()

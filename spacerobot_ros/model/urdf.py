@@ -17,6 +17,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NoReturn
+from urllib.parse import quote, unquote, urlparse
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
@@ -32,7 +33,6 @@ from spacerobot_ros.model.description import (
     weld_links,
 )
 from spacerobot_ros.model.inertial_parameters import INERTIA_ENTRIES, TRIANGLE_SLACK
-from spacerobot_ros.model.meshes import mesh_beside, mesh_file, with_mesh_files
 from spacerobot_ros.model.rotations import rpy_from_matrix
 from spacerobot_ros.model.urdf_elements import (
     MalformedError,
@@ -44,7 +44,7 @@ from spacerobot_ros.model.urdf_elements import (
     with_leaders,
 )
 from spacerobot_ros.model.wheels import require_reaction_wheels
-from spacerobot_ros.resources import suggestion
+from spacerobot_ros.resources import installed_share_directory, share_directory, suggestion
 
 _MAX_LINKS = 200
 
@@ -517,3 +517,60 @@ def obstacles_from_topic(text: str) -> RobotDescription | None:
 def links_with_shapes(world: RobotDescription) -> list[str]:
     """Return the names of the obstacle links, which are the links with a shape."""
     return [each.name for each in world.links if each.collisions or each.shapes]
+
+
+# -- files of meshes ------------------------------------------------------------------------------
+
+
+def with_mesh_files(text: str, find: Callable[[str], Path | None]) -> str:
+    """Return a URDF string with meshes referenced by ``file://`` URIs.
+
+    Parameters
+    ----------
+    text
+        URDF string; a string that is not XML is returned unchanged.
+    find
+        Function that returns the file for a mesh name in the URDF; None keeps the name.
+    """
+    try:
+        root = editable_root(text)
+    except (ParseError, ValueError):
+        return text
+    any_found = False
+    for mesh in root.iter("mesh"):
+        if found := find(mesh.get("filename", "")):
+            mesh.set("filename", f"file://{quote(str(found))}")
+            any_found = True
+    return tostring(root, encoding="unicode") if any_found else text
+
+
+def mesh_beside(resource: str, folder: Path) -> Path | None:
+    """Return the file of a mesh named relative to a folder; None if the path is absolute."""
+    scheme, mark, rest = resource.partition("://")
+    if not mark:
+        found = folder / resource
+        return found.resolve() if found.is_file() else None
+    if scheme != "package" or mesh_file(resource) is not None:
+        return None
+    package, _, inside = rest.partition("/")
+    around = xacro_files.package_around(package, folder)
+    return around / inside if around is not None and (around / inside).is_file() else None
+
+
+def mesh_file(resource: str) -> Path | None:
+    """Return the file of a mesh given its URI (``file://``, ``package://``) or path; None if not
+    found.
+
+    Packages are looked up in the ROS environment; the meshes in this package do not require a ROS
+    environment.
+    """
+    url = urlparse(resource)
+    if url.scheme == "package":
+        own = url.netloc == "spacerobot_ros"
+        folder = share_directory() if own else installed_share_directory(url.netloc)
+        path = None if folder is None else folder / unquote(url.path).lstrip("/")
+    elif url.scheme in ("file", ""):
+        path = Path(unquote(url.path))
+    else:
+        return None
+    return path if path is not None and path.is_file() else None

@@ -26,14 +26,13 @@ from spacerobot_ros.flight.reading import (
 from spacerobot_ros.flight.series import SentGoal, Signal, reported_goal
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
-from spacerobot_ros.model.meshes import TriangleMesh
+from spacerobot_ros.model.meshes import TriangleMesh, Visual, meshes_from_attachments
 from spacerobot_ros.model.rotations import (
     quaternion_inverse,
     quaternion_multiply,
     rotvec_from_quaternion,
     rotvecs_from_quaternions,
 )
-from spacerobot_ros.model.visuals import Visual, meshes_from_attachments
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus

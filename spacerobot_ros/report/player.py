@@ -17,8 +17,8 @@ import numpy as np
 from spacerobot_ros.errors import quantity
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array, Pose, Shape
+from spacerobot_ros.model.meshes import Visual, solid_mesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion
-from spacerobot_ros.model.visuals import Visual, solid_mesh
 from spacerobot_ros.report.figures import (
     BASE_COLOUR,
     GHOST_COLOUR,

@@ -1,7 +1,7 @@
 """Flight scene: bodies with their solids, colours and poses over time.
 
 Pictures (:mod:`.solids`) and the 3D view (:mod:`.player`) draw the same bodies; the live page draws
-the same solids (:mod:`spacerobot_ros.model.visuals`).
+the same solids (:mod:`spacerobot_ros.model.meshes`).
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import numpy as np
 from matplotlib.colors import to_hex
 
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
-from spacerobot_ros.model.meshes import TriangleMesh
+from spacerobot_ros.model.meshes import TriangleMesh, Visual, visuals_of
 from spacerobot_ros.model.rotations import quaternion_from_matrix
-from spacerobot_ros.model.visuals import Visual, visuals_of
 from spacerobot_ros.report.figures import GHOST_COLOUR, colour
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.signals import continuous, link_poses

@@ -13,9 +13,8 @@ from spacerobot_ros.errors import PlanningError, counted
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Joint
-from spacerobot_ros.model.meshes import mesh_file
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
-from spacerobot_ros.model.urdf import describe_inertia_flaw
+from spacerobot_ros.model.urdf import describe_inertia_flaw, mesh_file
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations

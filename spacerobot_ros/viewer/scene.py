@@ -16,8 +16,8 @@ import numpy as np
 from spacerobot_ros.collision.distances import collision_visuals, obstacle_visuals
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics, joints_outward
+from spacerobot_ros.model.meshes import Visual, meshes_from_files, visuals_of
 from spacerobot_ros.model.thrusters import ThrusterTable
-from spacerobot_ros.model.visuals import Visual, meshes_from_files, visuals_of
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 
 if TYPE_CHECKING:

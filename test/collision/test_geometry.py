@@ -25,8 +25,8 @@ from spacerobot_ros.errors import PlanningError, RobotDescriptionError
 from spacerobot_ros.files import warn_first_time
 from spacerobot_ros.model import load_robot, parse_robot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription
+from spacerobot_ros.model.meshes import solid_mesh
 from spacerobot_ros.model.urdf import obstacles_from_topic, with_srdf
-from spacerobot_ros.model.visuals import solid_mesh
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.resources import robot_file
 

@@ -11,7 +11,7 @@ from support.command_line import CliRunner
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
-from spacerobot_ros.model.meshes import mesh_file
+from spacerobot_ros.model.urdf import mesh_file
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.own_robot import urdf_remarks
 

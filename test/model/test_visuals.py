@@ -19,16 +19,20 @@ from spacerobot_ros.errors import MeshError
 from spacerobot_ros.model import meshes as module
 from spacerobot_ros.model import parse_robot
 from spacerobot_ros.model.description import Array, Pose, RobotDescription, Shape
-from spacerobot_ros.model.meshes import TriangleMesh, mesh_of_stl, read_mesh, shape_mesh, stl_of
-from spacerobot_ros.model.rotations import matrix_from_rpy
-from spacerobot_ros.model.urdf import load_robot
-from spacerobot_ros.model.visuals import (
+from spacerobot_ros.model.meshes import (
+    TriangleMesh,
+    mesh_of_stl,
     meshes_for_bag,
     meshes_from_attachments,
+    read_mesh,
+    shape_mesh,
     sharp_edges,
     solid_mesh,
+    stl_of,
     visuals_of,
 )
+from spacerobot_ros.model.rotations import matrix_from_rpy
+from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.resources import robot_file, share_directory
 
 PLACED = Pose(matrix_from_rpy([0.3, -0.7, 1.9]), np.array([0.4, -2.0, 1.1]))

@@ -26,7 +26,8 @@ from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
 from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.model.meshes import TriangleMesh, mesh_file, read_mesh, stl_of
+from spacerobot_ros.model.meshes import TriangleMesh, read_mesh, stl_of
+from spacerobot_ros.model.urdf import mesh_file
 from spacerobot_ros.nodes import ReplayNode
 
 STRING = "std_msgs/msg/String"

@@ -18,9 +18,9 @@ from support.html_page import present
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import RobotDescriptionError, SpaceRobotError, shortened
 from spacerobot_ros.flight.captures import momentum_budget_over_time
+from spacerobot_ros.model.meshes import visuals_of
 from spacerobot_ros.model.payload_estimation import PayloadEstimate
 from spacerobot_ros.model.urdf import parse_robot
-from spacerobot_ros.model.visuals import visuals_of
 from spacerobot_ros.report import figures_over_time
 from spacerobot_ros.report import tables as report_tables
 from spacerobot_ros.report.figures import ReportFigure, drawing
