@@ -359,7 +359,7 @@ class CollisionGeometry:
         and for joints that rotate a body of revolution, such as a reaction wheel, about its axis.
         Also return the largest distances (P,) from the base, zero for pairs without obstacles.
         """
-        bodies = self.robot.bodies
+        bodies, joints = self.robot.bodies, self.robot.moving_joints
         travel = np.abs(self.moving_positions(shapes)).max(axis=0)
         reach = np.zeros((len(self.solids), len(bodies) - 1))
         carried = np.zeros(reach.shape, dtype=np.bool_)
@@ -372,11 +372,10 @@ class CollisionGeometry:
             far = float(np.linalg.norm(middle.r)) + solid.enclosure.bounding_radius
             index = solid.body
             while index > 0:
-                body = bodies[index]
-                assert body.joint is not None
-                slides = body.joint.kind is JointKind.PRISMATIC
+                body, joint = bodies[index], joints[index - 1]
+                slides = joint.kind is JointKind.PRISMATIC
                 carried[number, index - 1] = True
-                spins = index == solid.body and _spins_in_place(solid, pose, body.joint)
+                spins = index == solid.body and _spins_in_place(solid, pose, joint)
                 reach[number, index - 1] = 1.0 if slides else far * (not spins)
                 far += float(np.linalg.norm(body.origin.r)) + slides * travel[index - 1]
                 index = body.parent

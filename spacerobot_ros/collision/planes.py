@@ -109,9 +109,7 @@ def _between_links(tree: TreeKinematics, first: Solid, second: Solid, plane: ca.
     bend = ca.SX(tree.moving_body_count, tree.moving_body_count)
     turned: list[tuple[int, ca.SX]] = []
     for k, sign in chain:
-        joint_axis = tree.axis[k]
-        assert joint_axis is not None
-        motion = axis = sign * joint_axis
+        motion = axis = sign * tree.axis[k]
         if tree.is_revolute(k):
             motion = ca.cross(axis, point - tree.p[k])
             turned.append((k, ca.cross(normal, axis)))

@@ -330,7 +330,7 @@ def _closing_path(standoff: Array, options: ApproachOptions, limits: MotionLimit
     length, speed = float(np.linalg.norm(standoff)), min(options.closing_speed, limits.speed)
     acceleration = _CLOSING_SHARE * limits.acceleration
     duration = max(quintic_duration(length, speed, acceleration), _SAMPLE_PERIOD)
-    return RelativePath.from_rest(standoff, np.zeros(3), duration)
+    return RelativePath(RelativeMotionOverTime.at_rest(standoff), np.zeros(3), duration)
 
 
 def _outward_durations() -> Iterator[float]:

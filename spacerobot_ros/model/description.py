@@ -424,12 +424,11 @@ def plane_normal(description: RobotDescription) -> Array | None:
     normal: Array | None = None
     rotations = [np.eye(3)]
     slides = []
-    for body in description.bodies[1:]:
-        assert body.joint is not None
+    for body, joint in zip(description.bodies[1:], description.moving_joints, strict=True):
         # All rotations are about the normal, or the robot is spatial: shape q = 0 shows both.
         rotations.append(rotations[body.parent] @ body.origin.R)
-        axis = rotations[-1] @ body.joint.axis
-        if body.joint.kind is JointKind.PRISMATIC:
+        axis = rotations[-1] @ joint.axis
+        if joint.kind is JointKind.PRISMATIC:
             slides.append(axis)
         elif normal is None:
             normal = axis

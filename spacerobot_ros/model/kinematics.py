@@ -38,7 +38,7 @@ class TreeKinematics:
     """Body poses and centres of mass as functions of the configuration q.
 
     For body k, in the base frame: ``R[k]`` attitude ``R_BBk`` (paper 4: ``0T_k``), ``p[k]``
-    origin, ``com[k]`` centre of mass, ``axis[k]`` the unit axis of the joint that carries it (None
+    origin, ``com[k]`` centre of mass, ``axis[k]`` the unit axis of the joint that carries it (zero
     for the base). ``theta`` (m,) are the positions of the joints that carry ``bodies[1:]``: equal
     to q unless there are mimic joints. ``mass_properties`` are constants or symbols.
     """
@@ -49,7 +49,7 @@ class TreeKinematics:
     R: tuple[ca.SX, ...]
     p: tuple[ca.SX, ...]
     com: tuple[ca.SX, ...]
-    axis: tuple[ca.SX | None, ...]
+    axis: tuple[ca.SX, ...]
     r_BC_B: ca.SX
     mass_properties: MassProperties
 
@@ -96,9 +96,8 @@ class TreeKinematics:
         return self.robot.bodies[k].parent
 
     def is_revolute(self, k: int) -> bool:
-        """Whether the joint of body k is revolute or continuous, not prismatic."""
-        joint = self.robot.bodies[k].joint
-        return joint is not None and joint.kind is not JointKind.PRISMATIC
+        """Whether the joint that carries body k is revolute or continuous, not prismatic."""
+        return self.robot.moving_joints[k - 1].kind is not JointKind.PRISMATIC
 
     def ancestors(self, k: int) -> list[int]:
         """Return the bodies on the path from the base (excluded) to body k (included)."""
@@ -152,10 +151,9 @@ def tree_kinematics(
     theta = joint_positions(robot, q)
     R: list[ca.SX] = [ca.SX.eye(3)]
     p: list[ca.SX] = [ca.SX(3, 1)]
-    axis: list[ca.SX | None] = [None]
-    for k, body in enumerate(robot.bodies[1:], start=1):
-        joint = body.joint
-        assert joint is not None
+    axis: list[ca.SX] = [ca.SX(3, 1)]
+    moving = zip(robot.bodies[1:], robot.moving_joints, strict=True)
+    for k, (body, joint) in enumerate(moving, start=1):
         R_joint, p_joint = _chain_pose(R[body.parent], p[body.parent], body.origin)
         direction = R_joint @ sparse_constant(joint.axis)
         if joint.kind is JointKind.PRISMATIC:
@@ -179,11 +177,10 @@ def link_quaternion(description: RobotDescription, link: str, q: ca.SX) -> ca.SX
     quaternion = sparse_constant(quaternion_from_matrix(pose.R))
     theta = joint_positions(description, q)
     while index > 0:
-        body = description.bodies[index]
-        assert body.joint is not None
-        if body.joint.kind is not JointKind.PRISMATIC:
+        body, joint = description.bodies[index], description.moving_joints[index - 1]
+        if joint.kind is not JointKind.PRISMATIC:
             half = theta[index - 1] / 2
-            turn = ca.vertcat(ca.sin(half) * ca.DM(body.joint.axis), ca.cos(half))
+            turn = ca.vertcat(ca.sin(half) * ca.DM(joint.axis), ca.cos(half))
             quaternion = quaternion_multiply(turn, quaternion)
         turned = sparse_constant(quaternion_from_matrix(body.origin.R))
         quaternion = quaternion_multiply(turned, quaternion)

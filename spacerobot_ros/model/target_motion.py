@@ -153,6 +153,12 @@ class RelativeMotionOverTime:
         return np.asarray(w), np.asarray(wdot)
 
     @classmethod
+    def at_rest(cls, position: Array) -> RelativeMotionOverTime:
+        """Return no motion (K = 1) at a position (3,), with the attitude of G."""
+        zero = np.zeros((1, 6))
+        return cls(np.append(position, np.zeros(3))[np.newaxis], zero, zero)
+
+    @classmethod
     def between(cls, frame: FrameMotion, moving: FrameMotion) -> RelativeMotionOverTime:
         """Return the motion of ``moving`` relative to ``frame``, both at a single time (K = 1)."""
         R, omega = frame.R[0], frame.omega[0]
@@ -208,12 +214,6 @@ class RelativePath:
         begin = start.values[0], start.rates[0], start.accelerations[0]
         self._coefficients = _quintic(begin, (self._end, zero, zero), duration)
 
-    @classmethod
-    def from_rest(cls, start: Array, end: Array, duration: float) -> RelativePath:
-        """Return the path between two positions (3,), at rest at both ends, with the attitude of
-        G."""
-        return cls(_fixed_at(start), end, duration)
-
     def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
         """Return the motion at times (K,), s since the start; at rest after the end."""
         t = np.minimum(np.asarray(times, dtype=float), self.duration)
@@ -221,12 +221,6 @@ class RelativePath:
         rested = np.asarray(times, dtype=float) >= self.duration
         parts[0][rested], parts[1][rested], parts[2][rested] = self._end, 0.0, 0.0
         return RelativeMotionOverTime(*parts)
-
-
-def _fixed_at(position: Array) -> RelativeMotionOverTime:
-    """Return no motion (K = 1) at a position (3,), with the attitude of G."""
-    zero = np.zeros((1, 6))
-    return RelativeMotionOverTime(np.append(position, np.zeros(3))[np.newaxis], zero, zero)
 
 
 def _quintic(start: Sequence[Array], end: Sequence[Array], T: float) -> Array:
@@ -448,7 +442,9 @@ class PathInWorld:
     ) -> None:
         self.duration = relative.duration
         self._relative, self._target, self._start = relative, target, start
-        end = target.grapple([start + self.duration]).with_relative_motion(_fixed_at(position))
+        end = target.grapple([start + self.duration]).with_relative_motion(
+            RelativeMotionOverTime.at_rest(position)
+        )
         first, last = ((each.r[0], each.v[0], each.a[0]) for each in (moving, end))
         self._coefficients = _quintic(first, last, self.duration)
 

@@ -218,8 +218,8 @@ def _imbalance_clause(body: Body, axis: Array) -> str:
 
 def _wheels_of(robot: RobotDescription) -> list[tuple[Body, Joint]]:
     """Return the wheels and their joints, in coordinate order."""
-    joints = [(body, body.joint) for body in robot.bodies]
-    return [(body, joint) for body, joint in joints if joint is not None and joint.wheel]
+    moving = zip(robot.bodies[1:], robot.moving_joints, strict=True)
+    return [(body, joint) for body, joint in moving if joint.wheel]
 
 
 def _spin_inertia(body: Body, axis: Array) -> float:
