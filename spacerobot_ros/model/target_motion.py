@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -41,8 +40,7 @@ _LONGEST_STEP = 4.0  # s, between nodes
 _SMALL_ANGLE = 1e-3  # rad; below it, functions of an angle are series
 
 
-@dataclass(frozen=True)
-class FrameMotion:
+class FrameMotion(NamedTuple):
     """Motion of a frame in W at given times (K,).
 
     Attributes
@@ -64,7 +62,7 @@ class FrameMotion:
 
     def rows(self, chosen: slice | npt.NDArray[np.int64]) -> FrameMotion:
         """Return the motion at selected times."""
-        return FrameMotion(*(getattr(self, each.name)[chosen] for each in fields(self)))
+        return FrameMotion(*(each[chosen] for each in self))
 
     def body_motion(self) -> BodyMotion:
         """Return the motion at the first time, without accelerations."""
@@ -72,7 +70,7 @@ class FrameMotion:
 
     def with_relative_motion(self, path: RelativeMotionOverTime) -> FrameMotion:
         """Return the motion of a frame that moves relative to this frame."""
-        parts = *(x[:, :3] for x in (path.values, path.rates, path.accelerations)), *path.rotation
+        parts = *(each[:, :3] for each in path), *path.rotation
         R_rel = matrices_from_quaternions(quaternions_from_rotvecs(path.values[:, 3:]))
         return self._composed(self.R @ R_rel, *(_rotate_vectors(self.R, each) for each in parts))
 
@@ -116,8 +114,7 @@ class FrameMotion:
         return arm, v_rel, a_rel - 2 * cross(omega, v_rel)
 
 
-@dataclass(frozen=True)
-class RelativeMotionOverTime:
+class RelativeMotionOverTime(NamedTuple):
     """Motion of a frame E relative to a frame G at given times (K,), in G.
 
     Attributes
@@ -138,7 +135,7 @@ class RelativeMotionOverTime:
         The velocity is ``J(phi) phidot``, with the rotation vector phi and the left Jacobian of
         SO(3).
         """
-        phi, phidot, phiddot = (x[:, 3:] for x in (self.values, self.rates, self.accelerations))
+        phi, phidot, phiddot = (each[:, 3:] for each in self)
         B, C, B_rate, C_rate = _jacobian_terms(phi, phidot)
         first, second = cross(phi, phidot), cross(phi, phiddot)
         twice = cross(phi, first)
@@ -164,8 +161,7 @@ class RelativeMotionOverTime:
         R, omega = frame.R[0], frame.omega[0]
         motion = cls(*(np.zeros((1, 6)) for _ in range(3)))
         translation = frame.relative_translation(moving.r, moving.v, moving.a)
-        parts = (motion.values, motion.rates, motion.accelerations)
-        for part, vectors in zip(parts, translation, strict=True):
+        for part, vectors in zip(motion, translation, strict=True):
             part[0, :3] = R.T @ vectors[0]
         w_W = moving.omega[0] - omega
         wdot = R.T @ (moving.alpha[0] - frame.alpha[0] - cross(omega, w_W))
@@ -211,7 +207,7 @@ class RelativePath:
     def __init__(self, start: RelativeMotionOverTime, position: Array, duration: float) -> None:
         self.duration = duration
         self._end, zero = np.concatenate([position, np.zeros(3)]), np.zeros(6)
-        begin = start.values[0], start.rates[0], start.accelerations[0]
+        begin = [each[0] for each in start]
         self._coefficients = _quintic(begin, (self._end, zero, zero), duration)
 
     def at(self, times: npt.ArrayLike) -> RelativeMotionOverTime:
@@ -457,7 +453,7 @@ class PathInWorld:
             return found
         frame = self._target.grapple(self._start + t[on_way])
         in_W = frame.relative_translation(*_evaluate_polynomials(self._coefficients, t[on_way]))
-        parts, R_GW = (found.values, found.rates, found.accelerations), np.swapaxes(frame.R, 1, 2)
-        for part, vectors in zip(parts, in_W, strict=True):
+        R_GW = np.swapaxes(frame.R, 1, 2)
+        for part, vectors in zip(found, in_W, strict=True):
             part[on_way, :3] = _rotate_vectors(R_GW, vectors)
         return found
