@@ -36,6 +36,7 @@ import numpy as np
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import dense_function
 from spacerobot_ros.model.dynamics import (
+    Composites,
     ExternalLoads,
     SymmetricFactor,
     composites,
@@ -214,7 +215,7 @@ def servo_rate(kin: TreeKinematics) -> ca.Function:
     qdot = ca.SX.sym("qdot", kin.n)
     vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
     bodies = composites(kin)
-    loads = external_loads(kin, bodies.J, quaternion, r_WC_W, vector, time)
+    loads = external_loads(bodies, quaternion, r_WC_W, vector, time)
     R_WB = matrix_from_quaternion(quaternion)
     omega = SymmetricFactor(bodies.D).solve(R_WB.T @ L_W - bodies.D_q @ qdot)
     x_dot = ca.vertcat(
@@ -234,20 +235,17 @@ def _equations(
 ) -> tuple[dict[str, ca.SX], ca.SX, ca.SX, list[ca.SX], list[ca.SX]]:
     """Return the symbols ``x`` and ``command`` by name, ``K``, ``Q``, and the components of
     ``x_dot`` before and after ``qddot``."""
-    quaternion, qdot, p_W, L_W, r_WC_W = (
-        ca.SX.sym(name, part.stop - part.start)
-        for name, part in zip(
-            ("quaternion", "qdot", "p_W", "L_W", "r_WC_W"), state_slices(kin.n)[1:], strict=True
-        )
-    )
+    sizes = {"quaternion": 4, "qdot": kin.n, "p_W": 3, "L_W": 3, "r_WC_W": 3}
+    symbols = [ca.SX.sym(name, size) for name, size in sizes.items()]
+    quaternion, qdot, p_W, L_W, r_WC_W = symbols
     command = ca.SX.sym("command", kin.n + 6)
     tau, wrench_B = command[: kin.n], command[kin.n :]
-    x = ca.vertcat(kin.q, quaternion, qdot, p_W, L_W, r_WC_W)
+    x = ca.vertcat(kin.q, *symbols)
     system, loads = shape_system(kin), ExternalLoads.none(kin)
     if loaded:
         vector = ca.SX.sym("loads", LoadLayout(len(kin.robot.links)).size)
         time = ca.SX.sym("time")
-        loads = external_loads(kin, system.parts.J, quaternion, r_WC_W, vector, time)
+        loads = external_loads(system.parts, quaternion, r_WC_W, vector, time)
         x, command = ca.vertcat(x, time), ca.vertcat(command, vector)
     external, R_WB = external_force(kin, wrench_B), matrix_from_quaternion(quaternion)
     omega = system.base_motion(R_WB.T @ L_W, qdot)
@@ -293,21 +291,14 @@ class LoadLayout:
 
 
 def external_loads(
-    kin: TreeKinematics,
-    second_moments: tuple[ca.SX, ...],
-    quaternion: ca.SX,
-    r_WC_W: ca.SX,
-    loads: ca.SX,
-    time: ca.SX,
+    parts: Composites, quaternion: ca.SX, r_WC_W: ca.SX, loads: ca.SX, time: ca.SX
 ) -> ExternalLoads:
     """Return the loads in a state.
 
     Parameters
     ----------
-    kin
-        The kinematics.
-    second_moments
-        (3, 3) second moment of mass of every body about its own centre, in the base frame.
+    parts
+        The composites, in the base frame.
     quaternion
         (4,) of ``R_WB``.
     r_WC_W
@@ -317,7 +308,7 @@ def external_loads(
     time
         Time, s.
     """
-    links = [link.name for link in kin.robot.links]
+    kin, links = parts.kin, [link.name for link in parts.kin.robot.links]
     layout = LoadLayout(len(links))
     R_BW = matrix_from_quaternion(quaternion).T
     forces = [ca.SX(6, 1) for _ in kin.robot.bodies]
@@ -334,7 +325,7 @@ def external_loads(
     radius_O = ca.vertcat(ca.cos(angle), ca.sin(angle), 0)
     o = R_BW @ (matrix_from_quaternion(loads[layout.quaternion_WO]) @ radius_O)
     r_WC_B = R_BW @ r_WC_W
-    for k, J in enumerate(second_moments):
+    for k, J in enumerate(parts.J):
         arm = kin.com[k] - kin.r_BC_B
         r = r_WC_B + arm
         force = kin.mass(k) * n**2 * (3 * ca.dot(o, r) * o - r)

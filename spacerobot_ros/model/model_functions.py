@@ -202,8 +202,7 @@ class ModelFunctions:
                 if kind.startswith("loaded"):
                     inputs = f"{inputs} r_WC_W loads"
                     time = x.loads[LoadLayout(len(self.link_names)).time]
-                    place = x.quaternion_WB, x.r_WC_W
-                    loads = external_loads(kin, parts.J, *place, x.loads, time)
+                    loads = external_loads(parts, x.quaternion_WB, x.r_WC_W, x.loads, time)
                 mean, change = (x.before + x.after) / 2, (x.after - x.before) / x.h
                 return inputs, {"tau": joint_efforts(kin, mean, change, R_WB.T @ x.L_W, loads)}
             case "momentum":
