@@ -29,8 +29,12 @@ from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.target_motion import FrameMotion, RelativeMotionOverTime
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.schedule import BasePath
-from spacerobot_ros.planning.methods.thrust.motion import Samples, ThrustMotion
-from spacerobot_ros.planning.methods.thrust.problem import Grapple, ThrustGoal
+from spacerobot_ros.planning.methods.thrust.problem import (
+    Grapple,
+    Samples,
+    ThrustGoal,
+    ThrustMotion,
+)
 from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 
 PLANNING_TIME = 2.0

@@ -17,8 +17,12 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.thrusters import ThrusterTable, find_thrusters
 from spacerobot_ros.model.urdf import parse_world, with_world
-from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
-from spacerobot_ros.planning.methods.thrust.problem import Propulsion, ThrustGoal, ThrustOptions
+from spacerobot_ros.planning.methods.thrust.problem import (
+    Propulsion,
+    ThrustGoal,
+    ThrustMotion,
+    ThrustOptions,
+)
 from spacerobot_ros.planning.methods.thrust.search import ThrustPlanner
 from spacerobot_ros.resources import robot_file
 

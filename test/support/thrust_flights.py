@@ -14,7 +14,7 @@ from spacerobot_ros.collision import BasePoses, CollisionGeometry
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion
-from spacerobot_ros.planning.methods.thrust.motion import ThrustMotion
+from spacerobot_ros.planning.methods.thrust.problem import ThrustMotion
 
 FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
 """Joint positions of the arm of a servicer."""

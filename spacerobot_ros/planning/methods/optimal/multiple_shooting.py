@@ -6,7 +6,8 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -157,25 +158,17 @@ class MultipleShooting:
         """Distance by which links are closer than required in the last solution, m."""
         self.turn = stages.rotation_of_step
         self._drifting = stages.drifting
-        self._program = program(stages, intervals)
-        self._layout = Layout.of(stages, intervals)
-        self.nonzeros = int(self._program.jac_g.nnz_out(1))
+        self._layout, of_program = Layout.of(stages, intervals), program(stages, intervals)
+        self.nonzeros = int(of_program.jac_g.nnz_out(1))
         """Number of nonzeros in the constraint Jacobian; the computing time of a step is
         proportional to it."""
-        self._monitor = SolverMonitor(
-            self._program.problem, self._program.lower, self._program.upper
-        )
         self._has_distances = stages.distances is not None
-        self._tolerance = tolerance
-        self._solver = self._build_solver(_WARM_OPTIONS if self._has_distances else {})
-
-    def _build_solver(self, options: Mapping[str, object]) -> ca.Function:
-        options = {**options, "ipopt.tol": self._tolerance}
-        return build_solver("manoeuvre", self._program, self._monitor, options)
-
-    @cached_property
-    def _refining_solver(self) -> ca.Function:
-        return self._build_solver(_REFINING_OPTIONS)
+        options = {"": _WARM_OPTIONS if self._has_distances else {}, "refining": _REFINING_OPTIONS}
+        self._solver = ProgramSolver(
+            "manoeuvre",
+            of_program,
+            {kind: {**each, "ipopt.tol": tolerance} for kind, each in options.items()},
+        )
 
     def solve(
         self,
@@ -232,30 +225,23 @@ class MultipleShooting:
         lack = 0.0 if near is None else near.largest_lack
         if layout.has_lack:
             most[-1] = lack
-        self._monitor.begin(stop)
-        solver = self._refining_solver if refining and not self._has_distances else self._solver
         slower = self._has_distances and not duration.fixed and not boundary.is_timed
         first = guess.stretched(_WARM_STRETCH) if slower else guess
-        result = solver(
-            x0=self._initial_variables(first, lack),
-            lbx=least,
-            ubx=most,
-            lbg=self._program.lower,
-            ubg=self._program.upper,
-            p=_pack_parameters(
-                boundary, limits, guess, fixed=duration.fixed, drifting=self._drifting
-            ),
+        parameters = _pack_parameters(
+            boundary, limits, guess, fixed=duration.fixed, drifting=self._drifting
         )
-        best, stats = self._monitor.end(), solver.stats()
-        self.converged = bool(stats["success"])
-        self.feasible = self.converged or best is not None
-        x = result["x"].full().ravel()
-        if not self.converged:
-            # If the goal drifts away, no duration compensates for the violations in each interval.
-            infeasible = self._drifting and stats["return_status"] == _INFEASIBLE
-            if infeasible or not (self.feasible or lack):
-                return None
-            x = x if best is None else best
+        found = self._solver.solve(
+            "refining" if refining and not self._has_distances else "",
+            stop,
+            self._initial_variables(first, lack),
+            (least, most),
+            parameters,
+        )
+        self.converged, self.feasible, x = found.converged, found.feasible, found.x
+        # If the goal drifts away, no duration compensates for the violations in each interval.
+        infeasible = self._drifting and found.status == _INFEASIBLE
+        if not self.converged and (infeasible or not (self.feasible or lack)):
+            return None
         self.lack = float(x[-1]) if layout.has_lack else 0.0
         h, (X, s, v, _) = float(x[0]), (x[each] for each in layout.knots())
         return Trajectory(h, s - h * v / 2, v, X)
@@ -267,17 +253,6 @@ class MultipleShooting:
         if self._layout.has_lack:
             x[-1] = lack / 2
         return x
-
-
-def build_solver(
-    name: str, program: Program, monitor: SolverMonitor, options: Mapping[str, object]
-) -> ca.Function:
-    """Return an IPOPT solver for a program, with options in addition to the common ones."""
-    # The solver's matrices are small: threads of its linear algebra would wait for each other.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    derivatives = {"jac_g": program.jac_g, "hess_lag": program.hess_lag}
-    given = {**_IPOPT_OPTIONS, **options, **derivatives, "iteration_callback": monitor}
-    return ca.nlpsol(name, "ipopt", program.problem, given)
 
 
 def _pack_parameters(
@@ -322,14 +297,84 @@ def pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
     return x
 
 
-class SolverMonitor(ca.Callback):
+class Solution(NamedTuple):
+    """End of a solve.
+
+    ``x`` are the last variables or, if the solver did not converge, those of the best feasible
+    iterate, if any; ``feasible``: whether they are feasible. ``multipliers`` are those of the
+    variables and of the rows, and ``status`` is that of the solver.
+    """
+
+    x: Array
+    converged: bool
+    feasible: bool
+    multipliers: tuple[Array, Array]
+    status: str
+
+
+class ProgramSolver:
+    """Solves a program by IPOPT.
+
+    Parameters
+    ----------
+    name, program
+        Name of the solver functions, and the program.
+    options
+        IPOPT options, in addition to the common ones, by the kind of guess.
+    """
+
+    def __init__(
+        self, name: str, program: Program, options: Mapping[str, Mapping[str, object]]
+    ) -> None:
+        monitor = _Monitor(program)
+        common = {**_IPOPT_OPTIONS, "jac_g": program.jac_g, "hess_lag": program.hess_lag}
+        # The solver's matrices are small: threads of its linear algebra would wait for each other.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+        @cache
+        def of_kind(kind: str) -> ca.Function:
+            given = {**common, **options[kind], "iteration_callback": monitor}
+            return ca.nlpsol(name, "ipopt", program.problem, given)
+
+        self.rows = len(program.lower)
+        """Number of constraint rows."""
+        self._bounds = {"lbg": program.lower, "ubg": program.upper}
+        self._monitor, self._ipopt = monitor, of_kind
+
+    def solve(
+        self,
+        kind: str,
+        stop: StopRule,
+        x0: Array,
+        bounds: tuple[Array, Array],
+        parameters: Array,
+        **multipliers: Array,
+    ) -> Solution:
+        """Solve the program from a guess of some kind.
+
+        ``bounds`` are the smallest and largest variables, and ``multipliers`` those of the guess,
+        ``lam_x0`` and ``lam_g0``.
+        """
+        solver, (least, most) = self._ipopt(kind), bounds
+        self._monitor.begin(stop)
+        result = solver(x0=x0, lbx=least, ubx=most, p=parameters, **self._bounds, **multipliers)
+        best, stats = self._monitor.end(), solver.stats()
+        x, *found = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
+        converged = bool(stats["success"])
+        if not converged and best is not None:
+            x = best
+        is_feasible = converged or best is not None
+        return Solution(x, converged, is_feasible, (found[0], found[1]), stats["return_status"])
+
+
+class _Monitor(ca.Callback):
     """Receives every iterate, keeps the best feasible iterate, and stops the solver."""
 
-    def __init__(self, problem: dict[str, ca.MX], lower: Array, upper: Array) -> None:
+    def __init__(self, program: Program) -> None:
         ca.Callback.__init__(self)
-        nx, ng, np_ = (problem[name].numel() for name in ("x", "g", "p"))
+        nx, ng, np_ = (program.problem[name].numel() for name in ("x", "g", "p"))
         self._sizes = {"x": nx, "f": 1, "g": ng, "lam_x": nx, "lam_g": ng, "lam_p": np_}
-        self._lower, self._upper = lower, upper
+        self._lower, self._upper = program.lower, program.upper
         self._best: Array | None = None
         self.construct("watch", {})
 

@@ -208,11 +208,7 @@ class Stages:
         direction = ca.SX.sym("direction", _DIRECTION_SIZE)
         on_knots = constraints.symbolic(s, X, direction)
         facts = [
-            source_hash(
-                *(__name__, momentum_derivatives.__module__),
-                *(solve_positive_definite.__module__, quaternion_multiply.__module__),
-            ),
-            robot.equations_key,
+            *dynamics_facts(robot),
             float(constraints.imposed_base_rate).hex(),
             ca.Function("on_knots", [s, X, direction], [on_knots]).serialize(),
             "" if inequality is None else inequality.serialize(),
@@ -227,6 +223,15 @@ class Stages:
     def with_distances(self, rows: PlaneDistances, instants: int) -> Stages:
         """Return the problem that also keeps link pairs apart, at several instants per interval."""
         return replace(self, distances=_distance_block(self.joints, rows, instants))
+
+
+def dynamics_facts(robot: SpaceRobot, *modules: str) -> tuple[str, str]:
+    """Return what the dynamics of an interval depend on: the sources of these functions and of
+    other modules, and a robot's equations.
+    """
+    sources = momentum_derivatives, solve_positive_definite, quaternion_multiply
+    names = (__name__, *(each.__module__ for each in sources), *modules)
+    return source_hash(*names), robot.equations_key
 
 
 def beginning_block(joints: int) -> ConstraintBlock:

@@ -34,20 +34,17 @@ from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import end_effector_pose
 from spacerobot_ros.planning.methods.optimal.problem import Trajectory
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock
-from spacerobot_ros.planning.methods.thrust.motion import (
+from spacerobot_ros.planning.methods.thrust.problem import (
     EXACT_STEPS,
+    Grapple,
     Samples,
-    ThrustMotion,
-    base_poses,
-)
-from spacerobot_ros.planning.methods.thrust.problem import Grapple, base_for_hand
-from spacerobot_ros.planning.methods.thrust.transcription import (
-    INSTANTS,
-    KeptPlaces,
     ThrustKnots,
-    pair_block,
+    ThrustMotion,
+    base_for_hand,
+    base_poses,
     state_parts,
 )
+from spacerobot_ros.planning.methods.thrust.transcription import INSTANTS, KeptPlaces, pair_block
 
 _ROOM = 4e-3
 """Distance, m, in excess of the required distance at these instants, because paths bend between the
@@ -276,7 +273,7 @@ class Bodies:
             self._around.append(_Corridor(robot, link, grapple, begin))
         self._pairs = [(each, k) for each in self._around for k in range(len(each.required))]
         """Surroundings of each pair, and its number there."""
-        self.rows = cache(partial(_derived_rows, robot, self._pairs))
+        self.rows = cache(partial(_rows_of_pair, robot, self._pairs))
         """Returns the rows of a pair with a given number."""
         self._kept: dict[int, tuple[float, npt.NDArray[np.bool_]]] = {}
         """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
@@ -374,7 +371,7 @@ class Bodies:
         return f"no clear motion was found: {around.clause(approach)}"
 
 
-def _derived_rows(
+def _rows_of_pair(
     robot: SpaceRobot, pairs: Sequence[tuple[_Surroundings | _Corridor, int]], number: int
 ) -> ConstraintBlock:
     around, pair = pairs[number]

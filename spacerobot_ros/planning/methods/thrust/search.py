@@ -43,26 +43,28 @@ from spacerobot_ros.planning.methods.optimal.motion_bounds import reach_of_end_e
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import DurationBounds, StopRule
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits
 from spacerobot_ros.planning.methods.thrust.bodies import Bodies
-from spacerobot_ros.planning.methods.thrust.motion import MotionFunctions, ThrustMotion, base_poses
 from spacerobot_ros.planning.methods.thrust.problem import (
+    DEFECT_SIZE,
     Grapple,
+    MotionFunctions,
     Propulsion,
     ThrustGoal,
+    ThrustKnots,
+    ThrustMotion,
     ThrustOptions,
     base_for_hand,
+    base_poses,
     shape_for_hand,
+    state_parts,
+    with_joints_moved,
 )
 from spacerobot_ros.planning.methods.thrust.transcription import (
-    DEFECT_SIZE,
     EndKind,
     KeptPlaces,
     ThrustBoundary,
-    ThrustKnots,
     ThrustSolver,
     Weights,
-    state_parts,
     thrust_stages,
-    with_joints_moved,
 )
 
 _LOG = logging.getLogger(__name__)

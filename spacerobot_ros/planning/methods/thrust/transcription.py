@@ -20,8 +20,6 @@ not just their discretisation (deferred correction).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
 import casadi as ca
@@ -29,23 +27,18 @@ import numpy as np
 
 from spacerobot_ros.collision.planes import PLANE_SIZE
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.compilation import source_hash
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.dynamics import momentum_derivatives, solve_positive_definite
 from spacerobot_ros.model.integration import runge_kutta
 from spacerobot_ros.model.symbolic_rotations import (
     half_angle_vector,
     matrix_from_quaternion,
-    quaternion_multiply,
     relative_vector,
 )
 from spacerobot_ros.model.target_motion import TARGET_SIZE, TargetExpression
-from spacerobot_ros.planning.methods.optimal import transcription as shooting
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     DurationBounds,
-    SolverMonitor,
+    ProgramSolver,
     StopRule,
-    build_solver,
     pack_knots,
 )
 from spacerobot_ros.planning.methods.optimal.transcription import (
@@ -57,15 +50,20 @@ from spacerobot_ros.planning.methods.optimal.transcription import (
     Program,
     assembled,
     beginning_block,
+    dynamics_facts,
     momentum_in_base,
     place_stages,
     rotation_with_derivatives,
     state_within_interval,
 )
-from spacerobot_ros.planning.methods.thrust.problem import Propulsion
-
-DEFECT_SIZE = 12
-"""Length of an interval's defect: rotation vector, then L, r and V at its end."""
+from spacerobot_ros.planning.methods.thrust.problem import (
+    DEFECT_SIZE,
+    Propulsion,
+    ThrustKnots,
+    state_parts,
+    state_symbols,
+    with_joints_moved,
+)
 
 INSTANTS = 2
 """Instants in an interval at which pairs are kept apart."""
@@ -99,55 +97,6 @@ _OPTIONS: Mapping[str, Mapping[str, object]] = {
     "corrected": {**_CONTINUED, **_EXACT},
 }
 """IPOPT options by starting point."""
-
-
-def state_parts(states: Array) -> list[Array]:
-    """Return ``X, L, r, V, q, qdot`` of states (..., 13 + 2 n) as views."""
-    return np.split(states, [4, 7, 10, 13, (states.shape[-1] + 13) // 2], axis=-1)
-
-
-def with_joints_moved(states: Array, time: float) -> Array:
-    """Return states whose joints have moved at their velocities for a given time, s."""
-    moved = states.copy()
-    *_, q, qdot = state_parts(moved)
-    q += time * qdot
-    return moved
-
-
-@dataclass(frozen=True)
-class ThrustKnots:
-    """N intervals of ``step`` seconds: states at N + 1 knots, controls in N intervals.
-
-    ``states`` (N + 1, 13 + 2 n) are ``[X; L; r; V; q; qdot]``: the quaternion of R_WB, the angular
-    momentum about the centre of mass, N m s, its position and velocity, all in W, and positions and
-    velocities of the joints. ``accelerations`` (N, n) are joint accelerations, ``levels`` (N, m)
-    propulsion levels, and ``defects`` (N, 12) the interval defects. A solution has the multipliers
-    of its variables and of its rows; its pairs are closer than required by at most ``lack``, m.
-    """
-
-    step: float
-    states: Array
-    accelerations: Array
-    levels: Array
-    defects: Array
-    multipliers: tuple[Array, Array] | None = None
-    lack: float = 0.0
-
-    @property
-    def duration(self) -> float:
-        """s."""
-        return self.step * len(self.levels)
-
-    def stretched(self, factor: float) -> ThrustKnots:
-        """Return the same path in ``factor`` times its duration."""
-        X, L, r, V, q, qdot = state_parts(self.states)
-        return ThrustKnots(
-            self.step * factor,
-            np.hstack([X, L / factor, r, V / factor, q, qdot / factor]),
-            self.accelerations / factor**2,
-            self.levels / factor**2,
-            np.zeros_like(self.defects),
-        )
 
 
 class ThrustBoundary(NamedTuple):
@@ -197,27 +146,14 @@ def thrust_stages(robot: SpaceRobot, levels: int, kind: EndKind) -> Stages:
 
     The wrenches of the levels are parameters, so the functions stay the same if thrusters fail.
     """
-    facts = [
-        source_hash(
-            *(__name__, shooting.__name__, momentum_derivatives.__module__),
-            *(solve_positive_definite.__module__, quaternion_multiply.__module__),
-            *(TargetExpression.__module__, runge_kutta.__module__),
-        ),
-        robot.equations_key,
-        f"levels {levels}",
-    ]
+    of_target = TargetExpression.__module__, runge_kutta.__module__
+    facts = [*dynamics_facts(robot, __name__, *of_target), f"levels {levels}"]
     cached = ConstraintBlock.cached
     return (
         beginning_block(robot.n),
         cached("thrust", facts, lambda: _interval_block(robot, levels)).compiled(),
         cached("thrust_end", [*facts, str(kind)], lambda: _end_block(robot, kind)),
     )
-
-
-def state_symbols(n: int) -> tuple[ca.SX, list[ca.SX]]:
-    """Return a knot, and its components ``X, L, r, V, s, v``."""
-    x = ca.SX.sym("x", 13 + 2 * n)
-    return x, ca.vertsplit(x, [0, 4, 7, 10, 13, 13 + n, 13 + 2 * n])
 
 
 def _end_block(robot: SpaceRobot, kind: EndKind) -> ConstraintBlock:
@@ -357,9 +293,7 @@ class ThrustSolver:
         self._propulsion, self._acceleration = propulsion, acceleration
         n, m = len(acceleration), len(propulsion.cost)
         self._layout = Layout((13 + 2 * n,), (n, m), intervals, bool(pairs))
-        self._program = program = self._assembled(stages, pairs)
-        self._monitor = monitor = SolverMonitor(program.problem, program.lower, program.upper)
-        self._ipopt = cache(lambda each: build_solver("thrust", program, monitor, _OPTIONS[each]))
+        self._solver = ProgramSolver("thrust", self._assembled(stages, pairs), _OPTIONS)
 
     def _assembled(
         self, stages: Stages, pairs: Sequence[tuple[ConstraintBlock, Sequence[int]]]
@@ -436,19 +370,20 @@ class ThrustSolver:
             ``rough`` if another solve starts from the solution, ``corrected`` if the guess is a
             solution with other defects.
         """
-        layout, propulsion, program = self._layout, self._propulsion, self._program
-        N, most, rows = layout.intervals, self._acceleration, len(program.lower)
+        layout, propulsion = self._layout, self._propulsion
+        N, most, rows = layout.intervals, self._acceleration, self._solver.rows
         vertices = with_joints_moved(guess.states, guess.step / 2)
         x0 = pack_knots(layout, guess.step, vertices, guess.accelerations, guess.levels)
-        begin = {"x0": x0}
+        multipliers = {}
         if guess.multipliers is not None:
             begins = begins if begins == "corrected" else "continued"
             of_variables, of_rows = guess.multipliers
             # Multipliers of all rows if they are the same, else of those without pairs.
             same = rows if len(of_rows) == rows else rows - len(planes)
-            begin["lam_x0"] = np.zeros(layout.size)
-            begin["lam_x0"][: len(of_variables)] = of_variables[: layout.size]
-            begin["lam_g0"] = np.append(of_rows[:same], np.zeros(rows - same))
+            lam_x = np.zeros(layout.size)
+            lam_x[: len(of_variables)] = of_variables[: layout.size]
+            lam_g = np.append(of_rows[:same], np.zeros(rows - same))
+            multipliers = {"lam_x0": lam_x, "lam_g0": lam_g}
         elif layout.has_lack:
             begins = "clear"
         centers = np.zeros((N, sum(layout.controls)))
@@ -465,18 +400,13 @@ class ThrustSolver:
         )
         if layout.has_lack:
             largest[-1] = np.inf
-        solver = self._ipopt(begins)
-        self._monitor.begin(stop)
-        bounds = {"lbx": least, "ubx": largest, "lbg": program.lower, "ubg": program.upper}
-        result = solver(**begin, **bounds, p=np.concatenate(parameters))
-        x, *found = (result[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
-        best, succeeded = self._monitor.end(), solver.stats()["success"]
-        multipliers = (found[0], found[1]) if succeeded else None
-        if not succeeded:
-            if best is None:
-                return None
-            x = best
+        found = self._solver.solve(
+            begins, stop, x0, (least, largest), np.concatenate(parameters), **multipliers
+        )
+        if not found.feasible:
+            return None
+        x, solved = found.x, found.multipliers if found.converged else None
         step, lack = float(x[0]), float(x[-1]) * layout.has_lack
         states, accelerations, levels = (x[at] for at in layout.knots())
         states = with_joints_moved(states, -step / 2)
-        return ThrustKnots(step, states, accelerations, levels, defects, multipliers, lack)
+        return ThrustKnots(step, states, accelerations, levels, defects, solved, lack)
