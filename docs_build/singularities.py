@@ -14,8 +14,8 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_multiply
 from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest, RobotState, Tolerance, plan
+from spacerobot_ros.planning.analysis import workspaces
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, end_effector_pose
-from spacerobot_ros.planning.core.workspaces import workspaces
 from spacerobot_ros.planning.methods.registry import method_options
 from spacerobot_ros.planning.methods.resolved_rate import JointPath, ResolvedRateGait
 from spacerobot_ros.report.figures import (

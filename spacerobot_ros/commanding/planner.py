@@ -22,7 +22,7 @@ from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal
-from spacerobot_ros.planning.execution.state_average import BaseMeasurement, MeasuredState
+from spacerobot_ros.planning.execution.measured_states import BaseMeasurement, MeasuredState
 from spacerobot_ros.planning.execution.status import (
     Notice,
     Phase,

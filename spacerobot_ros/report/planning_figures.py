@@ -22,11 +22,10 @@ from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
-from spacerobot_ros.planning.analysis import Analysis
+from spacerobot_ros.planning.analysis import Analysis, Workspaces
 from spacerobot_ros.planning.core.controllability import curvature_matrices, curvatures
-from spacerobot_ros.planning.core.workspaces import Workspaces
-from spacerobot_ros.planning.methods.geometric_phase import PhasePlane, PlanarPhase, curvature_peaks
 from spacerobot_ros.planning.methods.nominal_shape import JOINT_PLANES
+from spacerobot_ros.planning.methods.square_path import PhasePlane, PlanarPhase, curvature_peaks
 from spacerobot_ros.report.figures import (
     LINE_COLOUR,
     PALETTE,

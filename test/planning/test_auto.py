@@ -29,7 +29,7 @@ from spacerobot_ros.planning import (
     method_options,
 )
 from spacerobot_ros.planning.core.method import InitialMotion
-from spacerobot_ros.planning.methods.auto import AutoGait
+from spacerobot_ros.planning.methods.registry import AutoGait
 
 PERIOD = 0.25
 TOLERANCE = Tolerance(0.02, 0.02)

@@ -26,7 +26,7 @@ from spacerobot_ros.planning.core.controllability import (
     independent_slots,
     sample_shapes,
 )
-from spacerobot_ros.planning.methods.geometric_phase import check_planar_chain
+from spacerobot_ros.planning.methods.square_path import check_planar_chain
 
 
 def bracket(oracle: PinocchioOracle, q: Array, i: int, j: int) -> Array:

@@ -31,10 +31,9 @@ from spacerobot_ros.model.rotations import (
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, plan
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance
-from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.schedule import HeldMotion
+from spacerobot_ros.planning.core.schedule import HeldMotion, JointEfforts
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.methods.optimal.held_commands import DriftVariation
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions

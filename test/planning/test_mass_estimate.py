@@ -26,7 +26,7 @@ from spacerobot_ros.planning.core.progress import (
     report_progress,
 )
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.path_deviation import (
+from spacerobot_ros.planning.execution.measured_states import (
     MassEstimate,
     PathCheck,
     PathSensitivity,

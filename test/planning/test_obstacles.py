@@ -56,7 +56,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
 )
 from spacerobot_ros.planning.methods.optimal.transcription import ConstraintBlock, Stages
-from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.planning.methods.registry import RemainingJointsGait
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.simulation import InitialState

@@ -29,9 +29,8 @@ from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core import progress
-from spacerobot_ros.planning.core.joint_efforts import JointEfforts
 from spacerobot_ros.planning.core.method import BEYOND_EFFORT_LIMITS
-from spacerobot_ros.planning.core.schedule import HeldMotion
+from spacerobot_ros.planning.core.schedule import HeldMotion, JointEfforts
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.problem import OptimalOptions, PathConstraints
 from spacerobot_ros.planning.methods.optimal.transcription import Stages, program

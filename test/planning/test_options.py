@@ -25,9 +25,9 @@ from spacerobot_ros.parameters import Parameter, configured, declared
 from spacerobot_ros.planning import METHODS, Goal, PoseError, RobotState, Tolerance, plan
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.geometric_phase import PlanarPhase
-from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
+from spacerobot_ros.planning.methods.optimal.held_commands import LimitedEfforts
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits, OptimalOptions
+from spacerobot_ros.planning.methods.square_path import PlanarPhase
 from spacerobot_ros.resources import robot_file, share_directory
 
 PARTS: tuple[str, ...] = ("position", "attitude", "shape")

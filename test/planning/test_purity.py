@@ -27,7 +27,7 @@ from spacerobot_ros.planning import (
     build_method,
     method_options,
 )
-from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.planning.methods.registry import RemainingJointsGait
 
 PERIOD, STEP = 0.1, 0.02
 SERVICER_SHAPE = (0.0, -1.2, 2.0, 0.0, 0.8, 0.0)

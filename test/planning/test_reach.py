@@ -30,7 +30,7 @@ from spacerobot_ros.planning import (
     method_options,
     plan,
 )
-from spacerobot_ros.planning.core.workspaces import Workspaces, workspaces
+from spacerobot_ros.planning.analysis import Workspaces, workspaces
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.motion_bounds import CenterReach

@@ -33,7 +33,7 @@ from spacerobot_ros.planning.execution import worker as worker_module
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.tracker import StuckJointWatch
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
-from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.planning.methods.registry import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState, VelocityPlant
 from spacerobot_ros.simulation.actuators import PlantWithFaults

@@ -35,7 +35,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitMethod, GaitSchedule, Goal, Tolerance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
-from spacerobot_ros.planning.execution.state_average import BaseMeasurement
+from spacerobot_ros.planning.execution.measured_states import BaseMeasurement
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.worker import Planned, PlanningTask, Refused
 from spacerobot_ros.resources import robot_file

@@ -35,7 +35,7 @@ from spacerobot_ros.errors import ParameterError, PlanningError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import Goal, RobotState, Tolerance
-from spacerobot_ros.planning.methods.geometric_phase import (
+from spacerobot_ros.planning.methods.square_path import (
     PhasePlane,
     PlanarPhase,
     check_planar_chain,

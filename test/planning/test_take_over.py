@@ -27,7 +27,7 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
-from spacerobot_ros.planning.execution.path_deviation import PathCheck
+from spacerobot_ros.planning.execution.measured_states import PathCheck
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
 from spacerobot_ros.times import SECOND

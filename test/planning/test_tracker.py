@@ -17,8 +17,7 @@ from spacerobot_ros.planning.core.cancellation import Cancellation
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.path_deviation import PathCheck
-from spacerobot_ros.planning.execution.state_average import StateAverage
+from spacerobot_ros.planning.execution.measured_states import PathCheck, StateAverage
 from spacerobot_ros.planning.execution.tracker import ScheduleFollower, TrajectoryTracker
 from spacerobot_ros.planning.execution.worker import PlanningTask, PlanningWorker
 from spacerobot_ros.simulation import EffortPlant, InitialState

@@ -35,7 +35,7 @@ from spacerobot_ros.planning import (
 )
 from spacerobot_ros.planning.analysis import analyze
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.planning.methods.registry import RemainingJointsGait
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.topics import TOPICS

@@ -28,7 +28,7 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
     PursuedGoals,
 )
-from spacerobot_ros.planning.execution.state_average import BaseMeasurement, MeasuredState
+from spacerobot_ros.planning.execution.measured_states import BaseMeasurement, MeasuredState
 from spacerobot_ros.planning.execution.status import (
     Notice,
     Output,

@@ -26,9 +26,15 @@ from spacerobot_ros.planning.core.goal import (
     Tolerance,
     end_effector_pose,
 )
-from spacerobot_ros.planning.core.joint_efforts import JointEfforts, given_effort_limits
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule, HeldMotion, Notes
+from spacerobot_ros.planning.core.schedule import (
+    BasePath,
+    GaitSchedule,
+    HeldMotion,
+    JointEfforts,
+    Notes,
+    given_effort_limits,
+)
 
 _REST_MOMENTUM = 1e-9  # per mass: m/s and m^2/s
 

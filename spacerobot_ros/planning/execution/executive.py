@@ -4,8 +4,8 @@
 the phases, the events that change them, and the table of all transitions.
 
 Other modules do the work of the phases: :mod:`.tracker` computes the commands along a schedule,
-:mod:`.worker` makes plans, :mod:`.state_average` averages measured states, and
-:mod:`.path_deviation` compares the measured base with its predicted path.
+:mod:`.worker` makes plans, and :mod:`.measured_states` averages measured states and compares the
+measured base with its predicted path.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal, PursuedGoals
-from spacerobot_ros.planning.execution.state_average import MeasuredState, StateAverage
+from spacerobot_ros.planning.execution.measured_states import MeasuredState, StateAverage
 from spacerobot_ros.planning.execution.status import (
     ActiveGoal,
     Event,

@@ -24,7 +24,7 @@ from spacerobot_ros.model.rotations import (
 )
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.state_average import MeasuredState
+from spacerobot_ros.planning.execution.measured_states import MeasuredState
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.planning.methods.optimal.problem import MotionLimits

@@ -18,7 +18,7 @@ from spacerobot_ros.planning.core.goal import RobotState
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.schedule import GaitSchedule, interpolated
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.path_deviation import (
+from spacerobot_ros.planning.execution.measured_states import (
     MassEstimate,
     PathCheck,
     PathSensitivity,

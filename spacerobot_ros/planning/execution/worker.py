@@ -24,8 +24,7 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.planning.execution.status import PlanReason
 from spacerobot_ros.planning.execution.tracker import TakeOver
-from spacerobot_ros.planning.methods.registry import METHODS, build_method
-from spacerobot_ros.planning.methods.remaining_joints import RemainingJointsGait
+from spacerobot_ros.planning.methods.registry import METHODS, RemainingJointsGait, build_method
 from spacerobot_ros.times import SECOND
 
 _COASTING_TIME, _COASTING_FACTOR = 2.0, 2.0

@@ -41,8 +41,7 @@ from spacerobot_ros.planning.core.progress import SearchClock
 from spacerobot_ros.planning.core.schedule import GaitSchedule, HeldMotion, Notes
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorSpecification
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
-from spacerobot_ros.planning.methods.optimal.held_commands import ManoeuvreModel
-from spacerobot_ros.planning.methods.optimal.joint_efforts import LimitedEfforts
+from spacerobot_ros.planning.methods.optimal.held_commands import LimitedEfforts, ManoeuvreModel
 from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.motion_bounds import (
     ConnectionBounds,
@@ -754,8 +753,9 @@ class OptimalGait(GaitMethod):
     def _list_active_limits(self, motion: HeldMotion) -> str:
         if len(motion.positions) < 2:
             return "nothing"
-        speed, change = self._limits.limit_shares(motion)
-        shares = {"velocity": speed, "acceleration": change}
+        speed, change = np.abs(motion.velocities), np.abs(motion.accelerations)
+        limits = self._limits
+        shares = {"velocity": speed / limits.velocity, "acceleration": change / limits.acceleration}
         if self._efforts is not None:
             shares["effort"] = np.abs(self._efforts.shares(motion))
         names = np.array(self.robot.joint_names)

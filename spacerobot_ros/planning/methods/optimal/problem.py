@@ -287,15 +287,17 @@ class MotionLimits:
         The factor is at most 1 if velocities and accelerations are within their limits; the overrun
         is the largest distance of a joint beyond its limits, m or rad.
         """
-        speed, change = self.limit_shares(motion)
         beyond = np.maximum(self.lower - motion.positions, motion.positions - self.upper)
-        factor = max(float(speed.max(initial=0.0)), float(np.sqrt(change.max(initial=0.0))))
+        factor = self.slowdown(motion.velocities, motion.accelerations)
         return factor, float(beyond.max(initial=0.0))
 
-    def limit_shares(self, motion: HeldMotion) -> tuple[Array, Array]:
-        """Return velocities (N + 2, n) and accelerations (N + 1, n) as fractions of limits."""
-        speeds, changes = np.abs(motion.velocities), np.abs(motion.accelerations)
-        return speeds / self.velocity, changes / self.acceleration
+    def slowdown(self, velocities: Array, accelerations: Array) -> float:
+        """Return the factor by which a motion must be slowed down to satisfy the velocity and
+        acceleration limits: at most 1 if it satisfies them; values are (..., n).
+        """
+        speed = (np.abs(velocities) / self.velocity).max(initial=0.0)
+        change = (np.abs(accelerations) / self.acceleration).max(initial=0.0)
+        return max(float(speed), math.sqrt(float(change)))
 
 
 @dataclass(frozen=True)
@@ -337,10 +339,8 @@ class Trajectory:
 
     def at_full_speed(self, limits: MotionLimits, shortest: float) -> Trajectory:
         """Return the trajectory along the same path at full speed, in at least ``shortest`` s."""
-        speed = float((np.abs(self.velocities) / limits.velocity).max())
-        change = np.abs(np.diff(self.velocities, axis=0)) / self.step / limits.acceleration
-        factor = max(speed, float(np.sqrt(change.max())), shortest / self.duration)
-        return self.stretched(factor)
+        factor = limits.slowdown(self.velocities, np.diff(self.velocities, axis=0) / self.step)
+        return self.stretched(max(factor, shortest / self.duration))
 
 
 @dataclass(frozen=True)

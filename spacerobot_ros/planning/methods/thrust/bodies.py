@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -273,7 +273,15 @@ class Bodies:
             self._around.append(_Corridor(robot, link, grapple, begin))
         self._pairs = [(each, k) for each in self._around for k in range(len(each.required))]
         """Surroundings of each pair, and its number there."""
-        self.rows = cache(partial(_rows_of_pair, robot, self._pairs))
+        center_of_mass = robot.function("center_of_mass", compile=False)
+        pairs = self._pairs
+
+        @cache
+        def rows(number: int) -> ConstraintBlock:
+            around, pair = pairs[number]
+            return pair_block(robot.n, around.distance_function(pair, center_of_mass))
+
+        self.rows = rows
         """Returns the rows of a pair with a given number."""
         self._kept: dict[int, tuple[float, npt.NDArray[np.bool_]]] = {}
         """Room of the pairs that are kept apart, m, and whether each is kept apart at each instant
@@ -369,14 +377,6 @@ class Bodies:
         """Return a clause that describes a motion that is not clear."""
         around, _ = self._pairs[approach.pair]
         return f"no clear motion was found: {around.clause(approach)}"
-
-
-def _rows_of_pair(
-    robot: SpaceRobot, pairs: Sequence[tuple[_Surroundings | _Corridor, int]], number: int
-) -> ConstraintBlock:
-    around, pair = pairs[number]
-    center_of_mass = robot.function("center_of_mass", compile=False)
-    return pair_block(robot.n, around.distance_function(pair, center_of_mass))
 
 
 def _poses(pose: Array) -> BasePoses:

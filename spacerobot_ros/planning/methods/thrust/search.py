@@ -301,10 +301,8 @@ class ThrustPlanner:
         f_B = np.einsum("kji,kj->ki", R[:-1], robot.total_mass * np.diff(V, axis=0) / h)
         n_B = np.einsum("kji,kj->ki", R[:-1], np.diff(L, axis=0) / h) + np.cross(c[:-1], f_B)
         wanted = np.hstack([f_B, n_B]) @ np.linalg.pinv(self.propulsion.wrenches).T
-        speed = float(np.max(np.abs(v) / self.limits.velocity, initial=0.0))
         change = np.diff(v, axis=0) / h
-        most = float(np.max(np.abs(change) / self.limits.acceleration, initial=0.0))
-        time = max(speed, math.sqrt(most), math.sqrt(float(np.abs(wanted).max())), 1e-3)
+        time = max(self.limits.slowdown(v, change), math.sqrt(float(np.abs(wanted).max())), 1e-3)
         states = np.hstack([X, L, r, V, q, v])
         knots = ThrustKnots(h, states, change, wanted, np.zeros((N, DEFECT_SIZE))).stretched(time)
         return replace(knots, levels=np.clip(knots.levels, self.propulsion.lowest, 1.0))
@@ -390,25 +388,23 @@ class _Search:
         time on, each one much later than the one before, which was in vain, then earlier ones.
         """
         assert self.grapple is not None
+
+        def guess_at(time: float, past: bool) -> ThrustKnots | None:
+            base, shape, fixture = self._meeting(time)
+            return next(self._ways(base, shape, self._sides(base) if past else fixture, time), None)
+
         for past in (False, True):
             time = latest
             while time < self.grapple.horizon:
                 wait = _MEETING_PERIOD
-                if (guess := self._guess_at(time, past=past)) is not None:
+                if (guess := guess_at(time, past)) is not None:
                     yield guess
                     wait = max(wait, _LATER * time)
                 time += wait
             time = latest
             while (time := time / (1 + _LATER)) >= self.earliest:
-                if (guess := self._guess_at(time, past=past)) is not None:
+                if (guess := guess_at(time, past)) is not None:
                     yield guess
-
-    def _guess_at(self, time: float, *, past: bool) -> ThrustKnots | None:
-        """Return a clear guess that meets a target at a time, on the side of its fixture or past
-        it; None if there is none.
-        """
-        base, shape, fixture = self._meeting(time)
-        return next(self._ways(base, shape, self._sides(base) if past else fixture, time), None)
 
     def run(self, guess: ThrustKnots) -> ThrustMotion:
         planner, options = self.planner, self.planner.options
