@@ -46,7 +46,7 @@ from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.worker import PlanningWorker
 from spacerobot_ros.planning.methods.optimal import OptimalGait
-from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
+from spacerobot_ros.planning.methods.optimal.kept_distances import KeptDistances
 from spacerobot_ros.planning.methods.optimal.multiple_shooting import MultipleShooting
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
@@ -479,12 +479,10 @@ def test_a_clear_path_keeps_to_the_planes_between_its_links() -> None:
     away, near = np.array([0.0, -1.4, 0.5, 0, 0, 0]), np.array([0.0, 0.6, 0.5, 0, 0, 0])
     geometry = Clearance(robot.description, 0.0).geometry
     distance, pair = (each[0].item() for each in geometry.nearest_along(near[np.newaxis]))
-    library = DistanceLibrary(
-        Clearance(robot.description, distance - 1e-4), robot, BasePrediction(robot, 0.05, 0.01)
-    )
-    no_turn = np.array([0.0, 0.0, 0.0, 1.0])
+    clearance = Clearance(robot.description, distance - 1e-4)
+    no_turn, prediction = np.array([0.0, 0.0, 0.0, 1.0]), BasePrediction(robot, 0.05, 0.01)
     boundary = BoundaryConditions(away, no_turn, near, near)
-    kept = library.begin(boundary, turn_is_known=True)
+    kept = KeptDistances(clearance, robot, prediction, boundary, turn_is_known=True)
     s = np.linspace(0.0, 1.0, 41)[:, np.newaxis]
     path = Trajectory(
         0.05,
@@ -497,7 +495,7 @@ def test_a_clear_path_keeps_to_the_planes_between_its_links() -> None:
     still = MotionLimits(robot.lower, robot.upper, np.ones(6), np.ones(6))
     planes = kept.within(still, path).distances.reshape(-1, 7)
     shapes, _ = kept.along(path)
-    distances, own = library.planes(boundary, pair, geometry.poses(shapes))
+    distances, own = kept.planes(pair, geometry.poses(shapes))
     np.testing.assert_allclose(
         planes[:, [0, 1, 2, 4, 5, 6]], own[:, [0, 1, 2, 4, 5, 6]], atol=1e-12
     )

@@ -45,11 +45,11 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_rotvec,
     quaternion_multiply,
 )
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import HeldMotion, JointEfforts, given_effort_limits
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorRows
 from spacerobot_ros.planning.methods.optimal.goal_specification import nearest_shape_for_center
-from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.problem import (
     BoundaryConditions,
     MotionLimits,
@@ -168,7 +168,7 @@ class ManoeuvreModel:
         The model, the base motion prediction, and the command duration, s.
     axes
         (m, 3) directions in the base frame along which the attitude is reached.
-    constraints, efforts, distances
+    constraints, efforts, clearance
         Path constraints; efforts and distances are unlimited if None.
     end_effectors
         Rows for the end-effector goals that must be reached; None: none.
@@ -181,7 +181,7 @@ class ManoeuvreModel:
     constraints: PathConstraints
     efforts: LimitedEfforts | None = None
     end_effectors: EndEffectorRows | None = None
-    distances: DistanceLibrary | None = None
+    clearance: Clearance | None = None
 
     def stages(self, position: bool, drifting: bool, compiles: bool) -> Stages:
         """Return the functions of the optimal control problem.

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -48,8 +49,8 @@ def instants_of(intervals: int) -> int:
     return math.ceil(_MIN_INSTANTS / intervals)
 
 
-class DistanceLibrary:
-    """Clearance of one robot, and the data from which planes between its pairs are computed.
+class KeptDistances:
+    """Pairs kept apart in one search, each by planes along a path: none initially.
 
     Parameters
     ----------
@@ -57,79 +58,62 @@ class DistanceLibrary:
         The clearance of plans.
     robot, prediction
         The model, and the base motion prediction.
+    boundary
+        Both ends of the motion.
+    turn_is_known
+        Whether the boundary conditions give the base rotation at the end.
+
+    Raises
+    ------
+    PlanningError
+        Links are too close at an end.
     """
 
-    def __init__(self, clearance: Clearance, robot: SpaceRobot, prediction: BasePrediction) -> None:
+    def __init__(
+        self,
+        clearance: Clearance,
+        robot: SpaceRobot,
+        prediction: BasePrediction,
+        boundary: BoundaryConditions,
+        *,
+        turn_is_known: bool,
+    ) -> None:
         self.clearance = clearance
-        self._robot, self._prediction = robot, prediction
-
-    def begin(self, boundary: BoundaryConditions, *, turn_is_known: bool) -> KeptDistances:
-        """Return the pairs to keep apart between the two ends of a motion: none initially.
-
-        ``turn_is_known``: whether the boundary conditions give the base rotation at the end.
-
-        Raises
-        ------
-        PlanningError
-            Links are too close at an end.
-        """
-        start = boundary.start[np.newaxis]
-        required = self.clearance.required(
-            boundary.start, self.base_poses(boundary, start, _NO_TURN[np.newaxis])
-        )
+        self._robot, self._prediction, self._boundary = robot, prediction, boundary
+        self._room: dict[int, float] = {}
+        base = self._base_poses(boundary.start[np.newaxis], _NO_TURN[np.newaxis])
+        self._required = clearance.required(boundary.start, base)
         if boundary.final is not None:
             base = None
             if turn_is_known:
                 end, turn = boundary.final[np.newaxis], boundary.goal_rotation[np.newaxis]
-                base = self.base_poses(boundary, end, turn)
-            self.clearance.require_shape(boundary.final, required, base)
-        return KeptDistances(self, boundary, required)
+                base = self._base_poses(end, turn)
+            clearance.require_shape(boundary.final, self._required, base)
 
-    def base_poses(
-        self, boundary: BoundaryConditions, shapes: Array, turns: Array
-    ) -> BasePoses | None:
+    def _base_poses(self, shapes: Array, turns: Array) -> BasePoses | None:
         """Return the base poses at shapes (K, n) and rotations (K, 4) since the start.
 
         None if there are no obstacles, so that the base pose does not matter.
         """
-        if boundary.state is None or not self.clearance.has_obstacles:
+        state = self._boundary.state
+        if state is None or not self.clearance.has_obstacles:
             return None
-        attitudes = quaternion_multiply(boundary.state.quaternion, turns)
-        return self._prediction.poses(boundary.state, shapes, attitudes)
+        attitudes = quaternion_multiply(state.quaternion, turns)
+        return self._prediction.poses(state, shapes, attitudes)
 
-    def planes(self, boundary: BoundaryConditions, pair: int, poses: Poses) -> tuple[Array, Array]:
+    def planes(self, pair: int, poses: Poses) -> tuple[Array, Array]:
         """Return the distances (K,) of a pair, m, and its planes (K, 7) in row form."""
         geometry = self.clearance.geometry
         distances, planes = geometry.planes(pair, poses)
         if geometry.with_obstacles[pair]:
             # From W to the centre-of-mass frame with the initial base attitude.
-            state = boundary.state
+            state = self._boundary.state
             assert state is not None
             R_W0 = matrix_from_quaternion(state.quaternion)
             r_WC = state.position + R_W0 @ self._robot.center_of_mass(state.q)
             planes[:, 3] -= planes[:, :3] @ r_WC
             planes[:, :3] = planes[:, :3] @ R_W0
         return distances, planes
-
-
-class KeptDistances:
-    """Pairs kept apart in one search, each by planes along a path.
-
-    Parameters
-    ----------
-    library
-        The clearance and the poses of the robot.
-    boundary
-        Both ends.
-    required
-        (P,) required distances of all pairs, m.
-    """
-
-    def __init__(
-        self, library: DistanceLibrary, boundary: BoundaryConditions, required: Array
-    ) -> None:
-        self._library, self._boundary, self._required = library, boundary, required
-        self._room: dict[int, float] = {}
 
     @property
     def pairs(self) -> tuple[int, ...]:
@@ -142,18 +126,14 @@ class KeptDistances:
 
         ``turns`` (N + 1, 4) are the base rotations since the start.
         """
-        base = self._library.base_poses(self._boundary, positions, turns)
-        return self._library.clearance.approaches(positions, self._required + margin, base)
-
-    def message(self, approach: Approach, control_period: float | None) -> str:
-        """Return a clause about an approach that is too close, with times if a period is given."""
-        return self._library.clearance.clause(approach, control_period)
+        base = self._base_poses(positions, turns)
+        return self.clearance.approaches(positions, self._required + margin, base)
 
     def beside(self, path: Trajectory, margin: float = 0.0) -> KeptDistances:
         """Return kept distances for the same ends, with the pairs that come closer along a path
         than required plus a margin, m; pairs that are already kept apart keep their room.
         """
-        kept = KeptDistances(self._library, self._boundary, self._required)
+        kept = copy(self)
         near = (each.pair for each in self.approaches_of(path, margin))
         kept._room = {pair: self._room.get(pair, INITIAL_ROOM) for pair in near}
         return kept
@@ -180,8 +160,8 @@ class KeptDistances:
     def is_clear(self, path: Trajectory) -> bool:
         """Whether no pair comes too close along a path."""
         # Most paths in collision are so at their knots, which costs a fiftieth to check.
-        clearance = self._library.clearance
-        return clearance.is_clear(path.shapes, self._required) and not self.approaches_of(path)
+        knots_are_clear = self.clearance.is_clear(path.shapes, self._required)
+        return knots_are_clear and not self.approaches_of(path)
 
     def approaches_of(self, path: Trajectory, margin: float = 0.0) -> list[Approach]:
         """Return the pairs that come too close along a path, as in :meth:`approaches`."""
@@ -201,16 +181,14 @@ class KeptDistances:
         if not self.pairs:
             return limits
         shapes, turns = self.along(path)
-        poses = self._library.clearance.geometry.poses(
-            shapes, self._library.base_poses(self._boundary, shapes, turns)
-        )
+        poses = self.clearance.geometry.poses(shapes, self._base_poses(shapes, turns))
         found = np.empty((len(shapes), len(self.pairs), PLANE_SIZE))
         place = np.arange(len(shapes)) / len(shapes)
         if self._boundary.final is not None:
             place = np.minimum(place, 1 - place)
         at_ends = place < _SHARE_OF_ENDS
         for number, pair in enumerate(self.pairs):
-            distances, found[:, number] = self._library.planes(self._boundary, pair, poses)
+            distances, found[:, number] = self.planes(pair, poses)
             wanted = self._required[pair] + self._room[pair]
             left_as_it_is = distances >= self._required[pair]
             if pushing:

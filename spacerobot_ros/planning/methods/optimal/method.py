@@ -42,7 +42,6 @@ from spacerobot_ros.planning.core.schedule import GaitSchedule, HeldMotion, Note
 from spacerobot_ros.planning.methods.optimal.end_effectors import EndEffectorSpecification
 from spacerobot_ros.planning.methods.optimal.goal_specification import GoalSpecification
 from spacerobot_ros.planning.methods.optimal.held_commands import LimitedEfforts, ManoeuvreModel
-from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
 from spacerobot_ros.planning.methods.optimal.motion_bounds import (
     ConnectionBounds,
     DurationBound,
@@ -176,11 +175,7 @@ class OptimalGait(GaitMethod):
             self._specification.axes,
             self._constraints,
             self._efforts,
-            distances=(
-                None
-                if self.clearance is None
-                else DistanceLibrary(self.clearance, robot, self._prediction)
-            ),
+            clearance=self.clearance,
         )
         self._base_goals = _GoalKind.of(self._specification, self._model)
         self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}

@@ -112,29 +112,20 @@ class DurationBounds:
         return self.shortest == self.longest
 
 
-@dataclass(frozen=True)
-class Neighbourhood:
+class Neighbourhood(NamedTuple):
     """Neighbourhood of a guess in which a solver searches for a path without collisions.
 
     Attributes
     ----------
-    reach
-        (n,) largest shape change anywhere on the path, m or rad.
+    share
+        Largest shape change anywhere on the path, as a fraction of the largest reach.
     largest_lack
         Distance by which links may be closer than required, m. The cost of this distance is high,
         so that it vanishes if the solver finds a path.
     """
 
-    reach: Array
+    share: float
     largest_lack: float = 0.0
-
-    @classmethod
-    def within(
-        cls, limits: MotionLimits, share: float = 1.0, largest_lack: float = 0.0
-    ) -> Neighbourhood:
-        """Return the neighbourhood with a fraction of the largest reach for given limits."""
-        width = limits.upper - limits.lower
-        return cls(share * np.minimum(_LARGEST_REACH, _LARGEST_REACH_SHARE * width), largest_lack)
 
 
 class MultipleShooting:
@@ -206,9 +197,9 @@ class MultipleShooting:
         vertices = np.array([np.tile(x, (N + 1, 1)) for x in (limits.lower, limits.upper)])
         if near is not None:
             middle = np.clip(guess.shapes + guess.step * guess.velocities / 2, *vertices)
-            vertices = np.clip(
-                middle + np.multiply.outer([-1.0, 1.0], near.reach)[:, None], *vertices
-            )
+            width = limits.upper - limits.lower
+            reach = near.share * np.minimum(_LARGEST_REACH, _LARGEST_REACH_SHARE * width)
+            vertices = np.clip(middle + np.multiply.outer([-1.0, 1.0], reach)[:, None], *vertices)
         if boundary.final is not None:
             given = np.isfinite(boundary.final)
             vertices[:, N, given] = boundary.final[given]

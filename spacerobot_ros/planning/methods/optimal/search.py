@@ -332,9 +332,10 @@ class ManoeuvreSearch:
             most = problem.limits.velocity
             velocity = np.clip(problem.motion.mean_velocity(model.control_period), -most, most)
             problem = replace(problem, boundary=replace(problem.boundary, velocity=velocity))
-        kept, knows_turn = None, len(model.axes) == 3
-        if model.distances is not None and problem.keeps_clear:
-            kept = model.distances.begin(problem.boundary, turn_is_known=knows_turn)
+        kept = None
+        if model.clearance is not None and problem.keeps_clear:
+            about = model.clearance, model.robot, model.prediction, problem.boundary
+            kept = KeptDistances(*about, turn_is_known=len(model.axes) == 3)
         search = _Search(model, problem, self._solvers)
         found, refusal = search.search_from_guesses(), NotFoundError
         if found is not None and kept is not None:
@@ -364,9 +365,9 @@ def _built_solver(
 ) -> MultipleShooting:
     """Return the solver on a grid, which keeps pairs of links apart."""
     # Most of the time is spent on clear paths.
-    stages, distances = stages_of(position, drifting, bool(pairs)), model.distances
-    if pairs and distances is not None:
-        rows = PlaneDistances.of(distances.clearance.geometry, pairs)
+    stages = stages_of(position, drifting, bool(pairs))
+    if pairs and model.clearance is not None:
+        rows = PlaneDistances.of(model.clearance.geometry, pairs)
         stages = stages.with_distances(rows, instants_of(grid.intervals))
     return MultipleShooting(stages, *grid)
 
@@ -555,7 +556,7 @@ class _Search:
             share = _HELD_SHARE_OF_STOPS
             limits = replace(limits, velocity=share * velocity, acceleration=share * acceleration)
         if kept is not None and kept.pairs:
-            near = Neighbourhood.within(limits, _HELD_REACH_SHARE)
+            near = Neighbourhood(_HELD_REACH_SHARE)
         grid = _Grid(len(trajectory.shapes) - 1)
         ticks = max(_MIN_TICKS, math.ceil(trajectory.duration / self._period - 1e-6))
         guess, boundary, aim = trajectory, problem.boundary, problem.boundary
@@ -685,7 +686,7 @@ class _Search:
         steps of a fraction of the largest reach. UnusableCandidateError if none was found.
         """
         self._begin(SearchPhase.CLEARING)
-        around = Neighbourhood.within(self._problem.limits, reach, _LARGEST_LACK)
+        around = Neighbourhood(reach, _LARGEST_LACK)
         least, stalled, no_lack = math.inf, 0, _NO_LACK
         for _ in range(_MAX_CLEARING_ROUNDS):
             path = self._solve_apart(kept, grid, path, duration, around)
@@ -709,7 +710,7 @@ class _Search:
             if is_over or stalled >= _MAX_STALLED_ROUNDS:
                 break
         period = None if made is None else self._period
-        raise UnusableCandidateError(kept.message(near[0], period))
+        raise UnusableCandidateError(kept.clearance.clause(near[0], period))
 
     def _shorten(
         self,
@@ -725,15 +726,13 @@ class _Search:
         held commands may be replaced by a faster one that is not clear.
         """
         self._begin(SearchPhase.SHORTENING)
-        limits = self._problem.limits
         for number in range(_MAX_SHORTENING_ROUNDS):
             self._report("clear path", path.duration)
             is_over = number >= _MIN_SHORTENING_ROUNDS and self._is_over(found=True)
             if is_over or reach < _MIN_REACH_SHARE or self._problem.clock.is_over(found=True):
                 break
             try:
-                around = Neighbourhood.within(limits, reach)
-                faster = self._solve_apart(kept, grid, path, None, around)
+                faster = self._solve_apart(kept, grid, path, None, Neighbourhood(reach))
                 near, found = self._approaches(kept, grid, faster)
             except UnusableCandidateError:
                 reach /= _REACH_DIVISOR
