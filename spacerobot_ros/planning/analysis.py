@@ -45,6 +45,8 @@ from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS, AutoGait
 from spacerobot_ros.planning.methods.square_path import check_planar_chain
 
+# -- workspaces ------------------------------------------------------------------------------------
+
 _SEED = 20
 _SAMPLED_SHAPES = 48
 """Number of start configurations of searches for singular shapes, and of samples for the reach."""
@@ -349,6 +351,8 @@ def _union(intervals: Array, gap: float) -> list[Interval]:
             found.append([float(low), float(high)])
     return [(low, high) for low, high in found]
 
+
+# -- analysis --------------------------------------------------------------------------------------
 
 _CONDITION_SAMPLE_COUNT = 300
 

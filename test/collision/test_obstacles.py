@@ -20,7 +20,7 @@ from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.planning import RobotState
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.prediction import BasePrediction
-from spacerobot_ros.planning.methods.optimal.kept_distances import DistanceLibrary
+from spacerobot_ros.planning.methods.optimal.kept_distances import KeptDistances
 from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions
 from spacerobot_ros.simulation.clearance import FlightClearance
 
@@ -109,7 +109,8 @@ def test_planes_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None
     state = RobotState(base.position[0], base.quaternion[0], shapes[0])
     boundary = BoundaryConditions(shapes[0], IDENTITY, shapes[-1], state=state)
     prediction = BasePrediction(robot, 0.05, 0.05)
-    library = DistanceLibrary(Clearance(geometry.robot, 0.01), robot, prediction)
+    clearance = Clearance(geometry.robot, 0.01)
+    kept = KeptDistances(clearance, robot, prediction, boundary, turn_is_known=False)
     rng = np.random.default_rng(3)
 
     def distance(y: Array) -> float:
@@ -123,7 +124,7 @@ def test_planes_follow_the_turn_of_the_base(geometry: CollisionGeometry) -> None
         r_WB = r_WC - R_WB.apply(robot.center_of_mass(q))
         at = BasePoses(r_WB[np.newaxis], R_WB.as_quat()[np.newaxis])
         y = np.concatenate([q, x])
-        (found,), (plane,) = library.planes(boundary, pair, geometry.poses(q[np.newaxis], at))
+        (found,), (plane,) = kept.planes(pair, geometry.poses(q[np.newaxis], at))
         assert found == pytest.approx(distance(y), abs=1e-6)
         assert float(row.values(y, plane)) == pytest.approx(found, abs=1e-6)
         steps = 1e-6 * np.eye(6)

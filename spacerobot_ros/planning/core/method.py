@@ -235,14 +235,13 @@ class GaitMethod(ABC):
         remaining: float = 0.0,
         progress: object = None,
         is_clear: bool = False,
-        velocity: Array | float = 0.0,
-        L_B: Array | None = None,
+        motion: HeldMotion | None = None,
         end_velocities: Array | None = None,
     ) -> GaitSchedule:
         """Return shapes (N + 1, n) at the ticks as a schedule of this method.
 
-        ``velocity`` and ``end_velocities`` (n,) are held before and after the motion. A note
-        reports efforts beyond the URDF limits, at the angular momentum ``L_B`` (N + 1, 3) in B.
+        A note reports efforts beyond the URDF limits in the ``motion``; None: from rest to rest at
+        zero momentum. ``end_velocities`` (n,) are held after it.
 
         Raises
         ------
@@ -257,8 +256,7 @@ class GaitMethod(ABC):
             start = RobotState(path.position[0], path.quaternion[0], positions[0])
             self._require_clear(positions, self._base_poses(start, positions))
         if self._joint_efforts is not None:
-            after = 0.0 if end_velocities is None else end_velocities
-            motion = HeldMotion(positions, self.control_period, velocity, after, L_B)
+            motion = motion or HeldMotion(positions, self.control_period)
             beyond = self._joint_efforts.beyond_limits(motion)
             notes = {**notes, BEYOND_EFFORT_LIMITS: beyond} if beyond else notes
         return GaitSchedule(

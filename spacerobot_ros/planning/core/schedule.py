@@ -227,6 +227,8 @@ def _leg_duration(robot: SpaceRobot, move: Array, wanted: float) -> float:
     return max(wanted, float(slowest))
 
 
+# -- joint efforts ---------------------------------------------------------------------------------
+
 _MAX_EXCESS = 1e-6
 """Fraction of a limit by which an effort may exceed it through rounding errors."""
 

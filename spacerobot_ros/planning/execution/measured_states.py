@@ -40,6 +40,8 @@ from spacerobot_ros.planning.core.goal import (
 from spacerobot_ros.planning.core.schedule import GaitSchedule, interpolated
 from spacerobot_ros.planning.execution.config import PlannerConfig
 
+# -- averages --------------------------------------------------------------------------------------
+
 _REST_RATE = 1e-9  # m/s or rad/s
 
 
@@ -150,6 +152,8 @@ class StateAverage:
             self._momenta = momenta
         return RobotState(poses[:, :3].mean(axis=0), quaternion, q, *momenta, qdot)
 
+
+# -- deviation from the path -----------------------------------------------------------------------
 
 _MAX_EVALUATED_SHAPES = 48
 _DIFFERENCE_STEP = 1e-6

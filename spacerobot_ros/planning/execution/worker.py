@@ -311,21 +311,20 @@ class PlanningWorker:
         self, shapes: Array, task: PlanningTask, method: GaitMethod, cancellation: Cancellation
     ) -> GaitSchedule:
         """Return one schedule: braking in ``shapes`` (K + 1, n), then a gait from rest."""
-        request, period = task.request, self._config.control_period
+        request = task.request
         shapes[0] = request.state.q
-        at_rest, positions, attitudes = self._predict_motion(request.state, shapes)
-        times: Array = period * np.arange(len(shapes), dtype=float)
+        at_rest, braking = self._predict_motion(request.state, shapes)
         at_rest = replace(at_rest, qdot=task.rates_after_braking)
         gait = method.plan(replace(request, state=at_rest), cancellation)
         path = BasePath(
-            np.append(times[:-1], times[-1] + gait.path.time),
-            np.vstack([positions[:-1], gait.path.position]),
-            np.vstack([attitudes[:-1], gait.path.quaternion]),
+            np.append(braking.time[:-1], braking.time[-1] + gait.path.time),
+            np.vstack([braking.position[:-1], gait.path.position]),
+            np.vstack([braking.quaternion[:-1], gait.path.quaternion]),
         )
         return replace(gait, positions=np.vstack([shapes[:-1], gait.positions]), path=path)
 
-    def _predict_motion(self, state: RobotState, shapes: Array) -> tuple[RobotState, Array, Array]:
-        """Return the state after shapes (K + 1, n), one per tick, and the base pose at each."""
+    def _predict_motion(self, state: RobotState, shapes: Array) -> tuple[RobotState, BasePath]:
+        """Return the state after shapes (K + 1, n), one per tick, and the base path on the way."""
         config = self._config
         # Most manoeuvres have few ticks: compiling the step would take longer.
         robot = self._robot.interpreted
@@ -335,4 +334,4 @@ class PlanningWorker:
         positions = prediction.positions(state, times, shapes, attitudes)
         q = shapes[-1].copy()
         after = replace(state, position=positions[-1], quaternion=attitudes[-1], q=q)
-        return after, positions, attitudes
+        return after, BasePath(times, positions, attitudes)

@@ -787,21 +787,23 @@ class ResolvedRateGait(GaitMethod):
     ) -> Array:
         """Return shapes (N + 1, n) at ticks, corrected for the motion in between."""
         positions = shapes.copy()
-        X, at_rest = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
-        positions[0] = state.q
+        X, positions[0] = np.array([0.0, 0.0, 0.0, 1.0]), state.q
         for k in range(1, len(shapes)):
-            q = shapes[k] + (positions[k - 1] - shapes[k - 1])
+            before = positions[k - 1]
+            q = shapes[k] + (before - shapes[k - 1])
+            turned = self._turned(X, before, q)
             for _ in range(_MAX_CORRECTION_ITERATIONS):
-                between = np.vstack([positions[k - 1], q])
-                turned = self._prediction.attitudes(between, X, at_rest)[-1]
                 step, miss = lines.least_correction(q, turned, float(shares[k]))
                 if miss < _ZERO_DISTANCE / 100:
                     break
                 q = q + step
-            between = np.vstack([positions[k - 1], q])
-            X = self._prediction.attitudes(between, X, at_rest)[-1]
-            positions[k] = q
+                turned = self._turned(X, before, q)
+            X, positions[k] = turned, q
         return positions
+
+    def _turned(self, X: Array, before: Array, after: Array) -> Array:
+        """Return the attitude (4,) after a tick between two shapes (n,), from another attitude."""
+        return self._prediction.attitudes(np.vstack([before, after]), X, np.zeros(3))[-1]
 
     def _schedule(
         self,

@@ -60,6 +60,8 @@ from spacerobot_ros.planning.methods.optimal.problem import (
 )
 from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
+# -- effort limits ---------------------------------------------------------------------------------
+
 _PLANNED_EFFORT_SHARE = 0.98
 """Fraction of the limits that a solution may use; the rest is reserved for path changes."""
 
@@ -120,6 +122,8 @@ class LimitedEfforts(JointEfforts):
         share = tau / (_PLANNED_EFFORT_SHARE * self.limit[limited])
         return ca.Function("efforts", arguments, [ca.vertcat(1 - share, 1 + share)])
 
+
+# -- held commands ---------------------------------------------------------------------------------
 
 _WAVES_PER_JOINT = 6
 

@@ -123,13 +123,6 @@ class _GoalKind:
     search: ManoeuvreSearch
     within_efforts: ManoeuvreSearch
 
-    @classmethod
-    def of(
-        cls, specification: GoalSpecification | EndEffectorSpecification, model: ManoeuvreModel
-    ) -> _GoalKind:
-        free = ManoeuvreSearch(replace(model, efforts=None))
-        return cls(specification, free, ManoeuvreSearch(model))
-
 
 class _Plan(NamedTuple):
     """Shapes (N + 1, n) at the ticks, notes on the search, and the final velocities (n,)."""
@@ -177,21 +170,22 @@ class OptimalGait(GaitMethod):
             self._efforts,
             clearance=self.clearance,
         )
-        self._base_goals = _GoalKind.of(self._specification, self._model)
-        self._end_effector_goals: dict[tuple[object, ...], _GoalKind] = {}
+        self._kinds: dict[tuple[object, ...], _GoalKind] = {}
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
     def _kind_of(self, goal: Goal) -> _GoalKind:
-        if not goal.end_effectors:
-            return self._base_goals
-        key = EndEffectorSpecification.key(goal)
-        if key not in self._end_effector_goals:
-            of = EndEffectorSpecification.of(self._specification, goal)
-            # A motion to a given shape has no rows at its end: the attitude follows from the shape.
-            rows = None if of.ends_in_one_shape else of.rows
-            model = replace(self._model, axes=of.axes, end_effectors=rows)
-            self._end_effector_goals[key] = _GoalKind.of(of, model)
-        return self._end_effector_goals[key]
+        key = EndEffectorSpecification.key(goal) if goal.end_effectors else ()
+        if key not in self._kinds:
+            specification: GoalSpecification | EndEffectorSpecification = self._specification
+            model = self._model
+            if goal.end_effectors:
+                specification = of = EndEffectorSpecification.of(self._specification, goal)
+                # A motion to a given shape has no rows at its end: the attitude follows from it.
+                rows = None if of.ends_in_one_shape else of.rows
+                model = replace(model, axes=of.axes, end_effectors=rows)
+            free, limited = ManoeuvreSearch(replace(model, efforts=None)), ManoeuvreSearch(model)
+            self._kinds[key] = _GoalKind(specification, free, limited)
+        return self._kinds[key]
 
     @classmethod
     @override
@@ -739,8 +733,7 @@ class OptimalGait(GaitMethod):
             path,
             notes,
             is_clear=True,
-            velocity=before,
-            L_B=L_B,
+            motion=motion,
             end_velocities=after if after.any() else None,
         )
         return replace(schedule, controls=controls)

@@ -207,15 +207,9 @@ class MultipleShooting:
         velocities[:, 0], velocities[:, N] = boundary.velocity, boundary.final_velocity
         attitudes = np.multiply.outer([-1.0, 1.0], np.full((N + 1, 4), 1.1))
         attitudes[:, 0] = [0.0, 0.0, 0.0, 1.0]
-        accelerations = np.multiply.outer([-1.0, 1.0], np.tile(limits.acceleration, (N, 1)))
-        steps = duration.shortest / N, duration.longest / N
-        least, most = (
-            pack_knots(layout, steps[i], attitudes[i], vertices[i], velocities[i], accelerations[i])
-            for i in (0, 1)
-        )
+        accelerations = np.array([-limits.acceleration, limits.acceleration])
         lack = 0.0 if near is None else near.largest_lack
-        if layout.has_lack:
-            most[-1] = lack
+        bounds = knot_bounds(layout, duration, lack, attitudes, vertices, velocities, accelerations)
         slower = self._has_distances and not duration.fixed and not boundary.is_timed
         first = guess.stretched(_WARM_STRETCH) if slower else guess
         parameters = _pack_parameters(
@@ -225,7 +219,7 @@ class MultipleShooting:
             "refining" if refining and not self._has_distances else "",
             stop,
             self._initial_variables(first, lack),
-            (least, most),
+            bounds,
             parameters,
         )
         self.converged, self.feasible, x = found.converged, found.feasible, found.x
@@ -261,17 +255,11 @@ def _pack_parameters(
         change = np.diff(guess.velocities, axis=0) / guess.step / typical
         effort = max(float(np.sum(change**2)) / len(change), 1e-300)
         weights = np.array([0.0, 1.0 / effort, _COST_OF_LACK])
-    center = np.zeros(3) if boundary.center is None else boundary.center
     return np.concatenate(
         [
-            *(
-                boundary.start,
-                boundary.goal_rotation,
-                boundary.direction,
-                center,
-                boundary.end_effectors,
-            ),
-            *(typical, weights if limits.distances.size else weights[:2]),
+            *(boundary.start, boundary.goal_rotation, boundary.direction),
+            np.zeros(3) if boundary.center is None else boundary.center,
+            *(boundary.end_effectors, typical, weights if limits.distances.size else weights[:2]),
             boundary.angular_momentum if drifting else np.zeros(0),
             limits.distances.ravel(),
         ]
@@ -286,6 +274,19 @@ def pack_knots(layout: Layout, step: float, *knots: Array) -> Array:
     for places, values in zip(layout.knots(), knots, strict=True):
         x[places] = values
     return x
+
+
+def knot_bounds(
+    layout: Layout, duration: DurationBounds, lack: float, *ranges: Array
+) -> tuple[Array, Array]:
+    """Return the smallest and the largest variables for a duration, the ``ranges`` (2, ...) of the
+    components of all knots, and a lack of at most ``lack``, m.
+    """
+    spans = zip((duration.shortest, duration.longest), *ranges, strict=True)
+    least, most = (pack_knots(layout, each[0] / layout.intervals, *each[1:]) for each in spans)
+    if layout.has_lack:
+        most[-1] = lack
+    return least, most
 
 
 class Solution(NamedTuple):

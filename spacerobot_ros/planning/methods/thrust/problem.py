@@ -357,7 +357,7 @@ class MotionFunctions:
     joint efforts. Without a link, the base is the end-effector.
     """
 
-    def __init__(self, robot: SpaceRobot, link: str = "") -> None:
+    def __init__(self, robot: SpaceRobot, link: str) -> None:
         self.robot = robot
         names = ("inertia_matrix", "center_of_mass", "link_poses")
         x, (X, L, r, V, q, qdot) = state_symbols(robot.n)

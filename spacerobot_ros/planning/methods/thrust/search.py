@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 
@@ -162,8 +162,9 @@ class ThrustPlanner:
         self.clearance = Clearance.wanted(described, self.options.clearance, "plan.clearance")
 
     @cached_property
-    def _functions(self) -> MotionFunctions:
-        return MotionFunctions(self.robot, self.link)
+    def motion(self) -> Callable[[ThrustKnots], ThrustMotion]:
+        """Returns the motion produced by a solution's controls."""
+        return partial(ThrustMotion, MotionFunctions(self.robot, self.link), self.propulsion)
 
     def plan(
         self, start: RobotMotion, goal: ThrustGoal | Grapple, cancellation: Cancellation = NEVER
@@ -213,20 +214,13 @@ class ThrustPlanner:
 
     def solver(self, kind: EndKind, bodies: Bodies) -> ThrustSolver:
         """Return the solver for a kind of goal, with the pairs that are kept apart."""
-        kept = bodies.kept
-        if (kind, kept) not in self._solvers:
-            self._solvers[kind, kept] = ThrustSolver(
-                self.stages(kind),
-                self.propulsion,
-                self.options.intervals,
-                self.limits.acceleration,
-                [(bodies.rows(pair), at) for pair, at in kept],
+        key, N, acceleration = (kind, bodies.kept), self.options.intervals, self.limits.acceleration
+        if key not in self._solvers:
+            pairs = [(bodies.rows(pair), at) for pair, at in bodies.kept]
+            self._solvers[key] = ThrustSolver(
+                self.stages(kind), self.propulsion, N, acceleration, pairs
             )
-        return self._solvers[kind, kept]
-
-    def motion(self, knots: ThrustKnots) -> ThrustMotion:
-        """Return the motion produced by a solution's controls."""
-        return ThrustMotion(self._functions, self.propulsion, knots)
+        return self._solvers[key]
 
     # -- both ends ----------------------------------------------------------------------------
 
@@ -518,7 +512,7 @@ class _Search:
         spent = guess.step * float(self.planner.propulsion.cost_of(ca.DM(guess.levels.T)))
         return Weights(0.0, 1 / max(spent, 1e-12), _SMOOTHNESS, _REGULARISATION, rounding)
 
-    def _exact(self, guess: ThrustKnots, *, nearest: bool = False) -> ThrustMotion:
+    def _exact(self, guess: ThrustKnots, *, nearest: bool) -> ThrustMotion:
         """Return the exactly integrated motion of least propellant or time near a path, or the
         nearest one.
         """

@@ -39,6 +39,7 @@ from spacerobot_ros.planning.methods.optimal.multiple_shooting import (
     DurationBounds,
     ProgramSolver,
     StopRule,
+    knot_bounds,
     pack_knots,
 )
 from spacerobot_ros.planning.methods.optimal.transcription import (
@@ -374,16 +375,15 @@ class ThrustSolver:
         N, most, rows = layout.intervals, self._acceleration, self._solver.rows
         vertices = with_joints_moved(guess.states, guess.step / 2)
         x0 = pack_knots(layout, guess.step, vertices, guess.accelerations, guess.levels)
-        multipliers = {}
+        multipliers = dict[str, Array]()
         if guess.multipliers is not None:
             begins = begins if begins == "corrected" else "continued"
             of_variables, of_rows = guess.multipliers
             # Multipliers of all rows if they are the same, else of those without pairs.
             same = rows if len(of_rows) == rows else rows - len(planes)
-            lam_x = np.zeros(layout.size)
-            lam_x[: len(of_variables)] = of_variables[: layout.size]
-            lam_g = np.append(of_rows[:same], np.zeros(rows - same))
-            multipliers = {"lam_x0": lam_x, "lam_g0": lam_g}
+            # The last variable may be the lack.
+            multipliers["lam_x0"] = np.append(of_variables, 0.0)[: layout.size]
+            multipliers["lam_g0"] = np.append(of_rows[:same], np.zeros(rows - same))
         elif layout.has_lack:
             begins = "clear"
         centers = np.zeros((N, sum(layout.controls)))
@@ -391,17 +391,10 @@ class ThrustSolver:
             centers = np.hstack([center.accelerations, center.levels])
         shape, goals, defects = state_parts(boundary.start)[4], boundary.goals, guess.defects
         parameters = (shape, goals, defects.ravel(), weights, centers.ravel(), planes.ravel())
-        least, largest = (
-            pack_knots(layout, span / N, bounds, acceleration, np.array(level))
-            for span, bounds, acceleration, level in (
-                (duration.shortest, boundary.bounds[0], -most, propulsion.lowest),
-                (duration.longest, boundary.bounds[1], most, 1.0),
-            )
-        )
-        if layout.has_lack:
-            largest[-1] = np.inf
+        ranges = boundary.bounds, np.array([-most, most]), np.array([propulsion.lowest, 1.0])
+        bounds = knot_bounds(layout, duration, np.inf, *ranges)
         found = self._solver.solve(
-            begins, stop, x0, (least, largest), np.concatenate(parameters), **multipliers
+            begins, stop, x0, bounds, np.concatenate(parameters), **multipliers
         )
         if not found.feasible:
             return None
