@@ -18,14 +18,14 @@ from spacerobot_ros import fly
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.meshes import meshes_from_files
-from spacerobot_ros.report.scene import robot_bodies
-from spacerobot_ros.report.solids import (
+from spacerobot_ros.report.scene import (
     MAX_MESH_FACES,
     Canvas,
     View,
     corner_points,
     outlines,
     placed_solids,
+    robot_bodies,
 )
 
 OUT = Path(__file__).parents[1] / "docs" / "images" / "turning.gif"

@@ -25,9 +25,8 @@ PACKAGE = "spacerobot_ros"
 ROOT = Path(__file__).resolve().parents[1]
 
 DRAWING = {
-    "robot in pictures": ("report/solids.py",),
     "robot in pages": ("report/player.py",),
-    "robot, shared by both": ("report/scene.py", "model/meshes.py"),
+    "robot in pictures, and shared": ("report/scene.py", "model/meshes.py"),
 }
 """The modules that draw a robot; viewers use the shared one, too."""
 

@@ -11,9 +11,8 @@ if TYPE_CHECKING:
     from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile, RecordedTopic
     from spacerobot_ros.bag.playback import Playback, ReplayMessage
     from spacerobot_ros.bag.reader import Bag, RecordedRobot, read_bag
-    from spacerobot_ros.bag.recording import Recording, RecordingState
     from spacerobot_ros.bag.series import TopicSeries
-    from spacerobot_ros.bag.writer import BagWriter, free_name
+    from spacerobot_ros.bag.writer import BagWriter, Recording, RecordingState, free_name
     from spacerobot_ros.messages.definitions import message_definition, type_hash
 
 __all__ = [
@@ -42,9 +41,8 @@ __getattr__ = lazy_names(
         "bag.mcap_file": ["LATCHED", "QosProfile", "RecordedTopic"],
         "bag.playback": ["Playback", "ReplayMessage"],
         "bag.reader": ["Bag", "RecordedRobot", "read_bag"],
-        "bag.recording": ["Recording", "RecordingState"],
         "bag.series": ["TopicSeries"],
-        "bag.writer": ["BagWriter", "free_name"],
+        "bag.writer": ["BagWriter", "Recording", "RecordingState", "free_name"],
         "messages.definitions": ["message_definition", "type_hash"],
     },
 )

@@ -10,14 +10,15 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.meshes import meshes_from_files
 from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.report.figures import GHOST_COLOUR
-from spacerobot_ros.report.scene import Body, robot_bodies
-from spacerobot_ros.report.solids import (
+from spacerobot_ros.report.scene import (
     MAX_MESH_FACES,
+    Body,
     Canvas,
     View,
     corner_points,
     outlines,
     placed_solids,
+    robot_bodies,
 )
 
 WIDTH, HEIGHT = 640, 480

@@ -43,17 +43,20 @@ from spacerobot_ros.report.figures_over_time import (
     error_group,
 )
 from spacerobot_ros.report.flight import FlightReport, joint_unit, labels_of
-from spacerobot_ros.report.scene import bodies_of, goal_of_base, is_flat, obstacles_of
-from spacerobot_ros.report.signals import Indices
-from spacerobot_ros.report.solids import (
+from spacerobot_ros.report.scene import (
     MAX_MESH_FACES,
     Canvas,
     PlacedSolid,
     View,
+    bodies_of,
     corner_points,
+    goal_of_base,
+    is_flat,
+    obstacles_of,
     outlines,
     placed_solids,
 )
+from spacerobot_ros.report.signals import Indices
 
 PIXELS = 420
 """Width of a robot picture, pixels."""

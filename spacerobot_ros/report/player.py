@@ -28,9 +28,18 @@ from spacerobot_ros.report.figures import (
 )
 from spacerobot_ros.report.flight import FlightReport
 from spacerobot_ros.report.page_parts import PagePart, missing, package_file
-from spacerobot_ros.report.scene import Body, bodies_of, goal_of_base, is_flat, obstacles_of
+from spacerobot_ros.report.scene import (
+    EDGE_COLOUR,
+    Body,
+    View,
+    bodies_of,
+    corner_points,
+    goal_of_base,
+    is_flat,
+    obstacles_of,
+    placed_solids,
+)
 from spacerobot_ros.report.signals import Cycles, Indices, simplified
-from spacerobot_ros.report.solids import EDGE_COLOUR, View, corner_points, placed_solids
 
 Command = dict[str, Any]
 

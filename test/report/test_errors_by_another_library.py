@@ -30,8 +30,8 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.flight import read_report
-from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart
+from spacerobot_ros.report.writing import page
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session import run
 from spacerobot_ros.session.run import RunResult

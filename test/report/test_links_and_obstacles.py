@@ -37,13 +37,19 @@ from spacerobot_ros.report.figures_space import (
     path_figure,
 )
 from spacerobot_ros.report.flight import FlightReport, read_report
-from spacerobot_ros.report.page import charts_of, page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.player import WORLD, view_of_flight
-from spacerobot_ros.report.scene import obstacles_of
+from spacerobot_ros.report.scene import (
+    Canvas,
+    PlacedSolid,
+    View,
+    corner_points,
+    obstacles_of,
+    placed_solids,
+)
 from spacerobot_ros.report.signals import Cycles, find_cycles, rotvecs
-from spacerobot_ros.report.solids import Canvas, PlacedSolid, View, corner_points, placed_solids
 from spacerobot_ros.report.tables import headline, result_table
+from spacerobot_ros.report.writing import charts_of, page
 
 BAGS = Path(__file__).parents[2] / "bags"
 LEFT, RIGHT = "left_link_7", "right_link_7"

@@ -24,9 +24,9 @@ from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.report import write_report
 from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
-from spacerobot_ros.report.page import charts_of
 from spacerobot_ros.report.player import View3D, player_of
 from spacerobot_ros.report.signals import thinned
+from spacerobot_ros.report.writing import charts_of
 
 with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 

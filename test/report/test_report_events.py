@@ -28,8 +28,7 @@ from spacerobot_ros.report.figures_over_time import momentum_budget_figure, shap
 from spacerobot_ros.report.figures_space import configurations_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.player import WORLD, View3D, view_of_flight
-from spacerobot_ros.report.scene import bodies_of
-from spacerobot_ros.report.solids import corner_points, placed_solids
+from spacerobot_ros.report.scene import bodies_of, corner_points, placed_solids
 from spacerobot_ros.report.tables import joint_table, payload_text, result_table
 
 EVENTS = [

@@ -35,7 +35,6 @@ from spacerobot_ros.report.figures_over_time import (
 )
 from spacerobot_ros.report.figures_space import cycles_figure
 from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors, read_report
-from spacerobot_ros.report.page import page
 from spacerobot_ros.report.page_parts import PagePart, tiles
 from spacerobot_ros.report.tables import (
     headline,
@@ -44,6 +43,7 @@ from spacerobot_ros.report.tables import (
     result_table,
     runs_table,
 )
+from spacerobot_ros.report.writing import page
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.session.run import run_scenario

@@ -44,7 +44,6 @@ from spacerobot_ros.report.figures_over_time import (
     thrusters_figure,
 )
 from spacerobot_ros.report.flight import FlightReport, read_report
-from spacerobot_ros.report.page import charts_of, page
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.planning_figures import _planar_figure, _spatial_figure
 from spacerobot_ros.report.player import view_of_flight
@@ -55,7 +54,7 @@ from spacerobot_ros.report.tables import (
     result_table,
     runs_table,
 )
-from spacerobot_ros.report.writing import FIGURES, _overview_figure
+from spacerobot_ros.report.writing import FIGURES, _overview_figure, charts_of, page
 from spacerobot_ros.resources import robot_file
 
 ROOT = Path(__file__).resolve().parents[2]
