@@ -28,7 +28,6 @@ from matplotlib.ticker import MaxNLocator
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
-from spacerobot_ros.report.signals import thinned
 
 TEXT_COLOUR, SECONDARY_COLOUR, LINE_COLOUR = "#1f2328", "#667085", "#c3c8d0"
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -364,7 +363,7 @@ def draw_traces(
 ) -> None:
     """Draw every column of a signal; for a dense signal, the extremes in each time slice."""
     for index, tint in enumerate(colours if len(signal) else ()):
-        part = thinned(Signal(signal.time, signal.values[:, [index]]), TRACE_TIME_SLICES)
+        part = Signal(signal.time, signal.values[:, [index]]).thinned(TRACE_TIME_SLICES)
         axes.plot(
             part.time,
             part.values[:, 0],

@@ -55,7 +55,6 @@ from spacerobot_ros.report.flight import (
     labels_of,
     pose_errors,
 )
-from spacerobot_ros.report.signals import thinned
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 
@@ -220,7 +219,7 @@ def figure_of_flights(
 def _draw_rows(axes: Axes, group: TraceGroup) -> None:
     """Draw each trace as a band in its own row, the first on top."""
     count = len(group.names)
-    signal = thinned(group.signal, TRACE_TIME_SLICES)
+    signal = group.signal.thinned(TRACE_TIME_SLICES)
     for index, tint in enumerate(group.colours):
         values, foot = signal.values[:, index], count - 1 - index
         # A value applies from the previous sample on.

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
 from spacerobot_ros.errors import shortened
 from spacerobot_ros.flight.series import Signal
@@ -56,7 +57,6 @@ from spacerobot_ros.report.scene import (
     outlines,
     placed_solids,
 )
-from spacerobot_ros.report.signals import Indices
 
 PIXELS = 420
 """Width of a robot picture, pixels."""
@@ -139,7 +139,7 @@ def _choose_instants(flight: FlightReport) -> list[int]:
     return _indices_ending_at(len(time) - 1, np.searchsorted(progress, wanted))
 
 
-def _indices_ending_at(last: int, found: Indices) -> list[int]:
+def _indices_ending_at(last: int, found: NDArray[np.int64]) -> list[int]:
     """Return unique indices; the last one is replaced by that of the last recorded state."""
     return np.unique([*np.minimum(found[:-1], last), last]).tolist()
 
@@ -409,7 +409,7 @@ def cycles_figure(flight: FlightReport) -> ReportFigure | None:
     return ReportFigure("cycles", "Attitude cycle by cycle", f"{caption}.", figure)
 
 
-def loop_ends(shape: Signal) -> Indices:
+def loop_ends(shape: Signal) -> NDArray[np.int64]:
     """Return the samples at which the joints return to their final shape, closing a loop.
 
     If the joints stop there, the last sample at rest is returned; at the end of the flight, the

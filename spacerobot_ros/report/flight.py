@@ -25,7 +25,15 @@ from spacerobot_ros.flight.reading import (
 )
 from spacerobot_ros.flight.series import SentGoal, Signal, reported_goal
 from spacerobot_ros.measures import flown_time
-from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, Joint, Pose, Shape
+from spacerobot_ros.model.description import (
+    DEFAULT_END_EFFECTOR,
+    Array,
+    Joint,
+    Pose,
+    RobotDescription,
+    Shape,
+)
+from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, Visual, meshes_from_attachments
 from spacerobot_ros.model.rotations import (
     quaternion_inverse,
@@ -38,18 +46,15 @@ from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.report.events import shown_events
-from spacerobot_ros.report.signals import (
-    Cycles,
-    continuous,
-    find_cycles,
-    link_poses,
-    nearest_rotvec,
-    rotvecs,
-)
 from spacerobot_ros.scenario import COMMANDERS
 from spacerobot_ros.times import SECOND
 
 _MAX_LINK_ERROR_STATES = 2000
+
+_MIN_CYCLES = 12
+
+_MAX_PERIOD_SAMPLES = 1 << 14
+"""Number of samples at the end of a gait that are searched for a period."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,24 @@ class GoalSpan:
     start: float
     end: float
     goal: Goal
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """A segment of a flight, ``start`` to ``end`` in s, that repeats every ``period`` s."""
+
+    start: float
+    end: float
+    period: float
+
+    @property
+    def count(self) -> int:
+        """Number of whole cycles."""
+        return int((self.end - self.start) / self.period + 0.05)
+
+    def last(self, count: int) -> tuple[float, float]:
+        """Return the start and end of the last few cycles."""
+        return self.end - count * self.period, self.end
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -438,3 +461,108 @@ def joint_unit(flight: FlightReport, name: str) -> str:
     """Return the unit of a joint: m, rad, or ``m or rad`` without a robot description."""
     joint = flight.joint(name)
     return "m or rad" if joint is None else joint.unit
+
+
+# -- arithmetic on recorded motion --------------------------------------------------------------
+
+
+def rotvecs(quaternions: Array) -> Array:
+    """Return attitudes (N, 4) as rotation vectors (N, 3), continuous beyond half revolutions.
+
+    The first vector has a length of at most pi; each later vector is the equivalent vector nearest
+    to the previous vector.
+    """
+    wrapped = rotvecs_from_quaternions(quaternions)
+    lengths = np.linalg.norm(wrapped, axis=1)
+    # The axis flips at half revolutions and at zero, where the angle about it changes sign.
+    turned_over = np.einsum("ij,ij->i", wrapped[1:], wrapped[:-1]) < 0
+    signs = np.append(1, np.cumprod(1 - 2 * turned_over))[: len(wrapped)]
+    added = signs * np.unwrap(signs * lengths) - lengths
+    return wrapped + added[:, np.newaxis] * wrapped / np.maximum(lengths, 1e-12)[:, np.newaxis]
+
+
+def nearest_rotvec(rotvec: Array, near: Array) -> Array:
+    """Return the rotation vector (3,) of the same attitude that is nearest to ``near`` (3,)."""
+    length = float(np.linalg.norm(rotvec))
+    if length < 1e-12:
+        return rotvec
+    turns = round((float(near @ rotvec) / length - length) / (2 * np.pi))
+    return rotvec * (1 + 2 * np.pi * turns / length)
+
+
+def continuous(poses: Array) -> Array:
+    """Return poses (N, 7) with sign-continuous quaternions."""
+    flips = np.cumsum((poses[1:, 3:] * poses[:-1, 3:]).sum(axis=1) < 0) % 2
+    signs = np.append(1, 1 - 2 * flips)[: len(poses), np.newaxis]
+    return np.hstack([poses[:, :3], poses[:, 3:] * signs])
+
+
+def link_poses(robot: RobotDescription, base: Array, q: Array) -> dict[str, Array]:
+    """Return the world poses (K, 7) of all links, with the base link first.
+
+    Link quaternions are continuous if the base quaternions are.
+
+    Parameters
+    ----------
+    robot
+        The robot.
+    base, q
+        (K, 7) base poses in the world, and (K, n) joint positions, m or rad.
+    """
+    from scipy.spatial.transform import Rotation
+
+    kinematics = ForwardKinematics(robot)
+    R_WL, r_WL = kinematics.poses_in_world(base, q)
+    attitudes = Rotation.from_matrix(R_WL.reshape(-1, 3, 3)).as_quat().reshape(*r_WL.shape[:2], 4)
+    poses = np.concatenate([r_WL, attitudes], axis=2)
+    return {link: continuous(poses[:, k]) for k, link in enumerate(kinematics.links)}
+
+
+def find_cycles(rates: Signal) -> Cycles | None:
+    """Return the equal cycles at the end of a gait, detected from its joint velocities.
+
+    None if there are fewer than twelve cycles that agree to within a tenth of the peak velocity.
+    """
+    peak = np.abs(rates.values).max(axis=0, initial=0.0)
+    moving = np.flatnonzero((np.abs(rates.values) > 1e-6 * peak).any(axis=1))
+    if len(moving) < 4 * _MIN_CYCLES:
+        return None
+    values = rates.values[: int(moving[-1]) + 1] / np.where(peak > 0, peak, 1.0)
+    # The cycles may be preceded by a large part of the gait.
+    looks = (values[-min(_MAX_PERIOD_SAMPLES, len(values) // part) :] for part in (1, 2, 4))
+    lag = next((lag for look in looks if (lag := _period_in_samples(look))), None)
+    if lag is None:
+        return None
+    different = np.abs(values[lag:] - values[:-lag]).max(axis=1) > 0.1
+    # The last stretch between differing samples that contains enough cycles.
+    bounds = np.concatenate([[-1], np.flatnonzero(different), [len(different)]])
+    enough = np.flatnonzero(np.diff(bounds) - 1 >= (_MIN_CYCLES - 1) * lag)
+    if not len(enough):
+        return None
+    first, stop = int(bounds[enough[-1]]) + 1, int(bounds[enough[-1] + 1]) + lag
+    last = min(stop, len(rates) - 1)
+    start, end = float(rates.time[first]), float(rates.time[last])
+    if end <= start:
+        return None  # All messages have the same log time.
+    return Cycles(start, end, lag * (end - start) / (last - first))
+
+
+def _period_in_samples(values: Array) -> int | None:
+    """Shortest shift, in samples, at which the columns match themselves; None if there is none."""
+    n = len(values)
+    spectrum = np.fft.rfft(values, 2 * n, axis=0)
+    product = np.fft.irfft((spectrum * spectrum.conj()).sum(axis=1))[:n]
+    energy = np.cumsum((values**2).sum(axis=1))
+    # Energy of the overlapping parts: the first and the last n - lag samples.
+    lags = np.arange(n // 3)
+    first, last = energy[n - 1 - lags], energy[-1] - np.append(0.0, energy)[lags]
+    match = product[lags] / np.maximum(np.sqrt(first * last), 1e-300)
+    below = np.flatnonzero(match < 0.9)
+    if not len(below):
+        return None
+    good = np.flatnonzero(match[below[0] :] > 0.97) + below[0]
+    if not len(good):
+        return None
+    # The maximum of the first peak that is high enough.
+    hill = np.split(good, np.flatnonzero(np.diff(good) > 1) + 1)[0]
+    return int(hill[np.argmax(match[hill])])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import json
 import math
 from collections.abc import Iterable
@@ -13,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spacerobot_ros.errors import quantity
 from spacerobot_ros.flight.series import Signal
@@ -26,7 +29,7 @@ from spacerobot_ros.report.figures import (
     LINE_COLOUR,
     PLANNED_COLOUR,
 )
-from spacerobot_ros.report.flight import FlightReport
+from spacerobot_ros.report.flight import Cycles, FlightReport
 from spacerobot_ros.report.page_parts import PagePart, missing, package_file
 from spacerobot_ros.report.scene import (
     EDGE_COLOUR,
@@ -39,7 +42,6 @@ from spacerobot_ros.report.scene import (
     obstacles_of,
     placed_solids,
 )
-from spacerobot_ros.report.signals import Cycles, Indices, simplified
 
 Command = dict[str, Any]
 
@@ -125,6 +127,10 @@ _MAX_KEY_FRAMES = 1000
 _MAX_CYCLE_INSTANTS = 300
 """Largest number of equal-phase instants between the cycles shown in full."""
 
+_INITIAL_STRETCHES = 64
+"""Number of parts into which a recording is split before simplification, to limit the computing
+time."""
+
 
 class KeyFrames(NamedTuple):
     """Recorded states to show; the motion between these states is interpolated.
@@ -140,7 +146,7 @@ class KeyFrames(NamedTuple):
         0 if all cycles are shown in full.
     """
 
-    indices: Indices
+    indices: NDArray[np.int64]
     error: float
     every: int = 0
 
@@ -168,6 +174,47 @@ def key_frames(motion: Signal, cycles: Cycles | None) -> KeyFrames:
         shown = np.union1d(np.flatnonzero(full), np.minimum(places, len(motion) - 1))
     chosen, error = simplified(Signal(motion.time[shown], motion.values[shown]), _MAX_KEY_FRAMES)
     return KeyFrames(shown[chosen], error, every)
+
+
+def simplified(motion: Signal, most: int) -> tuple[NDArray[np.int64], float]:
+    """Drop samples that lie on lines between other samples (Douglas-Peucker); the samples farthest
+    from such lines are kept first.
+
+    Parameters
+    ----------
+    motion
+        The motion, with each column divided by its tolerance.
+    most
+        Largest number of samples to keep, in addition to a few dozen that are always kept.
+
+    Returns
+    -------
+    The kept samples, and the largest distance of a dropped sample, in tolerances.
+    """
+    bounds = np.unique(np.linspace(0, len(motion) - 1, _INITIAL_STRETCHES + 1).astype(int)).tolist()
+    if len(bounds) < 2:
+        return np.array(bounds, np.int64), 0.0
+    kept = set(bounds)
+    heap = [_farthest_sample(motion, a, b) for a, b in itertools.pairwise(bounds)]
+    heapq.heapify(heap)
+    while -heap[0][0] > 1.0 and len(kept) < most:
+        _, a, b, k = heapq.heappop(heap)
+        kept.add(k)
+        heapq.heappush(heap, _farthest_sample(motion, a, k))
+        heapq.heappush(heap, _farthest_sample(motion, k, b))
+    return np.array(sorted(kept), np.int64), -heap[0][0]
+
+
+def _farthest_sample(motion: Signal, a: int, b: int) -> tuple[float, int, int, int]:
+    """The negative largest distance from the line between samples a and b, a, b, and its sample."""
+    if b - a < 2:
+        return 0.0, a, b, a
+    time, values = motion.time[a : b + 1], motion.values[a : b + 1]
+    span = float(time[-1] - time[0])  # Negative if a plant was restarted.
+    share: Array = ((time - time[0]) / (span if abs(span) > 1e-12 else np.inf))[:, np.newaxis]
+    off = np.abs(values - values[0] - share * (values[-1] - values[0])).max(axis=1, initial=0.0)
+    k = 1 + int(np.argmax(off[1:-1]))
+    return -float(off[k]), a, b, a + k
 
 
 # -- commands -----------------------------------------------------------------------------------

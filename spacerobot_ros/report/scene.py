@@ -19,8 +19,7 @@ from spacerobot_ros.model.description import Array, Pose, RobotDescription
 from spacerobot_ros.model.meshes import TriangleMesh, Visual, visuals_of
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.report.figures import GHOST_COLOUR, colour
-from spacerobot_ros.report.flight import FlightReport
-from spacerobot_ros.report.signals import continuous, link_poses
+from spacerobot_ros.report.flight import FlightReport, continuous, link_poses
 
 _BASE_COLOUR = "#c4c9d2"
 

@@ -54,7 +54,6 @@ from spacerobot_ros.report.scene import (
     obstacles_of,
     placed_solids,
 )
-from spacerobot_ros.report.signals import thinned
 from spacerobot_ros.report.tables import (
     different_goals,
     headline,
@@ -516,7 +515,7 @@ def _chart_events(flight: FlightReport) -> list[dict[str, Any]]:
 
 
 def _chart_data(group: TraceGroup, labels: Sequence[str]) -> dict[str, Any]:
-    signals = [thinned(each, _CHART_SLICES) for each in (group.signal, *group.beside)]
+    signals = [each.thinned(_CHART_SLICES) for each in (group.signal, *group.beside)]
     time, values = signals[0].time, signals[0].values
     names, flights = list(group.names), len(signals)
     if group.beside:

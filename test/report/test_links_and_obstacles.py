@@ -36,7 +36,7 @@ from spacerobot_ros.report.figures_space import (
     loops_figure,
     path_figure,
 )
-from spacerobot_ros.report.flight import FlightReport, read_report
+from spacerobot_ros.report.flight import Cycles, FlightReport, find_cycles, read_report, rotvecs
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.player import WORLD, view_of_flight
 from spacerobot_ros.report.scene import (
@@ -47,7 +47,6 @@ from spacerobot_ros.report.scene import (
     obstacles_of,
     placed_solids,
 )
-from spacerobot_ros.report.signals import Cycles, find_cycles, rotvecs
 from spacerobot_ros.report.tables import headline, result_table
 from spacerobot_ros.report.writing import charts_of, page
 

@@ -19,10 +19,9 @@ from spacerobot_ros.model.description import Array, Pose, Shape
 from spacerobot_ros.model.meshes import solid_mesh
 from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_rotvec
 from spacerobot_ros.report import player, write_report
-from spacerobot_ros.report.flight import FlightReport, read_report
+from spacerobot_ros.report.flight import Cycles, FlightReport, read_report
 from spacerobot_ros.report.player import WORLD, key_frames, view_of_flight
 from spacerobot_ros.report.scene import bodies_of
-from spacerobot_ros.report.signals import Cycles
 
 N = 6
 

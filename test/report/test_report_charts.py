@@ -25,7 +25,6 @@ from spacerobot_ros.report import write_report
 from spacerobot_ros.report.figures_over_time import shape_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.player import View3D, player_of
-from spacerobot_ros.report.signals import thinned
 from spacerobot_ros.report.writing import charts_of
 
 with_browser = pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
@@ -366,13 +365,13 @@ def test_a_break_is_wide_enough_to_be_seen(flight: FlightReport) -> None:
 def test_fewer_samples_look_alike() -> None:
     time = np.linspace(0.0, 100.0, 30_001)
     smooth = Signal(time, np.column_stack([np.sin(time), np.exp(-time)]))
-    few = thinned(smooth, 500)
+    few = smooth.thinned(500)
     assert len(few) < 3000
     for k in range(2):
         between = np.interp(time, few.time, few.values[:, k])
         assert np.abs(between - smooth.values[:, k]).max() < 6e-3
     noise = np.random.default_rng(1).normal(size=(30_001, 3))
-    few = thinned(Signal(time, noise), 500)
+    few = Signal(time, noise).thinned(500)
     assert len(few) < 4001
     assert (few.time[0], few.time[-1]) == (0.0, 100.0)
     for low in np.arange(0.0, 100.0, 0.2).tolist():
@@ -380,4 +379,4 @@ def test_fewer_samples_look_alike() -> None:
         np.testing.assert_array_equal(part.max(axis=0), all_of.max(axis=0))
         np.testing.assert_array_equal(part.min(axis=0), all_of.min(axis=0))
     short = Signal(time[:50], noise[:50])
-    assert thinned(short, 500) is short
+    assert short.thinned(500) is short
