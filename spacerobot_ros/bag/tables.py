@@ -25,7 +25,7 @@ from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.lazy import optional_module
-from spacerobot_ros.messages.statuses import key_values
+from spacerobot_ros.messages.diagnostics import key_values
 from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.flight.series import Commands, SentGoal, Signal, pose_error
 from spacerobot_ros.measures import Outcome, flown_time, momentum_drift
-from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.messages.diagnostics import StatusRecord
 from spacerobot_ros.model.description import Array, RobotDescription, Shape
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.meshes import TriangleMesh, shape_mesh

@@ -37,8 +37,7 @@ from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.series import FlightLog
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.messages.diagnostics import PlantDiagnostics, state_diagnostics
-from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.messages.diagnostics import PlantDiagnostics, StatusRecord, state_diagnostics
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.shared_parameters import RobotConfig, robot_from_text, robot_of

@@ -29,7 +29,7 @@ from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.series import Commands, SentGoal, Signal, goal_at_end
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.messages.diagnostics import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.urdf import obstacles_from_topic, parse_robot, with_world

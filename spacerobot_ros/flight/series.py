@@ -20,7 +20,7 @@ from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
     from spacerobot_ros.events import Event
-    from spacerobot_ros.messages.statuses import StatusRecord
+    from spacerobot_ros.messages.diagnostics import StatusRecord
     from spacerobot_ros.planning import GaitSchedule
     from spacerobot_ros.planning.core.schedule import BasePath
     from spacerobot_ros.simulation.actuators import PlantWithFaults

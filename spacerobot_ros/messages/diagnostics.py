@@ -1,19 +1,95 @@
-"""Diagnostics of a plant and its commanders, as records in a diagnostic_msgs/DiagnosticArray."""
+"""Statuses, events and diagnostics: diagnostic_msgs/DiagnosticStatus and DiagnosticArray, and their
+plain values.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from spacerobot_ros.errors import printable
 from spacerobot_ros.messages.layout import encode
-from spacerobot_ros.messages.statuses import StatusRecord
-from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant
-from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
-from spacerobot_ros.simulation.status import latched_text
-from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import LATEST_NS
+
+if TYPE_CHECKING:
+    from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant
+    from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal
+    from spacerobot_ros.simulation.time_modes import RealTime
+
+STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
+
+
+@dataclass(frozen=True)
+class StatusRecord:
+    """Content of a DiagnosticStatus.
+
+    Attributes
+    ----------
+    name
+        Name of the node, or of one of its components.
+    level
+        0 OK, 1 WARN, 2 ERROR, 3 STALE.
+    message
+        One sentence for the user.
+    values
+        Values as strings by key.
+    hardware_id
+        Name of the robot or bag, or role of the node.
+    """
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, str] = field(default_factory=dict)
+    hardware_id: str = ""
+
+    @classmethod
+    def of(cls, node: str, status: Any, level: int | None = None) -> StatusRecord:
+        """Return the content for the status of a node; the level is that of the status by
+        default."""
+        given = status.level if level is None else level
+        return cls(node, given, status.message, status.to_values())
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Message fields by name."""
+        return {
+            "level": self.level,
+            "name": self.name,
+            "message": self.message,
+            "hardware_id": self.hardware_id,
+            "values": [{"key": key, "value": value} for key, value in self.values.items()],
+        }
+
+    def encoded(self) -> bytes:
+        """Return the serialised message."""
+        return encode(STATUS, self.fields)
+
+
+def key_values(pairs: Iterable[Any]) -> dict[str, str]:
+    """Return diagnostic_msgs/KeyValue messages as a dictionary whose strings are printable."""
+    return {printable(pair.key): printable(pair.value) for pair in pairs}
+
+
+def read_status(message: Any) -> StatusRecord:
+    """Return the printable content of a received or recorded DiagnosticStatus.
+
+    If several pairs have the same key, the last one takes precedence.
+    """
+    level = message.level if isinstance(message.level, int) else message.level[0]
+    return StatusRecord(
+        name=printable(message.name),
+        level=level,
+        message=printable(message.message),
+        values=key_values(message.values),
+        hardware_id=printable(message.hardware_id),
+    )
+
+
+# -- diagnostics ----------------------------------------------------------------------------------
 
 _MOMENTUM_ROUNDING = 1e-9
 """Largest changes of linear and angular momentum due to rounding, divided by the mass, m/s and
@@ -166,6 +242,8 @@ class PlantDiagnostics:
             message = "no command is active"
         if commands.fault:
             level = _ERROR
+            from spacerobot_ros.simulation.status import latched_text  # Statuses need no plant.
+
             message = f"{latched_text(commands.fault)}."
         elif refused and self._last_refusal:
             message = self._last_refusal

@@ -43,9 +43,8 @@ from spacerobot_ros.messages.builders import (
     RobotTransforms,
     StateFrames,
 )
-from spacerobot_ros.messages.diagnostics import diagnostic_name, encode_diagnostics
+from spacerobot_ros.messages.diagnostics import StatusRecord, diagnostic_name, encode_diagnostics
 from spacerobot_ros.messages.readers import read_text
-from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.messages import message_class

@@ -34,7 +34,7 @@ from spacerobot_ros.errors import (
     counted,
 )
 from spacerobot_ros.messages.builders import TRANSFORM_TYPE
-from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.messages.diagnostics import StatusRecord
 from spacerobot_ros.model.meshes import with_attached_meshes
 from spacerobot_ros.nodes.common.messages import message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM, FlightNode

@@ -22,7 +22,7 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.builders import goal_messages
-from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.messages.diagnostics import read_status
 from spacerobot_ros.nodes.common.messages import shape_message
 from spacerobot_ros.nodes.common.node import LATCHED_QUEUE, STREAM, UNKNOWN_NODE
 from spacerobot_ros.nodes.common.process import spin_until

@@ -28,7 +28,7 @@ from spacerobot_ros.bag import free_name
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.messages.diagnostics import StatusRecord
 from spacerobot_ros.model.shared_parameters import robot_of
 from spacerobot_ros.nodes import NODE_TYPES
 from spacerobot_ros.nodes.common.node import (

@@ -31,6 +31,7 @@ from spacerobot_ros.events import (
 )
 from spacerobot_ros.messages.builders import trajectory_message
 from spacerobot_ros.messages.definitions import MessageType, installed_type
+from spacerobot_ros.messages.diagnostics import STATUS, StatusRecord, read_status
 from spacerobot_ros.messages.layout import (
     encode_list,
     read_columns,
@@ -45,7 +46,6 @@ from spacerobot_ros.messages.readers import (
     joint_template,
     read_text,
 )
-from spacerobot_ros.messages.statuses import STATUS, StatusRecord, read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal

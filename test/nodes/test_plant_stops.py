@@ -20,8 +20,7 @@ from support.plant_rig import BAD_COMMANDS, SLIDERS, TICK, TICK_NS, Rig
 from support.ros_harness import LATCHED, Harness, Probe, nanoseconds
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.messages.diagnostics import timing_record
-from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.messages.diagnostics import StatusRecord, timing_record
 from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.simulation.time_modes import RealTime

@@ -25,9 +25,13 @@ from spacerobot_ros.commanding.plant_state import Stamped
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import CommandError, SpaceRobotError
 from spacerobot_ros.messages.builders import StateFrames
-from spacerobot_ros.messages.diagnostics import encode_diagnostics, state_diagnostics
+from spacerobot_ros.messages.diagnostics import (
+    StatusRecord,
+    encode_diagnostics,
+    read_status,
+    state_diagnostics,
+)
 from spacerobot_ros.messages.readers import MessageDecoder
-from spacerobot_ros.messages.statuses import StatusRecord, read_status
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array
 from spacerobot_ros.model.shared_parameters import robot_from_text, robot_of

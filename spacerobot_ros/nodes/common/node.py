@@ -37,7 +37,7 @@ from spacerobot_ros.errors import (
     printable,
 )
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.messages.statuses import StatusRecord
+from spacerobot_ros.messages.diagnostics import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes.common.ros_parameters import declare, fix, typed, unknown_parameters
 from spacerobot_ros.nodes.common.watchdog import Liveness, Role, SilenceReport

@@ -15,8 +15,12 @@ from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 
-from spacerobot_ros.messages.diagnostics import diagnostic_name, encode_diagnostics
-from spacerobot_ros.messages.statuses import StatusRecord, read_status
+from spacerobot_ros.messages.diagnostics import (
+    StatusRecord,
+    diagnostic_name,
+    encode_diagnostics,
+    read_status,
+)
 from spacerobot_ros.model.compilation import compilation_contexts
 
 if TYPE_CHECKING:

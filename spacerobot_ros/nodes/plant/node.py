@@ -29,8 +29,8 @@ from spacerobot_ros.errors import (
 )
 from spacerobot_ros.events import Event
 from spacerobot_ros.messages.builders import RobotMarkers
+from spacerobot_ros.messages.diagnostics import StatusRecord
 from spacerobot_ros.messages.readers import CommandReader, actuation_of
-from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import BodyMotion, Payload
 from spacerobot_ros.model.shared_parameters import robot_of

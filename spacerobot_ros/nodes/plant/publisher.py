@@ -17,9 +17,8 @@ from spacerobot_ros.messages.builders import (
     RobotTransforms,
     state_message,
 )
-from spacerobot_ros.messages.diagnostics import PlantDiagnostics, encode_diagnostics
+from spacerobot_ros.messages.diagnostics import PlantDiagnostics, StatusRecord, encode_diagnostics
 from spacerobot_ros.messages.readers import MessageTemplate
-from spacerobot_ros.messages.statuses import StatusRecord
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.nodes.common.messages import TRANSFORM_CLASS, interface_class, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM

@@ -31,7 +31,7 @@ from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.series import Signal
-from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.messages.diagnostics import read_status
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.nodes.common.messages import LatchedSubscription, goal_of, pose_array
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM

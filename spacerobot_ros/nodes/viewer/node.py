@@ -26,7 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 from spacerobot_ros.errors import SpaceRobotError, printable
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.messages.builders import goal_message
-from spacerobot_ros.messages.statuses import read_status
+from spacerobot_ros.messages.diagnostics import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, RobotDescription
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import obstacles_from_topic, parse_robot
