@@ -344,3 +344,14 @@ def _parameters_with_values(config: Any) -> Iterator[tuple[str, Parameter, Value
         for prefix, part in (value if _REGISTERED in each.metadata else groups).items():
             for name, declaration, inner in _parameters_with_values(part):
                 yield f"{prefix}.{name}", declaration, inner
+
+
+@dataclass(frozen=True)
+class WatchdogConfig:
+    """Supervision of other nodes' heartbeats."""
+
+    watchdog_timeout: float = nonnegative(
+        0.8,
+        "wall time without a heartbeat after which a required node is considered silent; 0: never",
+        "s",
+    )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.bag import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted, reason
 from spacerobot_ros.files import load_yaml

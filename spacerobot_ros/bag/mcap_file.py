@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from spacerobot_ros.bag.mcap_reading import require_regular
-from spacerobot_ros.errors import RecordingError, counted
+from spacerobot_ros.errors import RecordingError, counted, reason
 from spacerobot_ros.files import load_yaml
 from spacerobot_ros.messages.definitions import message_definition
 from spacerobot_ros.times import SECOND
@@ -81,7 +81,8 @@ class QosProfile:
             for given in parse_qos(entries):
                 if type(given.depth) is not int or not 0 <= given.depth <= _INFINITE_NS:
                     raise ValueError(f"its depth is {given.depth!r}")
-                words = {name: getattr(given, name).name.lower() for name in _POLICIES}
+                policies = "history", "reliability", "durability", "liveliness"
+                words = {name: getattr(given, name).name.lower() for name in policies}
                 profiles.append(cls(depth=given.depth, **words))
         except (ValueError, TypeError, AttributeError, KeyError) as error:
             raise RecordingError(f"A QoS profile of the bag cannot be read: {error}.") from error
@@ -110,9 +111,6 @@ LATCHED = QosProfile(depth=1, durability="transient_local")
 """Reliable, transient local, depth 1: late subscribers receive the last message."""
 
 
-_POLICIES = ("history", "reliability", "durability", "liveliness")
-
-
 class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -126,9 +124,6 @@ def _to_yaml(values: Any) -> str:
 
 METADATA_NAME = "rosbag2"
 """Name of the MCAP Metadata record that ``ros2 bag info`` and ``ros2 bag play`` read first."""
-
-# First version with QoS policies as strings; without a version, readers expect numbers.
-_METADATA_VERSION = 9
 
 
 @dataclass(frozen=True)
@@ -145,9 +140,6 @@ class RecordedTopic:
 
 _MESSAGE_HEAD_SIZE = 31
 """Length of a message header in a chunk, bytes."""
-
-_CHUNK = bytes([Opcode.CHUNK])
-"""First byte of a chunk."""
 
 
 class BagExistsError(RecordingError):
@@ -228,8 +220,7 @@ class McapFile(Writer):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._raw = _create_locked_file(path, overwrite)
         except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise RecordingError(f"Cannot create the bag {path}: {reason}.") from error
+            raise RecordingError(f"Cannot create the bag {path}: {reason(error)}.") from error
         try:
             self.start(profile, library="spacerobot_ros")
         except RecordingError:
@@ -248,7 +239,7 @@ class McapFile(Writer):
         except FileNotFoundError:
             problem = "it was removed or moved"
         except OSError as error:
-            problem = str(error.strerror or error)
+            problem = reason(error)
         if problem:
             raise RecordingError(f"The bag {self.path} was lost during recording: {problem}.")
 
@@ -287,7 +278,8 @@ class McapFile(Writer):
             "message_count": sum(self.message_counts[channel] for channel in self.topics),
         }
         whole = {
-            "version": _METADATA_VERSION,
+            # First version with QoS policies as strings; without it, readers expect numbers.
+            "version": 9,
             "storage_identifier": "mcap",
             **content,
             "topics_with_message_count": [
@@ -349,8 +341,8 @@ class McapFile(Writer):
                     f"{counted(written, 'message')} already written."
                 )
             raise RecordingError(
-                f"Cannot write the bag {self.path}: {error.strerror or error}; {what_is_left}"
+                f"Cannot write the bag {self.path}: {reason(error)}; {what_is_left}"
             ) from error
         self.size += len(data)
-        if data[:1] == _CHUNK:
+        if data[:1] == bytes([Opcode.CHUNK]):
             self.bytes_waiting, self._counts_in_file = 0, self.message_counts.copy()

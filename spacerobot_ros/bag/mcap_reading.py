@@ -43,7 +43,7 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.errors import RecordingError, reason
 from spacerobot_ros.files import irregular_kind
 
 RecordT = TypeVar("RecordT", bound=McapRecord)
@@ -109,10 +109,10 @@ def open_file(path: Path, content: Path | None = None) -> Iterator[BinaryIO]:
     except FileNotFoundError as error:
         raise RecordingError(f"There is no bag at {path}.") from error
     except OSError as error:
-        raise RecordingError(f"Cannot read the bag {path}: {error.strerror or error}.") from error
+        raise RecordingError(f"Cannot read the bag {path}: {reason(error)}.") from error
     except DAMAGE_ERRORS as error:
-        reason = str(error) or type(error).__name__
-        raise RecordingError(f"The bag {path} is damaged: {reason}.") from error
+        why = str(error) or type(error).__name__
+        raise RecordingError(f"The bag {path} is damaged: {why}.") from error
 
 
 class RecordedChannel(NamedTuple):

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice, starmap
 
-from spacerobot_ros.bag.config import ReplayConfig
+from spacerobot_ros.bag import ReplayConfig
 from spacerobot_ros.bag.mcap_file import QosProfile, RecordedTopic
 from spacerobot_ros.bag.mcap_reading import LATEST_TIME_NS
 from spacerobot_ros.bag.reader import Bag

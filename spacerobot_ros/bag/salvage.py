@@ -44,10 +44,6 @@ if TYPE_CHECKING:
     from spacerobot_ros.model.grasp import BodyMotion
     from spacerobot_ros.simulation.plant import InitialState
 
-_STATE_TOPICS = ("odom", "joint_states", "momentum")
-_WITHOUT_STATES = ("inactive", "failed")
-"""Values of the plant's state for which no robot state is published."""
-
 
 @dataclass(frozen=True)
 class Salvaged:
@@ -251,7 +247,7 @@ def last_state(path: str | os.PathLike[str], namespace: str = "") -> LastState:
 def _last_state(robot: RecordedRobot) -> LastState:
     from spacerobot_ros.simulation.plant import InitialState  # Other functions need no model.
 
-    odom, joints, momentum = (robot[name] for name in _STATE_TOPICS)
+    odom, joints, momentum = (robot[name] for name in ("odom", "joint_states", "momentum"))
     # Momenta have no stamp. The plant publishes the momenta of a state first, so that odom k has
     # momenta k.
     common = np.intersect1d(odom.stamp_ns, joints.stamp_ns)
@@ -298,8 +294,8 @@ def _last_payload(robot: RecordedRobot, time_ns: int) -> str:
         values = {pair.key: pair.value for pair in message.values}
         with suppress(KeyError, ValueError):
             # A capture changes the states after the one in which it took place. A plant
-            # restarted in the meantime has no record of it.
+            # restarted in the meantime has no record of it, and others publish no states.
             since = round(float(values["time_s"]) * SECOND)
-            if values["state"] not in _WITHOUT_STATES and since < time_ns:
+            if values["state"] not in ("inactive", "failed") and since < time_ns:
                 payload = values.get("payload", "")
     return payload

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spacerobot_ros.bag.series import TopicSeries
-from spacerobot_ros.errors import RecordingError
+from spacerobot_ros.errors import RecordingError, reason
 from spacerobot_ros.files import write_output
 from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.messages.diagnostics import key_values
@@ -387,7 +387,7 @@ def export(
             shutil.rmtree(target, ignore_errors=True)
             if not isinstance(error, OSError):
                 raise
-            raise RecordingError(f"{target} cannot be written: {error.strerror}.") from error
+            raise RecordingError(f"{target} cannot be written: {reason(error)}.") from error
     return {table.topic: len(table) for table in named.values()}
 
 

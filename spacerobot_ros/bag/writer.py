@@ -3,6 +3,7 @@ them: bag time base, latched topics and failures."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import time
@@ -13,7 +14,7 @@ from enum import Enum
 from pathlib import Path
 from typing import NamedTuple
 
-from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.bag import RecorderConfig
 from spacerobot_ros.bag.mcap_file import BagExistsError, McapFile, QosProfile, RecordedTopic
 from spacerobot_ros.errors import RecordingError, RobotDescriptionError
 from spacerobot_ros.messages.definitions import type_hash
@@ -22,14 +23,16 @@ from spacerobot_ros.times import SECOND
 _DEFAULTS = RecorderConfig()
 
 
+def _numbered_names(path: Path) -> Iterator[Path]:
+    """Yield ``NAME``, ``NAME-1``, ``NAME-2``, ..."""
+    yield path
+    for number in itertools.count(1):
+        yield path.with_name(f"{path.stem}-{number}{path.suffix}")
+
+
 def free_name(path: Path) -> Path:
     """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... that does not exist yet."""
-    number = 0
-    while True:
-        name = path.with_name(f"{path.stem}-{number}{path.suffix}") if number else path
-        if not os.path.lexists(name):
-            return name
-        number += 1
+    return next(name for name in _numbered_names(path) if not os.path.lexists(name))
 
 
 class BagWriter(AbstractContextManager["BagWriter"]):
@@ -243,15 +246,15 @@ class BagWriter(AbstractContextManager["BagWriter"]):
 
     def _open_first_file(self) -> McapFile:
         """Create the first file; files of one bag are not mixed with files of another."""
-        asked, number = self._unsplit_path, 0
+        names = _numbered_names(self._unsplit_path)
         while True:
+            self._unsplit_path = whole = next(names)
+            numbered = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
+            others: list[str] = []
+            if any(self._limits) and not self._overwrite:
+                with suppress(OSError):
+                    others = sorted(filter(numbered.fullmatch, os.listdir(whole.parent)))
             try:
-                whole = self._unsplit_path
-                numbered = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
-                others: list[str] = []
-                if any(self._limits) and not self._overwrite:
-                    with suppress(OSError):
-                        others = sorted(filter(numbered.fullmatch, os.listdir(whole.parent)))
                 if others:
                     raise BagExistsError(
                         f"Cannot create the bag {whole.with_name(others[0])}: File exists; name "
@@ -261,8 +264,6 @@ class BagWriter(AbstractContextManager["BagWriter"]):
             except BagExistsError:
                 if not self._next_free:
                     raise
-            number += 1
-            self._unsplit_path = asked.with_name(f"{asked.stem}-{number}{asked.suffix}")
 
     def check(self) -> None:
         """Check that the bag file still exists and has its full size.

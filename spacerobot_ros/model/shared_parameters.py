@@ -10,7 +10,7 @@ from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.model_functions import SymbolicModels
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.model.urdf import load_robot, load_world, parse_robot, with_world
-from spacerobot_ros.parameters import nonnegative, parameter
+from spacerobot_ros.parameters import WatchdogConfig, nonnegative, parameter
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.times import SECOND
 
@@ -129,17 +129,6 @@ def _with_model_error(true: RobotDescription, config: RobotConfig) -> SpaceRobot
     believed = config.assumed_robot(true)
     # Models with other mass properties share their compiled functions.
     return SpaceRobot(believed, None if believed is true else SymbolicModels.of(true))
-
-
-@dataclass(frozen=True)
-class WatchdogConfig:
-    """Supervision of other nodes' heartbeats."""
-
-    watchdog_timeout: float = nonnegative(
-        0.8,
-        "wall time without a heartbeat after which a required node is considered silent; 0: never",
-        "s",
-    )
 
 
 @dataclass(frozen=True)

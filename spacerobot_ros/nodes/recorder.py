@@ -23,10 +23,10 @@ from spacerobot_ros.bag import (
     LATCHED,
     BagWriter,
     QosProfile,
+    RecorderConfig,
     Recording,
     RecordingState,
 )
-from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS
 from spacerobot_ros.errors import (
     CommandError,

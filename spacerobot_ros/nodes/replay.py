@@ -23,8 +23,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from std_msgs.msg import Float64, String
 from std_srvs.srv import SetBool
 
-from spacerobot_ros.bag import Playback, ReplayMessage, read_bag
-from spacerobot_ros.bag.config import ReplayConfig
+from spacerobot_ros.bag import Playback, ReplayConfig, ReplayMessage, read_bag
 from spacerobot_ros.bag.playback import ReplayStatus, SubscriberWait, renamed_topics
 from spacerobot_ros.errors import (
     CommandError,

@@ -25,7 +25,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import SpaceRobotError, reason
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.model.description import Array
 
@@ -142,8 +142,7 @@ def _apply_style(path: Path) -> None:
     try:
         styles.use(str(shipped if shipped.is_file() and not path.exists() else path))
     except (OSError, ValueError, KeyError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise SpaceRobotError(f"The style file {path} cannot be read: {why}.") from error
+        raise SpaceRobotError(f"The style file {path} cannot be read: {reason(error)}.") from error
     finally:
         log.removeFilter(collect)
     if warnings:

@@ -7,8 +7,8 @@ from typing import Any
 
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.model.grasp import RelativeMotion
-from spacerobot_ros.model.shared_parameters import DEFAULT_TICK_RATE, RobotConfig, WatchdogConfig
-from spacerobot_ros.parameters import group, nonnegative, parameter
+from spacerobot_ros.model.shared_parameters import DEFAULT_TICK_RATE, RobotConfig
+from spacerobot_ros.parameters import WatchdogConfig, group, nonnegative, parameter
 from spacerobot_ros.times import SECOND
 
 _MAX_SENSOR_ERROR = 1e6

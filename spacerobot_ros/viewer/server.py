@@ -26,8 +26,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.model.shared_parameters import WatchdogConfig
-from spacerobot_ros.parameters import parameter
+from spacerobot_ros.parameters import WatchdogConfig, parameter
 
 if TYPE_CHECKING:
     import viser

@@ -18,13 +18,13 @@ from support.made_bags import STRING
 
 from spacerobot_ros.bag import (
     BagWriter,
+    RecorderConfig,
     Recording,
     RecordingError,
     free_name,
     mcap_file,
     read_bag,
 )
-from spacerobot_ros.bag.config import RecorderConfig
 from spacerobot_ros.bag.salvage import is_complete, salvage_bag
 
 

@@ -21,8 +21,7 @@ from support.raw_messages import Content
 from support.sentences import assert_one_sentence
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from spacerobot_ros.bag import BagWriter, RecordedRobot, RecordingError, read_bag
-from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.bag import BagWriter, RecordedRobot, RecorderConfig, RecordingError, read_bag
 from spacerobot_ros.bag.mcap_reading import BagFile, blocks_in_time_order
 from spacerobot_ros.flight.reading import FlightBag
 

@@ -9,8 +9,7 @@ from support.full_disk import MakeDisk
 from support.made_bags import STRING
 from support.raw_messages import Content
 
-from spacerobot_ros.bag import BagWriter, Recording, RecordingError, read_bag
-from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.bag import BagWriter, RecorderConfig, Recording, RecordingError, read_bag
 from spacerobot_ros.resources import robot_file
 
 S = 10**9

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from support.hostile.records import string
 from support.made_bags import STRING
 
-from spacerobot_ros.bag import LATCHED, Bag, BagWriter, RecordingError, read_bag
-from spacerobot_ros.bag.config import ReplayConfig
+from spacerobot_ros.bag import LATCHED, Bag, BagWriter, RecordingError, ReplayConfig, read_bag
 from spacerobot_ros.bag.playback import Playback, ReplayMessage, SubscriberWait, renamed_topics
 from spacerobot_ros.errors import ParameterError
 

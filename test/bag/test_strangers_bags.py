@@ -32,11 +32,12 @@ import spacerobot_ros
 from spacerobot_ros.bag import (
     BagWriter,
     Playback,
+    RecorderConfig,
     RecordingError,
+    ReplayConfig,
     message_definition,
     read_bag,
 )
-from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
 from spacerobot_ros.bag.mcap_reading import INFLATED_SIZE_VARIABLE
 from spacerobot_ros.bag.salvage import last_state, salvage_bag
 from spacerobot_ros.flight.reading import open_flight_bag

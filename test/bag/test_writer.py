@@ -17,8 +17,14 @@ from support.made_bags import STRING, bag_of_strings
 from support.raw_messages import Content
 
 import spacerobot_ros
-from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecordingError, read_bag
-from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.bag import (
+    LATCHED,
+    BagWriter,
+    QosProfile,
+    RecorderConfig,
+    RecordingError,
+    read_bag,
+)
 from spacerobot_ros.bag.salvage import salvage_bag
 
 S = 10**9
@@ -290,7 +296,7 @@ def test_the_limit_of_a_real_file(tmp_path: Path) -> None:
 import resource, sys
 import spacerobot_ros
 from spacerobot_ros.bag import BagWriter, RecordingError
-from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.bag import RecorderConfig
 resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
 writer = BagWriter(sys.argv[1], RecorderConfig(compression="none"), chunk_size=65536)
 channel = writer.add_topic("/a", "std_msgs/msg/String")

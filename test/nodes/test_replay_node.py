@@ -22,8 +22,7 @@ from support.ros_harness import Harness, Probe, construction
 from support.sentences import assert_one_sentence
 from support.warm_python import WarmPython
 
-from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile
-from spacerobot_ros.bag.config import RecorderConfig
+from spacerobot_ros.bag import LATCHED, BagWriter, QosProfile, RecorderConfig
 from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.model.meshes import TriangleMesh, read_mesh, stl_of

@@ -19,7 +19,7 @@ from support.page_prints import CAMPAIGNS
 from support.planar_trees import random_tree
 from support.viewer_prints import SITUATIONS, viewer_prints
 
-from spacerobot_ros.bag.config import RecorderConfig, ReplayConfig
+from spacerobot_ros.bag import RecorderConfig, ReplayConfig
 from spacerobot_ros.cli.main import main as spacerobot
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.model import SpaceRobot

@@ -46,8 +46,7 @@ def resume(path: Path) -> None:
 
 
 def play(path: Path) -> None:
-    from spacerobot_ros.bag import Playback, read_bag
-    from spacerobot_ros.bag.config import ReplayConfig
+    from spacerobot_ros.bag import Playback, ReplayConfig, read_bag
 
     playback = Playback(read_bag(path), ReplayConfig(rate=1e9))
     playback.run(0)
