@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, KeysView, Sequence
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
 from typing import Any
@@ -16,8 +17,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.messages.definitions import DTYPES, MessageType
-from spacerobot_ros.messages.layout import Columns, column_dtype, read_columns
+from spacerobot_ros.messages.definitions import DTYPES, LITTLE_ENDIAN, Layout, MessageType
 from spacerobot_ros.times import SECOND
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
@@ -307,3 +307,73 @@ def _values_in_lists(value: Any, path: Sequence[str]) -> Any:
             return [_values_in_lists(element, path[depth:]) for element in value]
         value = getattr(value, name)
     return value
+
+
+# -- columns --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Fields with the same position in all messages of a list, as arrays with one entry per
+    message.
+
+    The values of a field are a slice of one byte matrix; reading them is about a hundred times
+    faster than decoding each message.
+
+    Attributes
+    ----------
+    matrix
+        The messages, one per row.
+    layout
+        Layout of each message.
+    """
+
+    matrix: NDArray[np.uint8]
+    layout: Layout
+
+    @property
+    def paths(self) -> KeysView[str]:
+        """The fields, such as ``pose.pose.position.x``."""
+        return self.layout.leaves.keys()
+
+    def constant(self, path: str) -> bool:
+        """Whether a list of strings is identical in all messages."""
+        part = self.layout.texts.get(path)
+        return part is not None and bool((self.matrix[:, part] == self.matrix[0, part]).all())
+
+    def __getitem__(self, path: str) -> NDArray[Any] | list[str]:
+        leaf = self.layout.leaves[path]
+        rows = np.ascontiguousarray(self.matrix[:, leaf.offset : leaf.offset + leaf.size])
+        if leaf.dtype is None:
+            return [row.tobytes().decode() for row in rows]
+        column = rows.reshape(-1).view(leaf.dtype).reshape(len(rows), *leaf.shape)
+        return column.astype(column_dtype(leaf.dtype))
+
+
+def column_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the wider number type in which a column of ``dtype`` is stored."""
+    if dtype.kind == "f":
+        return np.dtype(np.float64)
+    if dtype.kind in "iu" and dtype.itemsize < 8:
+        return np.dtype(np.int64)
+    return dtype.newbyteorder("=")
+
+
+def read_columns(messages: Sequence[bytes], kind: MessageType) -> Columns | None:
+    """Return the fields that have the same position in every message of one type.
+
+    Fields in lists of messages or strings are omitted. None if the layouts differ.
+    """
+    if not messages or len(set(map(len, messages))) != 1:
+        return None
+    try:
+        layout = Layout(messages[0], kind)
+    except (IndexError, KeyError):
+        return None
+    if messages[0][:2] != LITTLE_ENDIAN:
+        return None
+    matrix = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
+    fixed = [slice(0, 2), *(slice(start, start + 4) for start in layout.lengths)]
+    if any((matrix[:, part] != matrix[0, part]).any() for part in fixed):
+        return None
+    return Columns(matrix, layout)

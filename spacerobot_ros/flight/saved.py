@@ -32,8 +32,8 @@ from spacerobot_ros.messages.builders import (
     state_message,
     trajectory_message,
 )
+from spacerobot_ros.messages.definitions import encode
 from spacerobot_ros.messages.diagnostics import StatusRecord, encode_diagnostics
-from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.kinematics import ForwardKinematics

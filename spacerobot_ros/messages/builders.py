@@ -6,7 +6,8 @@ All markers are in the world frame, so that a viewer needs no transforms.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import struct
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spacerobot_ros.errors import CommandError
-from spacerobot_ros.messages.layout import encode, encode_list, seconds_and_nanoseconds
+from spacerobot_ros.messages.definitions import (
+    Layout,
+    encode,
+    installed_type,
+    seconds_and_nanoseconds,
+)
 from spacerobot_ros.messages.readers import (
     ODOMETRY,
     POSE_PATH,
@@ -226,6 +232,46 @@ def goal_messages(
         columns["pose.position.x"][:, : path.shape[1]] = path
         messages[name] = encode_list("nav_msgs/msg/Path", header, "poses", header, columns)
     return messages | {name: goal_message(aim, frame, stamp_ns) for name, aim in poses.items()}
+
+
+def encode_list(
+    type_name: str,
+    values: Mapping[str, Any],
+    name: str,
+    element: Mapping[str, Any],
+    columns: Mapping[str, NDArray[Any]],
+) -> bytes:
+    """Return a message whose last field is a list of many messages with one layout.
+
+    Parameters
+    ----------
+    type_name, values
+        Values of the message without the list, as in :func:`encode`.
+    name
+        Field of the list.
+    element
+        Values common to all elements; arrays have their final lengths.
+    columns
+        Numbers (N, size), one row per element, keyed by the path of the first field in an element.
+    """
+    count = len(next(iter(columns.values())))
+    if not count:
+        return encode(type_name, values)
+    # Three elements show the layout: only the padding of the first may differ.
+    few = [encode(type_name, {**values, name: [element] * k}) for k in range(4)]
+    none, _, second, _ = map(len, few)
+    leaves = Layout(few[3], installed_type(type_name), elements=True).leaves
+    head = bytearray(few[1])
+    struct.pack_into("<I", head, none - 4, count)
+    rows = np.tile(np.frombuffer(few[3][second:], np.uint8), (count - 1, 1))
+    for path, column in columns.items():
+        data = np.ascontiguousarray(column).view(np.uint8).reshape(count, -1)
+        size = data.shape[1]
+        begin = leaves[f"{name}[0].{path}"].offset
+        head[begin : begin + size] = data[0].tobytes()
+        begin = leaves[f"{name}[2].{path}"].offset - second
+        rows[:, begin : begin + size] = data[1:]
+    return bytes(head) + rows.tobytes()
 
 
 def trajectory_message(schedule: GaitSchedule, stamp_ns: int, frame: str) -> bytes:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from spacerobot_ros.errors import printable
-from spacerobot_ros.messages.layout import encode
+from spacerobot_ros.messages.definitions import encode
 from spacerobot_ros.times import LATEST_NS
 
 if TYPE_CHECKING:
@@ -147,18 +147,16 @@ def state_diagnostics(
     """
     level = _WARN if warning or missing else _OK
     message = warning or (f"waiting for {missing}" if missing else "responding to states")
-    records = [_record(diagnostic_name(node, "states"), level, message, ignored, robot)]
+    records = [_record(node, "states", (level, message, ignored), robot)]
     if last is not None and not warning:
-        name = diagnostic_name(node, "goal")
-        records.append(_record(name, last.level, last.message, last.values, robot))
+        records.append(_record(node, "goal", (last.level, last.message, last.values), robot))
     return records
 
 
-def _record(
-    name: str, level: int, message: str, values: Mapping[str, object], robot: str
-) -> StatusRecord:
+def _record(node: str, part: str, content: _Content, robot: str) -> StatusRecord:
+    level, message, values = content
     texts = {key: str(value) for key, value in values.items()}
-    return StatusRecord(name, level, message, texts, robot)
+    return StatusRecord(diagnostic_name(node, part), level, message, texts, robot)
 
 
 class PlantDiagnostics:
@@ -215,10 +213,7 @@ class PlantDiagnostics:
         if plant.thrusters is not None:
             parts["thrusters"] = self._of_thrusters(plant.thrusters)
         robot = plant.robot.description.name
-        found = [
-            _record(diagnostic_name(self._node, part), *content, robot)
-            for part, content in parts.items()
-        ]
+        found = [_record(self._node, part, content, robot) for part, content in parts.items()]
         if real_time is not None:
             found.append(timing_record(self._node, robot, real_time))
         return found
@@ -329,19 +324,15 @@ class PlantDiagnostics:
 def timing_record(node: str, robot: str, real_time: RealTime) -> StatusRecord:
     """Return the delays of plant ticks and of the commander's commands."""
     tick_rate, worse = real_time.report()
-    return _record(
-        diagnostic_name(node, "timing"),
-        _WARN if worse else _OK,
-        "deadlines were missed" if worse else "in time",
-        {
-            "tick_rate_Hz": f"{tick_rate:.6g}",
-            "ticks": real_time.ticks,
-            "ticks_late": real_time.ticks_late,
-            "worst_tick_ms": f"{real_time.worst_tick * _MILLISECONDS:.3f}",
-            "commands": real_time.commands,
-            "commands_late": real_time.commands_late,
-            "worst_command_ms": f"{real_time.worst_command * _MILLISECONDS:.3f}",
-            "command_age_s": f"{real_time.command_age:.6g}",
-        },
-        robot,
-    )
+    values = {
+        "tick_rate_Hz": f"{tick_rate:.6g}",
+        "ticks": real_time.ticks,
+        "ticks_late": real_time.ticks_late,
+        "worst_tick_ms": f"{real_time.worst_tick * _MILLISECONDS:.3f}",
+        "commands": real_time.commands,
+        "commands_late": real_time.commands_late,
+        "worst_command_ms": f"{real_time.worst_command * _MILLISECONDS:.3f}",
+        "command_age_s": f"{real_time.command_age:.6g}",
+    }
+    level, message = (_WARN, "deadlines were missed") if worse else (_OK, "in time")
+    return _record(node, "timing", (level, message, values), robot)

@@ -18,8 +18,13 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import CommandError, counted
-from spacerobot_ros.messages.definitions import installed_type
-from spacerobot_ros.messages.layout import LITTLE_ENDIAN, Layout, encode, seconds_and_nanoseconds
+from spacerobot_ros.messages.definitions import (
+    LITTLE_ENDIAN,
+    Layout,
+    encode,
+    installed_type,
+    seconds_and_nanoseconds,
+)
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Refusal

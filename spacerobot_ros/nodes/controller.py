@@ -26,7 +26,7 @@ from spacerobot_ros.control.servicing import Task
 from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.builders import path_message
-from spacerobot_ros.messages.layout import encode
+from spacerobot_ros.messages.definitions import encode
 from spacerobot_ros.messages.readers import (
     WRENCH,
     MessageTemplate,

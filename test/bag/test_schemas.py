@@ -23,8 +23,8 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from spacerobot_ros.bag import RecordingError, message_definition, type_hash
+from spacerobot_ros.bag.series import read_columns
 from spacerobot_ros.messages.definitions import installed_type, message_type
-from spacerobot_ros.messages.layout import read_columns
 from spacerobot_ros.nodes.common.messages import message_class
 
 TYPES = [

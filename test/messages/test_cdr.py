@@ -24,8 +24,7 @@ from support.random_messages import few, messages
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from spacerobot_ros.messages.definitions import installed_type
-from spacerobot_ros.messages.layout import Layout, encode
+from spacerobot_ros.messages.definitions import Layout, encode, installed_type
 from spacerobot_ros.messages.readers import (
     MessageTemplate,
     TemplateReader,

@@ -30,11 +30,11 @@ from spacerobot_ros.messages.builders import (
     path_message,
     shape_marker,
 )
+from spacerobot_ros.messages.definitions import encode
 from spacerobot_ros.messages.diagnostics import (
     PlantDiagnostics,
     encode_diagnostics,
 )
-from spacerobot_ros.messages.layout import encode
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion

@@ -10,7 +10,7 @@ import pytest
 from support.wheels import wheeled_robot
 
 from spacerobot_ros.errors import CommandError, ParameterError
-from spacerobot_ros.messages.layout import encode
+from spacerobot_ros.messages.definitions import encode
 from spacerobot_ros.messages.readers import JOINT_STATE, WRENCH, CommandReader, JointReader
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
