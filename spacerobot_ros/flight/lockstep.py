@@ -279,9 +279,8 @@ class LockstepFlight:
     def interrupt(self) -> None:
         """End the flight and the planning in progress; this may be called from another thread."""
         self._interrupted = True
-        for commander in (self._planner, self._controller):
-            if commander is not None:
-                commander.interrupt()
+        for commander in self._commanders.values():
+            commander.interrupt()
 
     def _fly(self, progress: Progress, longest: float) -> str:
         """Fly; return why the flight was interrupted, empty if the goal was decided."""

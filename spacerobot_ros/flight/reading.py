@@ -45,11 +45,6 @@ from spacerobot_ros.topics import TOPICS, StateField, link_topic, topic_named
 _SAME_CLOCK_TOLERANCE = 1.0
 """If stamps differ from log times by less than this value (s), both come from the same clock."""
 
-_STATE_QUANTITIES = {"odom": ("pose", "twist"), "joint_states": ("q", "qdot", "effort")}
-"""Quantities of the fields of the topics with true and measured variants."""
-
-_COMMAND_TOPICS = ("joint_commands", "base_wrench", "joint_reference")
-
 _QUANTITY_TOPICS = (
     *("momentum", "end_effector_pose", "momentum_expected"),
     *("base_wrench_realised", "thrusters", "target/odom", "target/odom_true"),
@@ -59,7 +54,7 @@ _QUANTITY_TOPICS = (
 _FLIGHT_TOPICS = (
     *("odom", "odom_true", "joint_states", "joint_states_true"),
     *_QUANTITY_TOPICS,
-    *_COMMAND_TOPICS,
+    *("joint_commands", "base_wrench", "joint_reference"),
     *(topic for topic, _ in STATUS_TOPICS.values()),
     *("events", "clearance"),
 )
@@ -71,9 +66,6 @@ _NO_GOAL = Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 _ABSENT_MEANS_ZERO = (("planner", "clearance"), ("plant", "clearance_period"))
 """Parameters missing from bags recorded by earlier versions, by node; the features that these
 parameters control did not exist."""
-
-WRENCH_COLUMNS = TOPICS["base_wrench_realised"].state[0].columns
-"""Paths of force and torque in a wrench message."""
 
 
 class FlightBag(RecordedRobot):
@@ -187,14 +179,13 @@ class FlightBag(RecordedRobot):
         While sensors have errors, true states are on ``odom_true`` and ``joint_states_true``.
         """
         found: dict[str, Signal] = {}
-        for name, quantities in _STATE_QUANTITIES.items():
-            if name not in self and f"{name}_true" not in self:
+        for name in ("odom", "joint_states"):
+            variants = name, f"{name}_true"
+            if not any(each in self for each in variants):
                 continue
-            for number, quantity in enumerate(quantities):
-                measured, true = (
-                    self.quantity(each, TOPICS[each].state[number])
-                    for each in (name, f"{name}_true")
-                )
+            for field in TOPICS[name].state:
+                quantity = field.quantity.removeprefix("measured_")
+                measured, true = (self.quantity(each, field) for each in variants)
                 found[quantity] = _completed(true, measured)
                 if len(true) and quantity != "effort":
                     found[f"measured_{quantity}"] = measured.between(*true.time[[0, -1]].tolist())
@@ -295,15 +286,16 @@ class FlightBag(RecordedRobot):
 
     def commands(self, actuation: str) -> dict[str, Commands]:
         """Return the commands by topic, for a plant with an actuation."""
-        joints = self.names("joint_states")
-        command = "velocity" if actuation == "velocity" else "effort"
-        fields = {"joint_commands": [command], "joint_reference": ["velocity"]}
-        fields["base_wrench"] = WRENCH_COLUMNS
-        found = {}
-        for name in filter(self.__contains__, _COMMAND_TOPICS):
-            width = 6 if name == "base_wrench" else len(joints)
-            signal = self.signal(name, fields[name], width, joints)
-            found[name] = Commands(signal.time, signal.values)
+        joints, found = self.names("joint_states"), {}
+        for name, paths in (
+            ("joint_commands", ["velocity" if actuation == "velocity" else "effort"]),
+            ("base_wrench", TOPICS["base_wrench_realised"].state[0].columns),
+            ("joint_reference", ["velocity"]),
+        ):
+            if name in self:
+                width = 6 if name == "base_wrench" else len(joints)
+                signal = self.signal(name, paths, width, joints)
+                found[name] = Commands(signal.time, signal.values)
         return found
 
 

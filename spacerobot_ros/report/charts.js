@@ -144,7 +144,7 @@
     };
   }
 
-  function build(figure, box, chart) {
+  function build(box, chart) {
     const alone = chart.own === 1;
     const height = () => {
       if (chart.rows) return 60 + 19 * chart.names.length;
@@ -267,7 +267,7 @@
     figure.prepend(box);
     figure.classList.add("live");
     for (const number of figure.dataset.charts.split(" ")) {
-      build(figure, make("div", "chart", box), given.charts[Number(number)]);
+      build(make("div", "chart", box), given.charts[Number(number)]);
     }
   }
 

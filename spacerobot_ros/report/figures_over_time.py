@@ -20,7 +20,7 @@ from spacerobot_ros.flight.captures import momentum_budget_over_time
 from spacerobot_ros.flight.reading import impulse
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import momentum_change
-from spacerobot_ros.model.description import Array, Joint
+from spacerobot_ros.model.description import Array, JointLimits
 from spacerobot_ros.model.rotations import (
     quaternion_inverse,
     quaternion_multiply,
@@ -265,30 +265,37 @@ def shape_groups(flight: FlightReport) -> list[TraceGroup]:
     """Return the joint positions, in groups of at most six joints with the same unit, and reaction
     wheel rates (the wheel angles are omitted).
     """
-
-    def bounds(joint: Joint) -> list[float]:
-        return [joint.limits.lower, joint.limits.upper]
-
-    units, columns = {"m": "m", "rad": "rad"}, flight.shape_columns
-    groups = joint_groups(flight, flight.signal("q"), "joint position", units, bounds, columns)
+    groups = joint_groups(flight, flight.signal("q"), "joint position", flight.shape_columns)
     if len(flight.qdot):
-        units, columns = {"rad": "rad/s"}, flight.wheel_columns
-        rates = flight.signal("qdot")
-        groups += joint_groups(flight, rates, "wheel rate", units, _rate_bounds, columns)
+        groups += joint_groups(flight, flight.signal("qdot"), "wheel rate", flight.wheel_columns)
     return groups
+
+
+_LENGTHS, _RATES = {"m": "m", "rad": "rad"}, {"m": "m/s", "rad": "rad/s"}
+
+_JOINT_QUANTITIES: dict[str, tuple[dict[str, str], Callable[[JointLimits], list[float]]]] = {
+    "joint position": (_LENGTHS, lambda limits: [limits.lower, limits.upper]),
+    "joint position error": (_LENGTHS, lambda limits: []),
+    "velocity": (_RATES, lambda limits: [-limits.velocity, limits.velocity]),
+    "wheel rate": (_RATES, lambda limits: [-limits.velocity, limits.velocity]),
+    "joint effort": (
+        {"m": "N", "rad": "N m"},
+        lambda limits: [-limits.effort, limits.effort] if np.isfinite(limits.effort) else [],
+    ),
+}
+"""Unit by the unit of the joint's position, and bounds, of each quantity of joints."""
 
 
 def joint_groups(
     flight: FlightReport,
     signal: Signal,
     label: str,
-    units: dict[str, str],
-    bounds: Callable[[Joint], list[float]] = lambda joint: [],
     columns: Sequence[int] | None = None,
     most: int = _JOINTS_PER_PANEL,
 ) -> list[TraceGroup]:
-    """Group the columns (N, n) of a signal, or the selected ``columns``, by unit; ``units`` maps
-    the position unit to the signal unit."""
+    """Group the columns (N, n) of a signal, or the selected ``columns``, by unit; ``label`` is the
+    name of their quantity."""
+    units, bounds = _JOINT_QUANTITIES[label]
     unknown = " or ".join(units.values())
     each = [units.get(joint_unit(flight, name), unknown) for name in flight.joint_names]
     groups = []
@@ -302,7 +309,7 @@ def joint_groups(
                 (k, bound)
                 for k, name in enumerate(names)
                 if (joint := flight.joint(name)) is not None
-                for bound in bounds(joint)
+                for bound in bounds(joint.limits)
             ]
             part, labels = Signal(signal.time, signal.values[:, chosen]), [*map(shortened, names)]
             colours = [colour(i) for i in chosen]
@@ -369,15 +376,10 @@ def rates_figure(flight: FlightReport) -> ReportFigure | str | None:
         return _why_no_joints(flight)
     if not len(flight.qdot):
         return "The bag contains no joint velocities."
-    units, columns = {"m": "m/s", "rad": "rad/s"}, flight.shape_columns
-    groups = joint_groups(flight, flight.signal("qdot"), "velocity", units, _rate_bounds, columns)
+    groups = joint_groups(flight, flight.signal("qdot"), "velocity", flight.shape_columns)
     if not groups:
         return None
     return time_figure(flight, "velocities", "Joint velocities", "Velocity of each joint", groups)
-
-
-def _rate_bounds(joint: Joint) -> list[float]:
-    return [-joint.limits.velocity, joint.limits.velocity]
 
 
 def twist_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -412,17 +414,12 @@ _EFFORT_ROUNDING = 1e-9
 
 def efforts_figure(flight: FlightReport) -> ReportFigure | str | None:
     """Commanded thruster wrench and joint efforts."""
-
-    def bounds(joint: Joint) -> list[float]:
-        limit = joint.limits.effort
-        return [-limit, limit] if np.isfinite(limit) else []
-
     wrench = axis_groups(flight.wrench, (("thruster force", "N"), ("thruster torque", "N m")))
     wrench = [g for g in wrench if np.abs(g.signal.values).max(initial=0.0) > _EFFORT_ROUNDING]
     joints: list[TraceGroup] = []
     if np.abs(flight.efforts.values).max(initial=0.0) > _EFFORT_ROUNDING:
-        units, count = {"m": "N", "rad": "N m"}, len(flight.joint_names)
-        joints = joint_groups(flight, flight.efforts, "joint effort", units, bounds, most=count)
+        count = len(flight.joint_names)
+        joints = joint_groups(flight, flight.efforts, "joint effort", most=count)
     groups = [replace(x, window=range_without_peaks(x.signal)) for x in wrench + joints]
     if not groups:
         return None
@@ -567,11 +564,11 @@ _SENSOR_ROUNDING = 1e-12
 
 _MAX_DECADES = 8
 
-_ERROR_PARTS: tuple[tuple[Literal["position", "attitude"], str, str], ...] = (
-    ("position", "distance", "m"),
-    ("attitude", "angle", "rad"),
-)
-"""Goal components, and the name and unit of the error norm of each."""
+_ERROR_PARTS: dict[Literal["position", "attitude"], tuple[str, str]] = {
+    "position": ("distance", "m"),
+    "attitude": ("angle", "rad"),
+}
+"""Name and unit of the error norm of each goal component."""
 
 
 def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
@@ -585,7 +582,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
     ):
         errors, of = pose_errors(pose, targets), part.replace("_", "-")
         free = flight.not_controlled if part == "base" else ()
-        for k, (half, *_) in enumerate(_ERROR_PARTS):
+        for k, half in enumerate(_ERROR_PARTS):
             chosen = [i for i in flight.controls(part) if i // 3 == k]
             if len(errors) and chosen and half not in free:
                 signal = errors.norms(chosen)
@@ -596,7 +593,7 @@ def errors_figure(flight: FlightReport) -> ReportFigure | str | None:
         "Distance and angle from the goal, in the controlled components, on logarithmic axes; "
         "smaller values are drawn at the lower edge; dotted line: tolerance"
     )
-    if left_out := [part for part, *_ in _ERROR_PARTS if part in flight.not_controlled]:
+    if left_out := [part for part in _ERROR_PARTS if part in flight.not_controlled]:
         caption += f"; the base {' and '.join(left_out)} is not controlled"
     return time_figure(flight, "errors", "Errors", caption, groups)
 
@@ -610,7 +607,7 @@ def error_group(
 ) -> TraceGroup:
     """Return the panel of a distance or an angle (N, 1) with its tolerance; its axis shows the
     largest error and the tolerance."""
-    _, quantity, unit = next(each for each in _ERROR_PARTS if each[0] == part)
+    quantity, unit = _ERROR_PARTS[part]
     tolerance = flight.tolerance(part)
     _, top = log_range(signal.values, 0)
     down_to = 0.1 * tolerance if tolerance else 1e-4 * top
@@ -632,7 +629,7 @@ def link_errors_figure(flight: FlightReport) -> ReportFigure | str | None:
         return flight.hidden_links_text or None if flight.link_goals else None
     groups: list[TraceGroup] = []
     for number, (link, errors) in enumerate(flight.link_errors.items()):
-        for (part, *_), signal in zip(_ERROR_PARTS, errors, strict=True):
+        for part, signal in zip(_ERROR_PARTS, errors, strict=True):
             if len(signal):
                 groups.append(error_group(flight, signal, part, shortened(link), colour(number)))
     caption = (
@@ -654,8 +651,7 @@ def sensors_figure(flight: FlightReport) -> ReportFigure | str | None:
     groups = axis_groups(Signal(time, errors), parts)
     time, shape, true = _at_same_times(flight.signal("measured_q"), flight.signal("q"))
     if len(shape):
-        units = {"m": "m", "rad": "rad"}
-        groups += joint_groups(flight, Signal(time, shape - true), "joint position error", units)
+        groups += joint_groups(flight, Signal(time, shape - true), "joint position error")
     groups = [g for g in groups if np.abs(g.signal.values).max(initial=0.0) > _SENSOR_ROUNDING]
     if not groups:
         return None
