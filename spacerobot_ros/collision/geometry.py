@@ -294,6 +294,17 @@ class CollisionGeometry:
             distances[at[nearer]], pairs[at[nearer]] = found[nearer], pair
         return distances, pairs
 
+    def keep_apart(self, poses: Poses, required: Array) -> bool:
+        """Whether all pairs keep their ``required`` distances (P,), m, at all sets of poses."""
+        R, r = poses
+        bounds = self.lower_bounds(poses) - required
+        least = bounds.min(axis=0)
+        for pair in np.argsort(least, kind="stable")[: np.count_nonzero(least < 0)].tolist():
+            at = np.flatnonzero(bounds[:, pair] < 0)
+            if (self.distances(pair, (R[at], r[at])) < required[pair]).any():
+                return False
+        return True
+
     def links_in_contact(self, poses: Poses) -> frozenset[LinkPair]:
         """Return the pairs of links in contact at one set of poses."""
         near = np.flatnonzero(self.lower_bounds(poses)[0] <= 0).tolist()

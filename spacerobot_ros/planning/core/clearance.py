@@ -204,7 +204,7 @@ class Clearance:
 
         Obstacles are ignored.
         """
-        return bool((self.geometry.nearest_along(shapes, None, required, most=0.0)[0] >= 0.0).all())
+        return self.geometry.keep_apart(self.geometry.poses(shapes), required)
 
     def approaches(
         self,
