@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import (
     BatchResult,
     ControlledGoals,
@@ -24,7 +23,7 @@ from spacerobot_ros.batch.flights import (
     HeldCommands,
     plant_of,
 )
-from spacerobot_ros.batch.native import CompiledTick, Job, Program
+from spacerobot_ros.batch.native import BatchController, CompiledTick, Job, Program
 from spacerobot_ros.batch.targets import Target, vector_unit
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.reference import ReferenceProfile

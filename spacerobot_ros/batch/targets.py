@@ -148,11 +148,11 @@ class Target:
             generator.add(function)
         parts = [
             self._definitions(given, libmvec),
-            _read_source("lanes.hpp"),
+            (_SOURCE_FOLDER / "lanes.hpp").read_text("utf-8"),
             _CASADI_SELECTION.sub(r"where(\1,\2)", str(generator.dump())),
             *(f"#define {name} {function.name()}" for name, function in functions.items()),
             declarations,
-            _read_source("driver.hpp").replace('#include "stops.hpp"\n', _read_source("stops.hpp")),
+            (_SOURCE_FOLDER / "driver.hpp").read_text("utf-8"),
         ]
         return "\n".join(parts)
 
@@ -335,7 +335,3 @@ def device_named(name: str) -> Target:
     if name.startswith("host"):
         return replace(THREADS_OF_HOST, single=single)
     return CudaDevice.of(int(found[1] or 0), single=single)
-
-
-def _read_source(name: str) -> str:
-    return (_SOURCE_FOLDER / name).read_text("utf-8")

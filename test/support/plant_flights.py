@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from spacerobot_ros.batch.controlling import BatchController
 from spacerobot_ros.batch.flights import (
     NOISES,
     BatchResult,
@@ -19,6 +18,7 @@ from spacerobot_ros.batch.flights import (
     split_command,
     state_of,
 )
+from spacerobot_ros.batch.native import BatchController
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.state import ControlState, Reference
 from spacerobot_ros.errors import SpaceRobotError
