@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from spacerobot_ros.batch.targets import is_device_name
-from spacerobot_ros.campaign.distributions import (
+from spacerobot_ros.campaign.draws import (
     Dispersion,
     checked_dispersions,
     read_distributions,

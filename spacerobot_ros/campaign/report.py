@@ -16,18 +16,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from spacerobot_ros.campaign.config import Campaign
-from spacerobot_ros.campaign.dataset import ERROR, Dataset
+from spacerobot_ros.campaign.dataset import DRAW_PREFIX, ERROR, Dataset
 from spacerobot_ros.campaign.metrics import metric_of
-from spacerobot_ros.campaign.results import PASSING, Results
-from spacerobot_ros.campaign.statistics import (
+from spacerobot_ros.campaign.results import (
+    PASSING,
     PERCENTILES,
     Influence,
     PairedDifference,
+    Results,
     Share,
     paired_difference,
     paired_success,
     percentiles,
     share,
+    success_by_bins,
 )
 from spacerobot_ros.errors import ParameterError, counted
 from spacerobot_ros.files import write_output
@@ -70,7 +72,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     results = Results.of(folder)
     title = f"Campaign {results.campaign.name}"
     write_output(path, html_page(title, _page_body(results), _FOOTER))
-    lines = [f"success     {results.success_share}"]
+    lines = [f"success     {share(results.passed)}"]
     lines += [f"{name:<11} {each}" for name, each in results.sampler_shares.items()]
     note = results.incompleteness_warning
     lines += [f"note        {note}"] if note else []
@@ -166,7 +168,7 @@ def _facts_section(results: Results) -> str:
 def _success_section(results: Results) -> str:
     wall = float(np.nansum(results.columns["wall_time_s"]))
     rows = []
-    for name, found in {"success": results.success_share, **results.sampler_shares}.items():
+    for name, found in {"success": share(results.passed), **results.sampler_shares}.items():
         low, high = found.exact_interval
         rows += [
             (name, f"{100 * found.value:.4g} %", f"{found.count} of {found.total}"),
@@ -184,7 +186,7 @@ def _criteria_section(results: Results) -> str:
         middle, high = values[PERCENTILES.index(50.0)], values[PERCENTILES.index(95.0)]
         met = results.share_meeting(criterion)
         rows.append([str(criterion), *_share_cells(met), f"{middle:.4g}", f"{high:.4g}"])
-    rows.append(["all together", *_share_cells(results.success_share), "", ""])
+    rows.append(["all together", *_share_cells(share(results.passed)), "", ""])
     head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
     return table("requirements", head, rows)
 
@@ -306,7 +308,7 @@ def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> st
         return ""
     figure, axes = _figure_with_axes(len(drawn), 3, 2.4)
     for panel, name in zip(axes, drawn, strict=True):
-        bins = results.success_by_bins(name)
+        bins = success_by_bins(results.columns[f"{DRAW_PREFIX}{name}"], results.passed)
         passed = [each.passed for each in bins]
         shares, low, high = np.array(
             [(each.value, each.interval_low, each.interval_high) for each in passed]

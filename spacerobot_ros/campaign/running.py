@@ -19,8 +19,13 @@ import numpy.typing as npt
 from spacerobot_ros.campaign.config import FLIGHTS, Campaign, parse_campaign, scenario_of_section
 from spacerobot_ros.campaign.dataset import ERROR, Dataset, Row
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.engines import fly_all, select_engine
-from spacerobot_ros.campaign.workers import KILLED, TaskDistributor, open_workers
+from spacerobot_ros.campaign.workers import (
+    KILLED,
+    TaskDistributor,
+    fly_all,
+    open_workers,
+    select_engine,
+)
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.flight.api import scenario_to_fly
 from spacerobot_ros.flight.lockstep import fly_scenario

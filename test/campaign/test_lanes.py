@@ -13,14 +13,14 @@ from support.campaigns import campaign
 from support.slow import some_fast
 
 from spacerobot_ros.batch import targets
-from spacerobot_ros.campaign import engines, lanes
+from spacerobot_ros.campaign import lanes, workers
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draws
-from spacerobot_ros.campaign.engines import fly_all, select_engine
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.running import RERUN_TOLERANCE, largest_deviation
+from spacerobot_ros.campaign.workers import fly_all, select_engine
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
 from spacerobot_ros.control.state import Actuation, Reference
@@ -377,15 +377,15 @@ def test_a_device_flies_large_campaigns_of_controllers_where_there_is_one(
         select_engine(large, "cuda:3")
     with pytest.raises(SpaceRobotError, match="There is no device 'cuda:x': use cuda, cuda:1, "):
         select_engine(large, "cuda:x")
-    monkeypatch.setattr(engines, "find_spec", lambda name: name == "cupy")
-    for module in (engines, lanes):
+    monkeypatch.setattr(workers, "find_spec", lambda name: name == "cupy")
+    for module in (workers, lanes):
         monkeypatch.setattr(module, "device_named", lambda name: targets.THREADS_OF_HOST)
-    engines.engine_by_name.cache_clear()
+    workers.engine_by_name.cache_clear()
     assert select_engine(large, "auto").name == "cuda"
     assert select_engine(large, "auto", local=False).name == "lanes"
     assert select_engine(replace(large, flights=99_999), "auto").name == "lanes"
     assert select_engine(replace(campaign(), flights=100_000), "auto").name == "lanes"
-    engines.engine_by_name.cache_clear()
+    workers.engine_by_name.cache_clear()
 
 
 @on_engines("lanes")

@@ -18,8 +18,7 @@ from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign.config import Criterion, passes_criteria
 from spacerobot_ros.campaign.dataset import Dataset, Row, self_contained
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
-from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, stored_flight
-from spacerobot_ros.campaign.statistics import (
+from spacerobot_ros.campaign.results import (
     Influence,
     PairedDifference,
     corrected_for_multiple_tests,
@@ -30,6 +29,7 @@ from spacerobot_ros.campaign.statistics import (
     share,
     sobol_indices,
 )
+from spacerobot_ros.campaign.running import Progress, Rerun, largest_deviation, stored_flight
 from spacerobot_ros.campaign.targets import DrawnFlight
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
 

@@ -27,7 +27,7 @@ from spacerobot_ros.campaign.report import (
     write_campaign_report,
     write_comparison,
 )
-from spacerobot_ros.campaign.results import PASSING, Results
+from spacerobot_ros.campaign.results import PASSING, Results, success_by_bins
 from spacerobot_ros.campaign.running import run_campaign
 from spacerobot_ros.errors import ParameterError
 
@@ -200,7 +200,7 @@ def test_success_is_counted_over_bins_of_what_was_drawn(tmp_path: Path) -> None:
     by_mass = rows.groupby(pd.qcut(rows["mass.mass_1"], 8), observed=True)
     by_method = rows.groupby("planner.method")
     for name, groups in (("mass.mass_1", by_mass), ("planner.method", by_method)):
-        bins = results.success_by_bins(name)
+        bins = success_by_bins(results.columns[f"draw.{name}"], results.passed)
         assert len(bins) == len(groups)
         for found, (_, group) in zip(bins, groups, strict=True):
             count, total = int(group["passed"].sum()), len(group)

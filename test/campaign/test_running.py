@@ -20,7 +20,6 @@ from spacerobot_ros.campaign import running, workers
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import ERROR, Dataset, Row
 from spacerobot_ros.campaign.draws import Draw, Draws, require_module
-from spacerobot_ros.campaign.engines import fly_all
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.campaign.results import Results
 from spacerobot_ros.campaign.running import (
@@ -30,6 +29,7 @@ from spacerobot_ros.campaign.running import (
     rerun_flight,
     run_campaign,
 )
+from spacerobot_ros.campaign.workers import fly_all
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.resources import robot_file
