@@ -61,7 +61,8 @@ GOAL_SETTLING_TIME_S = 0.3
 _HIDDEN_GHOST_DISTANCE = 0.01
 """Distance from the robot below which the ghost is hidden, in robot lengths and rad."""
 
-_BASE_GIZMO, _TOOL_GIZMO = "/goal", "/end_effector_goal"
+_TOOL: Part = ""
+"""Key of the goal for a controller's end-effector, which is no link's name."""
 
 _DECIMALS = 4, 2
 """Decimal places for the position (m) and angles (deg) of a goal being edited."""
@@ -101,10 +102,16 @@ class GoalEditor:
         Queues user changes.
     on_note
         Function called with the reason if an input is rejected.
+    on_reset
+        Function called when the button that moves the goal to the robot is pressed.
     """
 
     def __init__(
-        self, server: viser.ViserServer, defer: Defer, on_note: Callable[[str], None]
+        self,
+        server: viser.ViserServer,
+        defer: Defer,
+        on_note: Callable[[str], None],
+        on_reset: Callable[[], None],
     ) -> None:
         self._server, self._defer, self._on_note = server, defer, on_note
         self._gizmos: dict[str, Any] = {}
@@ -119,12 +126,13 @@ class GoalEditor:
         """Whether the robot is flying to the displayed goal, which hides the gizmos."""
         self._followed: Mapping[Part, Goal] = {}
         """The last followed goals."""
-        self._check = GoalCheck(Verdict.UNCHECKED)
+        self.check = GoalCheck(Verdict.UNCHECKED)
+        """The displayed check result."""
         gui = server.gui
         recorded = hint_html("A recording does not accept goals.")
         self._none_taken = gui.add_html(recorded, visible=False)
         self._hint = gui.add_html(hint_html("Drag the arrows or enter numbers, then press Fly."))
-        self._verdict = gui.add_html(check_html(self._check))
+        self._verdict = gui.add_html(check_html(self.check))
         edit = self._defer_edit
         self._parts = _PartMenu(gui, defer, edit, on_note, self._on_parts_chosen)
         # Any: for mypy viser's values are read-only.
@@ -140,29 +148,26 @@ class GoalEditor:
         self._final = _FinalShape(gui, edit, self._mark_changed)
         react(self._tool_too.on_update, edit, lambda _: self.touch(time.monotonic()))
         self._to_robot = gui.add_button("Goal to the robot", color="gray")
+        react(self._to_robot.on_click, defer, lambda _: on_reset())
         for field in (self._position, self._angles):
             field.on_update(self._on_field)
 
     @property
     def placed(self) -> bool:
         """Whether the editor has a goal."""
-        return _BASE_GIZMO in self._poses
+        return BASE_GOAL_KEY in self._poses
 
     @property
     def has_tool(self) -> bool:
         """Whether the editor has an end-effector goal."""
-        return _TOOL_GIZMO in self._poses
+        return _TOOL in self._poses
 
     def add_tool(self, pose: Array | None) -> None:
         """Add an end-effector goal at a pose (7,)."""
         if pose is not None and self.placed:
-            self._add_gizmo(_TOOL_GIZMO, 0.12 * self._reach)
-            self._move_gizmo(_TOOL_GIZMO, pose)
+            self._add_gizmo(_TOOL)
+            self._move_gizmo(_TOOL, pose)
             self.touch(time.monotonic())
-
-    def on_reset_goal(self, act: Callable[[], None]) -> None:
-        """Call a function when the button that moves the goal to the robot is pressed."""
-        react(self._to_robot.on_click, self._defer, lambda _: act())
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
         """Start again with another robot, in an empty scene; None: no robot."""
@@ -181,18 +186,18 @@ class GoalEditor:
     def place(self, base: Array, tool: Array | None, q: Array, now: float) -> None:
         """Set the goal to poses (7,) and the ghost to joint positions (n,)."""
         assert self._robot is not None
-        if _BASE_GIZMO not in self._gizmos:
-            self._add_gizmo(_BASE_GIZMO, 0.2 * self._reach)
-            color, path = COLORS[Verdict.UNCHECKED], f"{_BASE_GIZMO}/ghost"
+        if BASE_GOAL_KEY not in self._gizmos:
+            self._add_gizmo(BASE_GOAL_KEY)
+            color, path = COLORS[Verdict.UNCHECKED], f"{_path_of(BASE_GOAL_KEY)}/ghost"
             self._ghost = RobotDrawing(self._server.scene, path, self._robot, color=color)
         self._present = base, q
         self._final.update_robot(q)
         self._final.fill()
-        self._move_gizmo(_BASE_GIZMO, base)
+        self._move_gizmo(BASE_GOAL_KEY, base)
         for link in self._parts.links:
             self._place_link_gizmo(link)
         if tool is not None and self.has_tool:
-            self._move_gizmo(_TOOL_GIZMO, tool)
+            self._move_gizmo(_TOOL, tool)
         self.update_robot(base, q)
         self._show_fields()
         self._changed_at = now
@@ -224,18 +229,18 @@ class GoalEditor:
             asked[BASE_GOAL_KEY] = RequestedPart.POSE
         self._parts.choose(asked)
         if base is not None:
-            self._move_gizmo(_BASE_GIZMO, _pose_of(base))
+            self._move_gizmo(BASE_GOAL_KEY, _pose_of(base))
         if tool is not None and not tool.end_effectors and self.has_tool:
-            self._move_gizmo(_TOOL_GIZMO, _pose_of(tool))
+            self._move_gizmo(_TOOL, _pose_of(tool))
         for link, aim in links.items():
             self._place_link_gizmo(link)
-            turn = self._poses[_link_gizmo(link)][3:] if aim.quaternion is None else aim.quaternion
-            self._move_gizmo(_link_gizmo(link), np.concatenate([aim.position, turn]))
+            turn = self._poses[link][3:] if aim.quaternion is None else aim.quaternion
+            self._move_gizmo(link, np.concatenate([aim.position, turn]))
         self._show_parts()
         self._show_fields()
         self._changed_at = now
         self.note_sent()
-        if self._check.verdict is not Verdict.UNCHECKED:
+        if self.check.verdict is not Verdict.UNCHECKED:
             self.show_check(GoalCheck(Verdict.PLANNING, "Another goal has been sent."))
 
     def note_sent(self) -> None:
@@ -246,11 +251,6 @@ class GoalEditor:
     def shows_sent_goal(self) -> bool:
         """Whether the displayed goal is the goal that was sent last."""
         return self._origin is Origin.SENT
-
-    @property
-    def check(self) -> GoalCheck:
-        """The displayed check result."""
-        return self._check
 
     def _defer_edit(self, act: Callable[[], None]) -> None:
         def edit() -> None:
@@ -270,14 +270,14 @@ class GoalEditor:
         self._final.update_robot(q)
         if self._ghost is None:
             return
-        shape = self._check.shape
+        shape = self.check.shape
         if shape is None:
             final = self._final.positions
             shape = q if final is None else final
             self._ghost.set_joint_positions(shape)
         goal = self._ghost_pose(pose)
         # The ghost is attached to the base gizmo, so that it follows the mouse immediately.
-        self._ghost.place(relative_pose(self._poses[_BASE_GIZMO], goal))
+        self._ghost.place(relative_pose(self._poses[BASE_GOAL_KEY], goal))
         hidden = self._is_at_goal(goal, pose, q, shape)
         self._ghost.base.visible = self._ghost_shown and not hidden
 
@@ -289,10 +289,10 @@ class GoalEditor:
 
     def _ghost_pose(self, pose: Array) -> Array:
         """Return the ghost's base pose (7,): the predicted final pose, or else the goal pose."""
-        if self._check.base is not None:
-            return self._check.base
+        if self.check.base is not None:
+            return self.check.base
         free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
-        return pose if free else self._poses[_BASE_GIZMO]
+        return pose if free else self._poses[BASE_GOAL_KEY]
 
     def _is_at_goal(self, goal: Array, pose: Array, q: Array, shape: Array) -> bool:
         """Whether a robot at a pose and joint positions ``q`` coincides with the ghost."""
@@ -313,9 +313,9 @@ class GoalEditor:
         planners: the choice of end-effectors, and the final joint positions.
         """
         self._tool_too.visible = tool
-        if _TOOL_GIZMO in self._gizmos:
+        if _TOOL in self._gizmos:
             shown = tool and self._tool_too.value and not self._in_flight
-            self._gizmos[_TOOL_GIZMO].visible = shown
+            self._gizmos[_TOOL].visible = shown
         self._parts.show(visible=planned)
         self._final.show(visible=planned)
 
@@ -325,8 +325,8 @@ class GoalEditor:
         if offered == self._parts.links:
             return  # The user's choice is kept.
         for link in self._parts.links:
-            if _link_gizmo(link) in self._gizmos:
-                self._gizmos[_link_gizmo(link)].visible = False
+            if link in self._gizmos:
+                self._gizmos[link].visible = False
         self._parts.offer(offered)
         self._on_parts_chosen(BASE_GOAL_KEY)
 
@@ -353,17 +353,17 @@ class GoalEditor:
         shape = self._final.positions
         goals: dict[Part, Goal] = {}
         if self._parts.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING:
-            goals[BASE_GOAL_KEY] = self._goal_at(_BASE_GIZMO, shape)
+            goals[BASE_GOAL_KEY] = self._goal_at(BASE_GOAL_KEY, shape)
         if self._tool_too.visible and self._tool_too.value and self.has_tool:
-            goals[DEFAULT_END_EFFECTOR] = self._goal_at(_TOOL_GIZMO)
+            goals[DEFAULT_END_EFFECTOR] = self._goal_at(_TOOL)
         for link, asked in self._parts.requested_links().items():
-            pose = self._poses[_link_gizmo(link)]
+            pose = self._poses[link]
             aim = EndEffectorGoal.checked(link, pose if asked is RequestedPart.POSE else pose[:3])
             goals[link] = Goal.of_end_effectors([aim], joint_positions=shape)
         return goals
 
-    def _goal_at(self, gizmo: str, shape: Array | None = None) -> Goal:
-        pose = self._poses[gizmo]
+    def _goal_at(self, part: Part, shape: Array | None = None) -> Goal:
+        pose = self._poses[part]
         return Goal.checked(pose[:3].tolist(), pose[3:].tolist(), shape)
 
     def settled_goals(self, now: float) -> dict[Part, Goal] | None:
@@ -391,7 +391,7 @@ class GoalEditor:
 
     def show_check(self, check: GoalCheck) -> None:
         """Show the goal check result."""
-        self._check = check
+        self.check = check
         self._verdict.content = check_html(check)
         if self._ghost is not None:
             self._ghost.paint(COLORS[check.verdict])
@@ -404,31 +404,33 @@ class GoalEditor:
 
     # -- changes by users --------------------------------------------------------------------------
 
-    def _add_gizmo(self, name: str, scale: float) -> None:
-        gizmo = self._server.scene.add_transform_controls(name, scale=scale, depth_test=False)
-        self._gizmos[name] = gizmo
-        if name != _BASE_GIZMO:
-            self._marks[name] = self._server.scene.add_icosphere(
-                f"{name}/mark", _MARK_SIZE * scale, color=COLORS[self._check.verdict], opacity=0.6,
+    def _add_gizmo(self, part: Part) -> None:
+        base, path = part == BASE_GOAL_KEY, _path_of(part)
+        scale = (0.2 if base else 0.12) * self._reach
+        gizmo = self._server.scene.add_transform_controls(path, scale=scale, depth_test=False)
+        self._gizmos[part] = gizmo
+        if not base:
+            self._marks[part] = self._server.scene.add_icosphere(
+                f"{path}/mark", _MARK_SIZE * scale, color=COLORS[self.check.verdict], opacity=0.6,
                 cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
 
         @gizmo.on_update
         async def _(event: Any) -> None:
             pose = np.concatenate([event.target.position, xyzw(event.target.wxyz)])
-            self._defer_edit(lambda: self._on_gizmo_moved(name, pose))
+            self._defer_edit(lambda: self._on_gizmo_moved(part, pose))
 
     async def _on_field(self, event: Any) -> None:
         if event.client is not None:  # Otherwise, the page itself set the value.
             position, angles = self._position.value, self._angles.value
             self._defer_edit(lambda: self._on_fields_typed(position, angles))
 
-    def _on_gizmo_moved(self, name: str, pose: Array) -> None:
-        if name not in self._gizmos or not np.all(np.isfinite(pose)):
+    def _on_gizmo_moved(self, part: Part, pose: Array) -> None:
+        if part not in self._gizmos or not np.all(np.isfinite(pose)):
             return  # The gizmo belongs to an earlier robot, or the pose is not finite.
         # The values shown in the fields are sent.
         goal = Goal.from_rpy(*_fields_of(pose))
-        self._set_goal(name, _pose_of(goal))
+        self._set_goal(part, _pose_of(goal))
         self._show_fields()
 
     def _on_fields_typed(self, position: tuple[float, ...], angles: tuple[float, ...]) -> None:
@@ -440,33 +442,33 @@ class GoalEditor:
             self._on_note(str(error))
             self._show_fields()
             return
-        gizmo = _gizmo_of(self._parts.shown)
-        self._set_goal(gizmo, _pose_of(goal))
-        self._move_gizmo(gizmo, self._poses[gizmo])
+        part = self._parts.shown
+        self._set_goal(part, _pose_of(goal))
+        self._move_gizmo(part, self._poses[part])
 
-    def _set_goal(self, name: str, pose: Array) -> None:
-        before = self._poses.get(name, pose)
-        self._poses[name] = pose
-        if name == _BASE_GIZMO and _TOOL_GIZMO in self._poses:
-            self._move_gizmo(_TOOL_GIZMO, move_along(self._poses[_TOOL_GIZMO], before, pose))
+    def _set_goal(self, part: Part, pose: Array) -> None:
+        before = self._poses.get(part, pose)
+        self._poses[part] = pose
+        if part == BASE_GOAL_KEY and self.has_tool:
+            self._move_gizmo(_TOOL, move_along(self._poses[_TOOL], before, pose))
         self._mark_changed()
 
     def _mark_changed(self) -> None:
         if not self.placed:
             return
         self._changed_at = time.monotonic()
-        if self._check.verdict is not Verdict.UNCHECKED:
+        if self.check.verdict is not Verdict.UNCHECKED:
             self.show_check(GoalCheck(Verdict.PLANNING, "The goal is being moved."))
 
-    def _move_gizmo(self, name: str, pose: Array) -> None:
-        self._poses[name] = pose
-        self._gizmos[name].position = pose[:3]
-        self._gizmos[name].wxyz = wxyz(pose[3:])
+    def _move_gizmo(self, part: Part, pose: Array) -> None:
+        self._poses[part] = pose
+        self._gizmos[part].position = pose[:3]
+        self._gizmos[part].wxyz = wxyz(pose[3:])
 
     def _on_parts_chosen(self, part: Part) -> None:
         """Apply a user's choice for a part, or the choice of the part whose numbers are shown."""
         if part != BASE_GOAL_KEY and self._parts.asked(part) is not RequestedPart.NOTHING:
-            gizmo = self._gizmos.get(_link_gizmo(part))
+            gizmo = self._gizmos.get(part)
             if gizmo is None or not gizmo.visible:
                 self._place_link_gizmo(part)
         self._show_parts()
@@ -476,21 +478,20 @@ class GoalEditor:
     def _place_link_gizmo(self, link: str) -> None:
         if self._kinematics is None or self._present is None:
             return
-        name = _link_gizmo(link)
-        if name not in self._gizmos:
-            self._add_gizmo(name, 0.12 * self._reach)
-            self._gizmos[name].visible = False
-        self._move_gizmo(name, self._kinematics.link_in_world(link, *self._present))
+        if link not in self._gizmos:
+            self._add_gizmo(link)
+            self._gizmos[link].visible = False
+        self._move_gizmo(link, self._kinematics.link_in_world(link, *self._present))
 
     def _show_parts(self) -> None:
         """Show the gizmos of the parts that the goal specifies, and their handles."""
         for link in self._parts.links:
-            gizmo = self._gizmos.get(_link_gizmo(link))
+            gizmo = self._gizmos.get(link)
             if gizmo is not None:
                 asked = self._parts.asked(link)
                 gizmo.visible = asked is not RequestedPart.NOTHING and not self._in_flight
                 gizmo.disable_rotations = asked is RequestedPart.POSITION
-        base = self._gizmos.get(_BASE_GIZMO)
+        base = self._gizmos.get(BASE_GOAL_KEY)
         if base is not None:
             # Its node stays visible, because the ghost is attached to it.
             free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
@@ -499,7 +500,7 @@ class GoalEditor:
         self._angles.visible = self._parts.asked(self._parts.shown) is not RequestedPart.POSITION
 
     def _show_fields(self) -> None:
-        pose = self._poses.get(_gizmo_of(self._parts.shown))
+        pose = self._poses.get(self._parts.shown)
         if pose is not None:
             self._position.value, self._angles.value = _fields_of(pose)
 
@@ -692,13 +693,10 @@ def _pose_of(goal: Goal) -> Array:
     return np.concatenate([goal.position, goal.quaternion])
 
 
-def _link_gizmo(link: str) -> str:
-    """Return the gizmo path of a link, whose name may contain slashes."""
-    return f"/end_effector_goals/{link.replace('/', '%')}"
-
-
-def _gizmo_of(part: Part) -> str:
-    return _BASE_GIZMO if part == BASE_GOAL_KEY else _link_gizmo(part)
+def _path_of(part: Part) -> str:
+    """Return the path of a part's gizmo in the scene; the name of a link may contain slashes."""
+    paths = {BASE_GOAL_KEY: "/goal", _TOOL: "/end_effector_goal"}
+    return paths.get(part, f"/end_effector_goals/{part.replace('/', '%')}")
 
 
 def move_along(pose: Array, before: Array, after: Array) -> Array:

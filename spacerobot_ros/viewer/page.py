@@ -144,13 +144,7 @@ class TimeLine:
 
 
 class LookBack:
-    """Slider for looking back over a flight, and a button to return to the current state.
-
-    Attributes
-    ----------
-    time_s
-        Simulated time shown to the user, s; None: the present.
-    """
+    """Slider for looking back over a flight, and a button to return to the current state."""
 
     def __init__(self, gui: viser.GuiApi, defer: Defer) -> None:
         self.time_s: float | None = None
@@ -568,6 +562,8 @@ class Page:
     ----------
     editor, faults
         The goal editor and the fault menu.
+    tolerance
+        The planner's or controller's goal tolerance; None: unknown.
     """
 
     def __init__(self, server: viser.ViserServer, config: ViewerConfig) -> None:
@@ -582,7 +578,7 @@ class Page:
         """The obstacles shown last; None if the obstacles of the robot are shown."""
         self._drawn_obstacles: list[viser.MeshHandle] = []
         self._table: ThrusterTable | None = None
-        self._tolerance: Tolerance | None = None
+        self.tolerance: Tolerance | None = None
         self._state = StackState()
         self._due: dict[str, float] = {}
         self._now = 0.0
@@ -606,7 +602,7 @@ class Page:
         self._bar: Any = gui.add_progress_bar(0.0, visible=False)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Goal"):
-            self.editor = GoalEditor(self._server, defer, self._refuse)
+            self.editor = GoalEditor(self._server, defer, self._refuse, self._goal_to_robot)
         with tabs.add_tab("Plots"):
             self._plots = Plots(gui)
         with tabs.add_tab("Joints"):
@@ -615,7 +611,6 @@ class Page:
             self.faults = FaultPanel(gui, defer, self._request, self._refuse)
         with tabs.add_tab("Log"):
             self._log = LogPanel(gui)
-        self.editor.on_reset_goal(self._goal_to_robot)
         look = gui.add_button(
             "Look at the robot", color="gray", hint="Point the camera of this browser at the robot."
         )
@@ -713,7 +708,7 @@ class Page:
         self.editor.show_ghost(visible=shown["Ghost"])
         if self._around is not None:
             self._around.show_paths(visible=shown["Paths"])
-            self._around.show_world(visible=shown["Frames"])
+            self._around.world_axes.visible = shown["Frames"]
             self._around.plume_lines.show(visible=shown["Plumes"])
             self._around.show_backdrop(str(self._setting.value))
 
@@ -731,10 +726,6 @@ class Page:
         if table is not None and self._table is None:
             self._follow.value = True
         self._table = table
-
-    def show_tolerance(self, tolerance: Tolerance | None) -> None:
-        """Set the planner's or controller's goal tolerance; None: unknown."""
-        self._tolerance = tolerance
 
     def note(self, notice: Notice) -> None:
         """Add a line to the log; without a time, it has the time of the last state."""
@@ -778,7 +769,7 @@ class Page:
                 table = content.joints_html(self._robot, last.q, last.qdot, last.effort)
                 self._joints.content = table
             if self._is_due("plots", _PLOTS_S):
-                self._plots.draw(self._tolerance, self._look_back.time_s)
+                self._plots.draw(self.tolerance, self._look_back.time_s)
         actions, self._actions = self._actions, []
         return actions
 
@@ -848,7 +839,7 @@ class Page:
     def _draw_texts(self, shown: StackState) -> None:
         state, errors = self._state, self._goal_errors(shown)
         described = self._robot is not None
-        text = content.status_html(shown, errors, self._tolerance, described=described)
+        text = content.status_html(shown, errors, self.tolerance, described=described)
         announces = self._announced is not None and self._now < self._announced[1]
         if self._announced is not None and announces and not content.has_stack_ended(state):
             text = content.line_html(self._announced[0].message, self._announced[0].level) + text

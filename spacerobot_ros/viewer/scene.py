@@ -298,7 +298,9 @@ class Surroundings:
             fade_distance=12 * reach,
         )
         self._sky = self._add_sky(reach, center)
-        self._world = scene.add_frame("/world", axes_length=0.25 * reach, axes_radius=0.006 * reach)
+        self.world_axes = scene.add_frame(
+            "/world", axes_length=0.25 * reach, axes_radius=0.006 * reach
+        )
         self.plume_lines = Lines(scene, f"{robot_path}/plumes", _PLUME)
         self._paths: dict[tuple[str, str], Lines] = {}
         self._paths_shown = True
@@ -338,10 +340,6 @@ class Surroundings:
         self._grid.visible = indoors
         for each in self._sky:
             each.visible = not indoors
-
-    def show_world(self, *, visible: bool) -> None:
-        """Show or hide the world axes."""
-        self._world.visible = visible
 
     def show_paths(self, *, visible: bool) -> None:
         """Show or hide the planned and flown paths."""

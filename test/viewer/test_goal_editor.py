@@ -40,7 +40,7 @@ class Editor:
         self.inbox: SimpleQueue[Any] = SimpleQueue()
         self.refusals: list[str] = []
         server: Any = self.server
-        self.editor = GoalEditor(server, self.inbox.put, self.refusals.append)
+        self.editor = GoalEditor(server, self.inbox.put, self.refusals.append, lambda: None)
         self.robot = load_robot(robot_file(robot))
         self.editor.show_robot(self.robot, reach_of(self.robot))
 

@@ -352,7 +352,7 @@ class ViewerNode(FlightNode):
                 self._offer_end_effectors()
             known = self._remote_values
             parameters = known.get("planner", known.get("controller"))
-            self._page.show_tolerance(goal_tolerance(parameters, self._robot))
+            self._page.tolerance = goal_tolerance(parameters, self._robot)
             self._page.editor.touch(time.monotonic())
 
     def _offer_end_effectors(self) -> None:
