@@ -46,10 +46,14 @@ from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Measures, Outcome, momentum_drift
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.model.rotations import matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
-from spacerobot_ros.planning.core.goal import POSE, missed_parts, reached_message
+from spacerobot_ros.planning.core.goal import (
+    POSE,
+    end_effector_pose,
+    missed_parts,
+    reached_message,
+)
 from spacerobot_ros.planning.execution.status import describe_remaining_error
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
@@ -430,49 +434,49 @@ class _ControlledLanes:
         flights: Flights,
     ) -> Iterator[Measures | str]:
         """Yield the measures of each flight, or the reason for a fallback."""
+        n = flights.robot.n
         for row, ready in enumerate(batch):
-            yield self._measures_of(result, row, ready, flights)
-
-    def _measures_of(
-        self, result: BatchResult, row: int, ready: _PreparedDraw, flights: Flights
-    ) -> Measures | str:
-        if row in result.failures:
-            return "was refused by the plant"
-        decision, period_ns = Decision(result.decision[row]), ready.flight.scenario.plant.period_ns
-        decided = int(result.decision_tick[row])
-        if decision is Decision.LOST:
-            return "lost control"
-        if decided == 0:
-            return "ended in its first state"
-        n, end = flights.robot.n, result.end_state[row]
-        q, pose = end[:n], end[2 * n : 2 * n + 7]
-        hand = _end_effector_error(flights.robot, ready.flight, q, pose)
-        turns = hand is not None and _turns_end_effector(flights)
-        duration = int(result.end_tick[row]) * period_ns / SECOND
-        if decision is Decision.NONE:
-            outcome, flown = Outcome.INTERRUPTED, duration
-            message = f"Interrupted after {duration:.6g} s of simulated time."
-        else:
-            outcome, state = _OUTCOME_OF_DECISION[decision]
-            left = OutputDistance(*result.decision_distance[row].tolist())
-            message = decided_message(state, left, ready.flight.scenario.controller)
-            flown = decided * period_ns / SECOND
-        return Measures(
-            outcome=outcome,
-            message=message,
-            duration=duration,
-            manoeuvre_time=flown,
-            error=PoseError.between(pose[:3], pose[3:], ready.flight.scenario.goal),
-            peak_rate=np.maximum(result.peak_rate[row], np.abs(flights.initial_states.qdot[row])),
-            peak_effort=result.peak_effort[row],
-            peak_wrench=result.peak_wrench[row],
-            lowest=np.minimum(result.lowest[row], q),
-            highest=np.maximum(result.highest[row], q),
-            momentum_drift=result.momentum_drift[row],
-            end_effector_distance=math.nan if hand is None else hand.distance,
-            end_effector_angle=math.nan if hand is None or not turns else hand.angle,
-            plan_time=0.0,
-        )
+            scenario = ready.flight.scenario
+            decision, decided = Decision(result.decision[row]), int(result.decision_tick[row])
+            if row in result.failures:
+                yield "was refused by the plant"
+                continue
+            if decision is Decision.LOST:
+                yield "lost control"
+                continue
+            if decided == 0:
+                yield "ended in its first state"
+                continue
+            end = result.end_state[row]
+            q, pose = end[:n], end[2 * n : 2 * n + 7]
+            hand = _end_effector_error(flights.robot, ready.flight, q, pose)
+            turns = hand is not None and _turns_end_effector(flights)
+            duration = int(result.end_tick[row]) * scenario.plant.period_ns / SECOND
+            if decision is Decision.NONE:
+                outcome, flown = Outcome.INTERRUPTED, duration
+                message = f"Interrupted after {duration:.6g} s of simulated time."
+            else:
+                outcome, state = _OUTCOME_OF_DECISION[decision]
+                left = OutputDistance(*result.decision_distance[row].tolist())
+                message = decided_message(state, left, scenario.controller)
+                flown = decided * scenario.plant.period_ns / SECOND
+            initial_rate = np.abs(flights.initial_states.qdot[row])
+            yield Measures(
+                outcome=outcome,
+                message=message,
+                duration=duration,
+                manoeuvre_time=flown,
+                error=PoseError.between(pose[:3], pose[3:], scenario.goal),
+                peak_rate=np.maximum(result.peak_rate[row], initial_rate),
+                peak_effort=result.peak_effort[row],
+                peak_wrench=result.peak_wrench[row],
+                lowest=np.minimum(result.lowest[row], q),
+                highest=np.maximum(result.highest[row], q),
+                momentum_drift=result.momentum_drift[row],
+                end_effector_distance=math.nan if hand is None else hand.distance,
+                end_effector_angle=math.nan if hand is None or not turns else hand.angle,
+                plan_time=0.0,
+            )
 
 
 def _any_begins(names: Iterable[str], prefixes: str | tuple[str, ...]) -> bool:
@@ -517,9 +521,7 @@ def _end_effector_error(
     link = robot.description.end_effector(flight.scenario.plant.end_effector_frame)
     if goal is None or not link:
         return None
-    R_BE, r_BE_B = robot.link_pose(link, q)
-    R_WB = matrix_from_quaternion(pose[3:])
-    return PoseError.between(pose[:3] + R_WB @ r_BE_B, quaternion_from_matrix(R_WB @ R_BE), goal)
+    return PoseError.between(*end_effector_pose(robot, link, pose[:3], pose[3:], q), goal)
 
 
 def _turns_end_effector(flights: Flights) -> bool:

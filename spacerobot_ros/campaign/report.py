@@ -70,8 +70,8 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
         The file cannot be written.
     """
     results = Results.of(folder)
-    title = f"Campaign {results.campaign.name}"
-    write_output(path, html_page(title, _page_body(results), _FOOTER))
+    title, found = f"Campaign {results.campaign.name}", results.influences()
+    write_output(path, html_page(title, _page_body(results, found), _FOOTER))
     lines = [f"success     {share(results.passed)}"]
     lines += [f"{name:<11} {each}" for name, each in results.sampler_shares.items()]
     note = results.incompleteness_warning
@@ -82,7 +82,6 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
         for outcome, count, message in results.shown_messages
         if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
     ]
-    found = results.influences()
     drivers = [each for each in found if each.is_significant]
     lines += [f"driver      {each}" for each in _sort_passing_first(drivers)[:3]]
     if found and not drivers:
@@ -124,8 +123,8 @@ def metric_label(metric: str, not_controlled: Sequence[str] = ()) -> str:
 # -- parts of the page ------------------------------------------------------------------------
 
 
-def _page_body(results: Results) -> list[str]:
-    campaign, found = results.campaign, results.influences()
+def _page_body(results: Results, found: Sequence[Influence]) -> list[str]:
+    campaign = results.campaign
     with drawing():
         return [
             f"<header><h1>{escape(campaign.name)}</h1>",
@@ -452,7 +451,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
         f"{a} passes {int(passed_a.sum())} and {b} {int(passed_b.sum())} of {len(common)} draws; "
         f"{only_a} only {a}, {only_b} only {b} (McNemar's exact test: p = {p:.2g})."
     )
-    notes = [*_notes_on_failures(first, second), *_notes_on_control(first, second)]
+    notes = _notes(first, second)
     rows = different_parameters([first.campaign.scenario, second.campaign.scenario])
     with drawing():
         body = [
@@ -476,7 +475,7 @@ def write_comparison(folders: tuple[Path, Path], path: Path) -> list[str]:
     return [sentence, *lines, *notes]
 
 
-def _notes_on_failures(first: Results, second: Results) -> list[str]:
+def _notes(first: Results, second: Results) -> list[str]:
     notes = []
     for each in (first, second):
         missed = [found for found in each.messages if found[0] != "reached"]
@@ -485,11 +484,7 @@ def _notes_on_failures(first: Results, second: Results) -> list[str]:
             notes.append(f"Of {each.campaign.name}, {share} have the outcome {outcome}: {message}")
     if first.refused.any() or second.refused.any():
         notes.append("Differences exclude draws whose goal was refused in one of the campaigns.")
-    return notes
-
-
-def _notes_on_control(first: Results, second: Results) -> list[str]:
-    return [
+    return notes + [
         f"{each.campaign.name} does not control the {' and '.join(parts)}: this error is ignored "
         "unless it is named in a criterion."
         for each in (first, second)

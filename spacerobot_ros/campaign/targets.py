@@ -371,19 +371,15 @@ def _list_values(name: str, node: str, declaration: Parameter, scenario: Scenari
     if values:
         return [float(x) for x in values]
     if node == "plant" and declaration.length is None:
-        start = _start_positions(scenario)
-        return start if "positions" in name else [0.0] * len(start)
+        robot = description_of(scenario)
+        zeros = np.zeros(len(robot.joint_names))
+        if declaration.name == "initial_joint_positions":  # As close to zero as limits allow.
+            zeros = np.clip(zeros, robot.limits("lower"), robot.limits("upper"))
+        return list(zeros.tolist())
     raise ParameterError(
         f"'{name}': the list is empty, and an empty list has a special meaning: set the whole "
         "list under 'set'."
     )
-
-
-def _start_positions(scenario: Scenario) -> list[float]:
-    """Return the joint positions at the start; by default, as close to zero as limits allow."""
-    given, robot = scenario.plant.initial_joint_positions, description_of(scenario)
-    lower, upper = robot.limits("lower"), robot.limits("upper")
-    return list(given) or np.clip(np.zeros(len(lower)), lower, upper).tolist()
 
 
 def _mass_property_target(
