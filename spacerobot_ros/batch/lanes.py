@@ -77,7 +77,7 @@ def fly_lanes(
         except SpaceRobotError as error:
             result.failures[row] = str(error)
     rows = np.flatnonzero(fit)
-    each = 8 * (2 * tick.memory_layout.total_rows + 100 * len(flights.report_ticks))
+    each = 8 * (2 * tick.row_count + 100 * len(flights.report_ticks))
     if (table := flights.table).ndim == 3:
         each += 2 * table[0].nbytes
     size, lanes = target.block_bytes // each, target.lanes
@@ -125,7 +125,7 @@ class LaneBlock:
         result: BatchResult,
     ) -> None:
         self._flights, self._tick, self._model, self._flown = flights, tick, model, rows
-        self._result, self._target, self._rows = result, tick.target, tick.memory_layout
+        self._result, self._target, self._rows = result, tick.target, tick.rows
         program, self._controller = flights.program, None
         if tick.controller is not None and isinstance(program, ControlledGoals):
             self._controller = BatchController(program, tick.controller)
@@ -133,7 +133,7 @@ class LaneBlock:
         self._groups = -(-len(rows) // self._lanes)
         surplus = np.repeat(rows[-1:], self._groups * self._lanes - len(rows))
         self._rows_of_lanes = np.concatenate([rows, surplus])
-        self._memory = self._target.zeros((self._groups, self._rows.total_rows, self._lanes))
+        self._memory = self._target.zeros((self._groups, tick.row_count, self._lanes))
         self._memory[:, self._rows["decided_state"]] = np.nan
         self._memory[:, self._rows["end_state"]] = np.nan
         self._write_rows("alive", 1.0)
@@ -181,7 +181,7 @@ class LaneBlock:
             return
         chosen = np.arange(len(self._flown)) if lanes is None else lanes
         group, lane = np.divmod(chosen[:, np.newaxis], self._lanes)
-        rows = np.arange(self._rows.total_rows)[self._rows[name]]
+        rows = np.arange(self._tick.row_count)[self._rows[name]]
         at = (arrays.asarray(each) for each in (group, rows, lane))
         self._memory[tuple(at)] = arrays.asarray(values)
 
@@ -259,7 +259,7 @@ class LaneBlock:
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             if stopped():
                 return
-            alive = self._target.to_numpy(self._memory[:, self._rows.first_row("alive")])
+            alive = self._target.to_numpy(self._memory[:, self._rows["alive"]])
             if not alive.any():
                 break
             if not begin:
@@ -291,8 +291,8 @@ class LaneBlock:
             return
         self._tick.library.measure_starts(self._job)
         states = self._read_rows("measured")
-        numbers = np.zeros((len(states), self._rows.row_count("profile")))
-        most = np.zeros((len(states), self._rows.row_count("bounds")))
+        numbers = np.zeros_like(self._read_rows("profile"))
+        most = np.zeros_like(self._read_rows("bounds"))
         for lane, (row, state) in enumerate(zip(self._flown.tolist(), states, strict=True)):
             try:
                 profile, most[lane] = controller.begin_flight(row, ControlState.unstack(state))
@@ -330,7 +330,7 @@ class LaneBlock:
         return each.reshape(-1, *reports.shape[1:3])[: len(self._flown)]
 
     def _write_results(self) -> None:
-        result, rows, n = self._result, self._flown, self._flights.robot.n
+        result, rows = self._result, self._flown
         reports = self._reported(self._reports)
         for lane, tick in self._ended.items():
             reports[lane, np.array(self._flights.report_ticks) > tick] = np.nan
@@ -338,9 +338,8 @@ class LaneBlock:
         for name in ("peak_rate", "peak_effort", "peak_wrench", "lowest", "highest"):
             getattr(result, name)[rows] = self._read_rows(name)
         limits = self._read_rows("limits").astype(np.int64)
-        first = "effort" if self._flights.actuation == "effort" else "rate"
-        result.limited_ticks[first][rows] = limits[:, :n]
-        result.limited_ticks["stroke"][rows] = limits[:, n:]
+        for counts, part in zip(result.limited_ticks.values(), np.hsplit(limits, 2), strict=True):
+            counts[rows] = part
         if self._controller is not None:
             self._write_decisions(self._controller)
         measured, errors = (result.pose[rows], result.q[rows]), self._flights.sensors

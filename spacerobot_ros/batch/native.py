@@ -2,8 +2,8 @@
 
 CasADi functions become C++ in which every number is replaced by a vector register;
 ``driver.hpp`` loops over ticks and groups of lanes. Everything shared by Python and C++ is declared
-once, here, and generated as C++: the rows of a group's memory (:class:`RowLayout`), the
-enumerations, and :class:`Job`. :class:`BatchController` is a controller as such a function.
+once, here, and generated as C++: the rows of a group's memory, the enumerations, and :class:`Job`.
+:class:`BatchController` is a controller as such a function.
 """
 
 from __future__ import annotations
@@ -287,31 +287,6 @@ class Job(ctypes.Structure):
 _JOB = ctypes.POINTER(Job)
 
 
-class RowLayout:
-    """The rows of a group's memory by name; a row contains one value for each flight in the
-    group."""
-
-    def __init__(self, sizes: Mapping[str, int]) -> None:
-        self.slices: dict[str, slice] = {}
-        end = 0
-        for name, size in sizes.items():
-            self.slices[name] = slice(end, end + size)
-            end += size
-        self.total_rows = end
-
-    def __getitem__(self, name: str) -> slice:
-        return self.slices[name]
-
-    def first_row(self, name: str, offset: int = 0) -> int:
-        """Return the first row with the given name, or the row ``offset`` rows later."""
-        return int(self.slices[name].start) + offset
-
-    def row_count(self, name: str) -> int:
-        """Return the number of rows with the given name."""
-        rows = self.slices[name]
-        return int(rows.stop - rows.start)
-
-
 @dataclass(frozen=True)
 class CompiledTick:
     """The compiled tick for flights that differ only in numerical values, and its memory layout."""
@@ -320,8 +295,11 @@ class CompiledTick:
     """The functions of ``driver.hpp``, which take a :class:`Job`."""
     target: Target
     """Target on which they run."""
-    memory_layout: RowLayout
-    """Memory layout of a group."""
+    rows: dict[str, slice]
+    """The rows of a group's memory by name; a row contains one value for each flight in the
+    group."""
+    row_count: int
+    """Number of rows of a group."""
     report_width: int
     """Number of values in a report."""
     controller: CoordinatedController | None = None
@@ -386,51 +364,45 @@ class CompiledTick:
         if isinstance(flights.program, ControlledGoals):
             in_lanes = BatchController.of(flights)
             controller, functions["CONTROL"] = in_lanes.controller, in_lanes.function()
-        sizes: dict[str, int] = {}
+        sizes = {
+            **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
+            **{"limits": 2 * n, "peak_rate": n, "peak_effort": n, "failure": 1, "failed_at": 1},
+            **{"peak_wrench": 2, "lowest": n, "highest": n},
+            **{"decision": 1, "decided": 1, "decided_state": 2 * n + 13},
+            **{"ended": 1, "end_state": 2 * n + 20},
+            **{"first_momenta": 6, "drift": 2},
+        }
         for each in functions.values():
             sizes |= {name: each.nnz_in(i) for i, name in enumerate(each.name_in())}
             sizes |= {name: each.nnz_out(i) for i, name in enumerate(each.name_out())}
-        rows = RowLayout(
-            {
-                **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
-                **{"limits": 2 * n, "peak_rate": n, "peak_effort": n, "failure": 1, "failed_at": 1},
-                **{"peak_wrench": 2, "lowest": n, "highest": n},
-                **{"decision": 1, "decided": 1, "decided_state": 2 * n + 13},
-                **{"ended": 1, "end_state": 2 * n + 20},
-                **{"first_momenta": 6, "drift": 2},
-                **sizes,
-            }
-        )
+        *starts, row_count = np.cumsum([0, *sizes.values()]).tolist()
+        first = dict(zip(sizes, starts, strict=True))
         arrays: dict[str, Iterable[int]] = {}
         for kind, each in functions.items():
-            arrays[f"{kind}_ARGUMENTS"] = map(rows.first_row, each.name_in())
-            arrays[f"{kind}_RESULTS"] = map(rows.first_row, each.name_out())
+            arrays[f"{kind}_ARGUMENTS"] = [first[name] for name in each.name_in()]
+            arrays[f"{kind}_RESULTS"] = [first[name] for name in each.name_out()]
         has_stops = effort and np.isfinite([robot.lower, robot.upper]).any()
         if has_stops:
             for name in ("holding_step", "shape_equations"):
                 functions[name.upper()] = model.function(name, compile=False)
-        state, limited = rows.first_row("next_state"), rows.first_row("limited", 1)
-        rates = state + n + 4 if effort else rows.first_row("qdot")
-        efforts = rows.first_row("realised" if effort else "effort")
-        peaks = [
-            (rates, rows.first_row("peak_rate"), n),
-            (efforts, rows.first_row("peak_effort"), n),
-        ]
+        state, limited = first["next_state"], first["limited"] + 1
+        rates = state + n + 4 if effort else first["qdot"]
+        efforts = first["realised" if effort else "effort"]
         report, width = [(state, 0, n), (rates, n, n)], 2 * n
         for name in ("pose", "twist", "momentum", *["place"] * bool(link)):
-            report.append((rows.first_row(name), width, rows.row_count(name)))
-            width += rows.row_count(name)
+            report.append((first[name], width, sizes[name]))
+            width += sizes[name]
         spans = {
             "COPIES": [
-                (rows.first_row(source), rows.first_row(target), rows.row_count(source))
+                (first[source], first[target], sizes[source])
                 for source, target in _FED_BACK.items()
                 if source in sizes
             ],
-            "SUMS": [(limited, rows.first_row("limits"), n if effort else 2 * n)],
-            "PEAKS": peaks,
+            "SUMS": [(limited, first["limits"], n if effort else 2 * n)],
+            "PEAKS": [(rates, first["peak_rate"], n), (efforts, first["peak_effort"], n)],
             "REPORTED": report,
         }
-        constants = {"ROWS": rows.total_rows, "JOINTS": n, "COMMANDS": sizes["command"]}
+        constants = {"ROWS": row_count, "JOINTS": n, "COMMANDS": sizes["command"]}
         constants |= {"REPORT_ROWS": width, "NORMALS": 12 + 2 * n}
         if effort:
             constants |= {"STOP_ROW": limited + n, "REALISED_ROW": efforts}
@@ -439,7 +411,7 @@ class CompiledTick:
         if controller is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
         limits = JointStops.limits(robot) if has_stops else {}
-        declarations = _shared_declarations(rows, constants, arrays, spans, limits)
+        declarations = _shared_declarations(first, constants, arrays, spans, limits)
         entries: dict[str, list[Any]] = {
             "start_flights": [_JOB],
             "fly_until": [_JOB, ctypes.c_longlong],
@@ -447,7 +419,8 @@ class CompiledTick:
         if controller is not None:
             entries |= {"measure_starts": [_JOB], "end_flights": [_JOB]}
         library = target.compile(functions, declarations, entries)
-        return cls(library, target, rows, width, controller)
+        rows = {name: slice(row, row + sizes[name]) for name, row in first.items()}
+        return cls(library, target, rows, row_count, width, controller)
 
 
 _TICK_INPUTS = {
@@ -477,7 +450,7 @@ _FED_BACK = {
 
 
 def _shared_declarations(
-    rows: RowLayout,
+    first: Mapping[str, int],
     constants: Mapping[str, int],
     arrays: Mapping[str, Iterable[int]],
     spans: Mapping[str, Iterable[tuple[int, int, int]]],
@@ -485,7 +458,7 @@ def _shared_declarations(
 ) -> str:
     lines = [f"#define {name} {value}" for name, value in constants.items()]
     lines.append("namespace row {")
-    lines += [f"constexpr long long {name} = {at.start};" for name, at in rows.slices.items()]
+    lines += [f"constexpr long long {name} = {row};" for name, row in first.items()]
     lines.append("}")
     for enum in (Program, Decision):
         members = ", ".join(f"{each.name} = {each.value}" for each in enum)

@@ -292,7 +292,7 @@ class _SteppedLanes(LaneBlock):
             if whole is not self._model:
                 # The first masses with usually zero entries that are nonzero need another model.
                 names = ("state", "before", "momenta", "r_cm")
-                kept = {each: self._read_rows(each) for each in names if each in self._rows.slices}
+                kept = {each: self._read_rows(each) for each in names if each in self._rows}
                 self._lay_out(flights, self._target, self._result)
                 for name, values in kept.items():
                     self._write_rows(name, values)
@@ -302,7 +302,7 @@ class _SteppedLanes(LaneBlock):
 
     def remember_starts(self) -> None:
         names = ("p", "state", "momenta", "r_cm")
-        parts = [self._rows[name] for name in names if name in self._rows.slices]
+        parts = [self._rows[name] for name in names if name in self._rows]
         self._starts = [(part, self._memory[0, part].copy()) for part in parts]
 
     def restart(self, rows: Any, starts: Any) -> Any:

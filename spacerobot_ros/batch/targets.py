@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -286,20 +287,13 @@ class CudaDevice(Target):
             kernels = {entry: module.get_function(entry) for entry in entries}
         except self.arrays.cuda.compiler.CompileException as error:
             raise NoLibraryError(f"NVRTC failed: {str(error).strip().splitlines()[0]}") from error
-        return _Kernels(self, kernels)
+        return SimpleNamespace(**{name: self._launcher(each) for name, each in kernels.items()})
 
-
-class _Kernels:
-    """The driver's functions as kernels, one thread per flight."""
-
-    def __init__(self, device: CudaDevice, kernels: Mapping[str, Any]) -> None:
-        self._device, self._kernels = device, kernels
-
-    def __getattr__(self, name: str) -> Callable[..., None]:
-        kernel = self._kernels[name]
+    def _launcher(self, kernel: Any) -> Callable[..., None]:
+        """Return a function that runs a kernel, one thread per flight of a job."""
 
         def launch(job: Any, *arguments: int) -> None:
-            with self._device.named_errors() as cupy:
+            with self.named_errors() as cupy:
                 on_device = cupy.asarray(np.frombuffer(bytes(job), np.uint8))
                 blocks = -(-job.groups // _THREADS)
                 kernel((blocks,), (_THREADS,), (on_device, *map(np.int64, arguments)))
