@@ -467,23 +467,6 @@ def _repeats(notice: Notice, earlier: Notice) -> bool:
     return same and abs(now - then) < _REPEATED_NOTICE_S
 
 
-class LogPanel:
-    """Events and warnings, newest first."""
-
-    def __init__(self, gui: viser.GuiApi) -> None:
-        self._html = gui.add_html(content.log_html(()))
-        self._notices: deque[Notice] = deque(maxlen=_MAX_SHOWN_NOTICES)
-
-    def add(self, notice: Notice) -> None:
-        """Add a line to the log, unless it repeats one: nodes also log what they publish."""
-        if not any(_repeats(notice, each) for each in islice(self._notices, _REPEATED_NOTICES)):
-            self._notices.appendleft(notice)
-
-    def draw(self) -> None:
-        """Redraw the lines."""
-        self._html.content = content.log_html(self._notices)
-
-
 _ROBOT_PATH = "/robot"
 _OBSTACLES_PATH, _TARGET_PATH = "/obstacles", "/target"
 
@@ -586,6 +569,8 @@ class Page:
         """The last received state, from which users can look back."""
         self._drawn: Measured | None = None
         self._looked_back = False
+        self._notices: deque[Notice] = deque(maxlen=_MAX_SHOWN_NOTICES)
+        """Events and warnings, newest first."""
         self._announced: tuple[Notice, float] | None = None
         """The line at the top, and the wall time, s, until which it is shown."""
         self._build()
@@ -610,7 +595,7 @@ class Page:
         with tabs.add_tab("Faults"):
             self.faults = FaultPanel(gui, defer, self._request, self._refuse)
         with tabs.add_tab("Log"):
-            self._log = LogPanel(gui)
+            self._log = gui.add_html(content.log_html(()))
         look = gui.add_button(
             "Look at the robot", color="gray", hint="Point the camera of this browser at the robot."
         )
@@ -728,11 +713,14 @@ class Page:
         self._table = table
 
     def note(self, notice: Notice) -> None:
-        """Add a line to the log; without a time, it has the time of the last state."""
+        """Add a line to the log, unless it repeats one; without a time, it has the time of the last
+        state."""
         measured = self._state.measured
         if notice.time_s is None and measured is not None:
             notice = replace(notice, time_s=measured.time_s)
-        self._log.add(notice)
+        # Nodes also log what they publish.
+        if not any(_repeats(notice, each) for each in islice(self._notices, _REPEATED_NOTICES)):
+            self._notices.appendleft(notice)
 
     def announce(self, notice: Notice, seconds: float = _ANSWER_TIME_S) -> None:
         """Add a line to the log, and show it at the top of the page for a wall time in s."""
@@ -851,7 +839,7 @@ class Page:
         self._bar.value = 0.0 if flown is None else round(100 * flown, 1)
         self.faults.show(state)
         self._plots.show_budget(shown)
-        self._log.draw()
+        self._log.content = content.log_html(self._notices)
         self.editor.show_flight(flies=content.time_to_go(state) is not None)
         has_tool = content.has_tool(state)
         if has_tool and state.measured is not None and not self.editor.has_tool:
