@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
-from functools import reduce
+from functools import lru_cache, reduce
 from multiprocessing.connection import Connection, Pipe
 from queue import SimpleQueue
 
@@ -312,42 +312,40 @@ class GoalChecker:
 # -- in the process -----------------------------------------------------------------------------
 
 
-class Planner:
-    """Plans from rest like the planner of the stack; keeps the model of the last robot."""
+def answer_question(question: GoalQuestion, cancellation: Cancellation) -> GoalCheck:
+    """Return the check result, planned from rest like by the planner of the stack.
 
-    def __init__(self) -> None:
-        self._built: tuple[str, Mapping[str, str]] | None = None
+    Raises
+    ------
+    PlanningCancelled
+        A newer question has arrived.
+    """
+    try:
+        if question.tool is not None:
+            return _check_arm(question, question.tool)
+        parameters = tuple(question.parameters.items())
+        config, robot, worker = _build_planner(question.urdf, parameters)
+        request = PlanRequest(question.state, question.goal, config.tolerance)
+        schedule = worker.plan(PlanningTask(request), cancellation)
+    except PlanningCancelled:
+        raise
+    except SpaceRobotError as error:
+        return GoalCheck(Verdict.REFUSED, str(error))
+    base = _predicted_end(robot, request, schedule)
+    left_out = _uncontrolled_text(schedule, base, question.goal, request.tolerance)
+    time_s, method = f"{schedule.expected_duration:.4g} s", schedule.method
+    message = f"Reachable in {time_s} with '{method}'.{left_out}"
+    verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
+    return GoalCheck(verdict, message, schedule.positions[-1], base)
 
-    def answer(self, question: GoalQuestion, cancellation: Cancellation) -> GoalCheck:
-        """Return the check result.
 
-        Raises
-        ------
-        PlanningCancelled
-            A newer question has arrived.
-        """
-        try:
-            if question.tool is not None:
-                return _check_arm(question, question.tool)
-            built = question.urdf, question.parameters
-            if built != self._built:
-                self._built = None
-                self._config = planner_config(question.parameters)
-                self._robot = robot_from_text(question.urdf, self._config)
-                self._worker = PlanningWorker(self._robot, self._config)
-                self._built = built
-            request = PlanRequest(question.state, question.goal, self._config.tolerance)
-            schedule = self._worker.plan(PlanningTask(request), cancellation)
-        except PlanningCancelled:
-            raise
-        except SpaceRobotError as error:
-            return GoalCheck(Verdict.REFUSED, str(error))
-        base = _predicted_end(self._robot, request, schedule)
-        left_out = _uncontrolled_text(schedule, base, question.goal, request.tolerance)
-        time_s, method = f"{schedule.expected_duration:.4g} s", schedule.method
-        message = f"Reachable in {time_s} with '{method}'.{left_out}"
-        verdict = Verdict.PARTLY if left_out else Verdict.REACHABLE
-        return GoalCheck(verdict, message, schedule.positions[-1], base)
+@lru_cache(maxsize=1)
+def _build_planner(
+    urdf: str, parameters: tuple[tuple[str, str], ...]
+) -> tuple[PlannerConfig, SpaceRobot, PlanningWorker]:
+    config = planner_config(dict(parameters))
+    robot = robot_from_text(urdf, config)
+    return config, robot, PlanningWorker(robot, config)
 
 
 def _predicted_end(robot: SpaceRobot, request: PlanRequest, schedule: GaitSchedule) -> Array:
@@ -417,7 +415,7 @@ def main(descriptor: int) -> None:
             os._exit(0)
 
         threading.Thread(target=receive_questions, daemon=True).start()
-        planner, number = Planner(), 0
+        number = 0
 
         def send_progress(progress: SearchProgress) -> None:
             connection.send((number, f"{progress.message}, {progress.elapsed_s:.0f} s"))
@@ -428,4 +426,4 @@ def main(descriptor: int) -> None:
                 connection.send((number, None))
                 if question is not None and not cancellation.requested:
                     with suppress(PlanningCancelled):
-                        connection.send((number, planner.answer(question, cancellation)))
+                        connection.send((number, answer_question(question, cancellation)))

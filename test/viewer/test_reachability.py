@@ -30,8 +30,8 @@ from spacerobot_ros.viewer.reachability import (
     GoalCheck,
     GoalChecker,
     GoalQuestion,
-    Planner,
     Verdict,
+    answer_question,
     goal_tolerance,
     make_question,
     planned_goal,
@@ -54,7 +54,7 @@ def question(*position: float, **parameters: object) -> GoalQuestion:
 
 
 def test_an_answer_is_what_the_planner_would_plan() -> None:
-    answer = Planner().answer(question(0.1, 0.0, 0.05, tick_rate=10.0), Cancellation())
+    answer = answer_question(question(0.1, 0.0, 0.05, tick_rate=10.0), Cancellation())
     own = plan(
         "sliding_masses", position=(0.1, 0.0, 0.05), method="lie_bracket", t1=4.0, cycles=0,
         control_period=0.1,
@@ -71,7 +71,7 @@ def test_an_answer_is_what_the_planner_would_plan() -> None:
 def test_joint_positions_of_a_goal_are_asked_for_and_a_method_without_them_says_so() -> None:
     asked = question(0.1, 0.0, 0.05)
     wanted = replace(asked, goal=replace(asked.goal, joint_positions=np.array([0.1, -0.05, 0.2])))
-    answer = Planner().answer(wanted, Cancellation())
+    answer = answer_question(wanted, Cancellation())
     assert answer.verdict == Verdict.PARTLY
     assert "'lie_bracket' does not control the final joint positions" in answer.message
 
@@ -84,15 +84,15 @@ def arm_question(*position: float) -> GoalQuestion:
 
 def test_goal_components_that_a_method_does_not_control_are_named_with_their_errors() -> None:
     chain = arm_question(0.3, -0.4, 0.0)
-    answer = Planner().answer(chain, Cancellation())
+    answer = answer_question(chain, Cancellation())
     assert answer.verdict == Verdict.PARTLY, answer
     assert "'area_loop' does not control the position: it ends 0.5 m off." in answer.message
     hand = Goal.of_end_effectors([EndEffectorGoal("link_3", np.ones(3))])
-    refused = Planner().answer(replace(chain, goal=hand), Cancellation())
+    refused = answer_question(replace(chain, goal=hand), Cancellation())
     assert refused.verdict == Verdict.REFUSED
     assert refused.message.startswith("area_loop plans for the base pose")
     here = replace(chain, goal=Goal.checked([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]))
-    answer = Planner().answer(here, Cancellation())
+    answer = answer_question(here, Cancellation())
     assert answer.verdict == Verdict.REACHABLE
     assert "control" not in answer.message
 
@@ -104,7 +104,7 @@ def test_a_base_whose_position_is_not_controlled_ends_where_the_centre_of_mass_s
     asked = arm_question(0.3, -0.4, 0.0)
     turned = Goal.from_rotvec([0.3, -0.4, 0.0], [0.05, -0.03, 0.09])
     state = replace(asked.state, q=np.array([0.4, -0.9, 1.1]))
-    answer = Planner().answer(replace(asked, goal=turned, state=state), Cancellation())
+    answer = answer_question(replace(asked, goal=turned, state=state), Cancellation())
     assert answer.verdict == Verdict.PARTLY, answer
     assert answer.base is not None
     assert answer.shape is not None
@@ -120,20 +120,19 @@ def test_a_base_whose_position_is_not_controlled_ends_where_the_centre_of_mass_s
 
 
 def test_a_refusal_has_the_sentence_of_the_planner_and_the_next_goal_is_planned() -> None:
-    planner = Planner()
-    refused = planner.answer(question(9.0, 0.0, 0.0), Cancellation())
+    refused = answer_question(question(9.0, 0.0, 0.0), Cancellation())
     assert refused.verdict == Verdict.REFUSED
     assert "slider" in refused.message or "limits" in refused.message
-    wrong = planner.answer(question(0.1, 0.0, 0.0, method="none"), Cancellation())
+    wrong = answer_question(question(0.1, 0.0, 0.0, method="none"), Cancellation())
     assert (wrong.verdict, "method" in wrong.message) == (Verdict.REFUSED, True)
-    assert planner.answer(question(0.1, 0.0, 0.0), Cancellation()).verdict == (Verdict.REACHABLE)
+    assert answer_question(question(0.1, 0.0, 0.0), Cancellation()).verdict == (Verdict.REACHABLE)
 
 
 def test_a_cancelled_check_has_no_answer() -> None:
     cancellation = Cancellation()
     cancellation.cancel()
     with pytest.raises(PlanningCancelled):
-        Planner().answer(question(0.1, 0.0, 0.0, method="optimal"), cancellation)
+        answer_question(question(0.1, 0.0, 0.0, method="optimal"), cancellation)
 
 
 @pytest.mark.slow
@@ -145,7 +144,7 @@ def test_goals_of_links_are_planned_for_and_the_base_ends_where_the_plan_has_it(
     aim = EndEffectorGoal(link, np.array([1.3, 0.9, 0.8]))
     start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), q)
     asked = GoalQuestion(robot.urdf, texts, start, Goal.of_end_effectors([aim]))
-    answer = Planner().answer(asked, Cancellation())
+    answer = answer_question(asked, Cancellation())
     assert answer.verdict == Verdict.REACHABLE, answer
     assert re.fullmatch(r"Reachable in [\d.]+ s with 'resolved_rate'\.", answer.message)
     assert answer.shape is not None
@@ -156,7 +155,7 @@ def test_goals_of_links_are_planned_for_and_the_base_ends_where_the_plan_has_it(
     np.testing.assert_allclose(at, aim.position, atol=5e-3)
     assert np.linalg.norm(answer.base[:3]) > 0.01
     far = Goal.of_end_effectors([replace(aim, position=np.array([9.0, 0.0, 0.0]))])
-    assert Planner().answer(replace(asked, goal=far), Cancellation()).verdict == Verdict.REFUSED
+    assert answer_question(replace(asked, goal=far), Cancellation()).verdict == Verdict.REFUSED
 
 
 def test_goals_by_part_are_one_goal_of_a_planner() -> None:
@@ -269,14 +268,14 @@ def test_the_arm_of_a_controlled_robot_reaches_its_goal_or_not() -> None:
         base, tool = Goal(at[:3], turned), Goal(r, Rotation.from_matrix(R).as_quat())
         start = RobotState(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(6))
         near = GoalQuestion(urdf, {}, start, base, tool, link)
-        answer = Planner().answer(near, Cancellation())
+        answer = answer_question(near, Cancellation())
         assert answer.verdict == Verdict.REACHABLE, answer
         shape = np.array(answer.shape)
         assert np.all((lower - 1e-6 <= shape) & (shape <= upper + 1e-6))
         _, reached = oracle.link_pose(link, shape, at)
         np.testing.assert_allclose(reached, tool.position, atol=1e-3)
     far = Goal(tool.position + np.array([9.0, 0.0, 0.0]), tool.quaternion)
-    answer = Planner().answer(replace(near, tool=far), Cancellation())
+    answer = answer_question(replace(near, tool=far), Cancellation())
     assert answer.verdict == Verdict.REFUSED
     assert "m and" in answer.message
 
@@ -293,7 +292,7 @@ def test_an_attitude_that_the_law_leaves_free_refuses_no_goal() -> None:
         texts = {"end_effector_outputs": json.dumps(outputs)}
         asked = make_question(state, goals, robot, {"controller": texts})
         assert isinstance(asked, GoalQuestion)
-        verdicts[outputs] = Planner().answer(asked, Cancellation()).verdict
+        verdicts[outputs] = answer_question(asked, Cancellation()).verdict
     assert verdicts == {
         "": Verdict.REACHABLE,
         "x y": Verdict.REACHABLE,
