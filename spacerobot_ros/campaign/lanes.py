@@ -385,7 +385,8 @@ class _ControlledLanes:
             return "its gains are matrices; use engine 'flights'"
         if law.fixed_inputs is None:
             return f"the law '{law.name}' with these options is not a single function"
-        for key, goal in _goals_by_frame(scenario).items():
+        goals = {"base": scenario.goal, "end_effector": scenario.end_effector_goal}
+        for key, goal in goals.items():
             if goal is not None and not getattr(law.outputs.selection, key):
                 return f"the law '{law.name}' does not control the {key.replace('_', '-')}"
         if controlled_parts(law.outputs.selection.base) != POSE:
@@ -409,13 +410,12 @@ class _ControlledLanes:
         invalid."""
         scenario = campaign.scenario
         drawn = [each.flight for each in batch]
-        goals = [_goals_by_frame(each.scenario) for each in drawn]
         dispersed = _any_begins(campaign.names, _GAIN_PREFIX)
         gains = tuple(each.scenario.controller.gains for each in drawn) if dispersed else ()
         program = ControlledGoals(
             scenario.controller,
-            base=_goal_poses([each["base"] for each in goals]),
-            end_effector=_goal_poses([each["end_effector"] for each in goals]),
+            base=_goal_poses([each.scenario.goal for each in drawn]),
+            end_effector=_goal_poses([each.scenario.end_effector_goal for each in drawn]),
             gains=gains,
             robot=nominal_robots(scenario).controller,
             ends_when_decided=True,
@@ -434,7 +434,11 @@ class _ControlledLanes:
         flights: Flights,
     ) -> Iterator[Measures | str]:
         """Yield the measures of each flight, or the reason for a fallback."""
-        n = flights.robot.n
+        n, program = flights.robot.n, flights.program
+        assert isinstance(program, ControlledGoals)
+        law_type = LAWS[program.config.law]
+        outputs = controlled_outputs(program.robot or flights.robot, program.config, law_type)
+        turns = any(axis.startswith("r") for axis in outputs.end_effector)
         for row, ready in enumerate(batch):
             scenario = ready.flight.scenario
             decision, decided = Decision(result.decision[row]), int(result.decision_tick[row])
@@ -450,7 +454,6 @@ class _ControlledLanes:
             end = result.end_state[row]
             q, pose = end[:n], end[2 * n : 2 * n + 7]
             hand = _end_effector_error(flights.robot, ready.flight, q, pose)
-            turns = hand is not None and _turns_end_effector(flights)
             duration = int(result.end_tick[row]) * scenario.plant.period_ns / SECOND
             if decision is Decision.NONE:
                 outcome, flown = Outcome.INTERRUPTED, duration
@@ -474,7 +477,7 @@ class _ControlledLanes:
                 highest=np.maximum(result.highest[row], q),
                 momentum_drift=result.momentum_drift[row],
                 end_effector_distance=math.nan if hand is None else hand.distance,
-                end_effector_angle=math.nan if hand is None or not turns else hand.angle,
+                end_effector_angle=hand.angle if turns and hand is not None else math.nan,
                 plan_time=0.0,
             )
 
@@ -524,14 +527,6 @@ def _end_effector_error(
     return PoseError.between(*end_effector_pose(robot, link, pose[:3], pose[3:], q), goal)
 
 
-def _turns_end_effector(flights: Flights) -> bool:
-    program = flights.program
-    assert isinstance(program, ControlledGoals)
-    law_type = LAWS[program.config.law]
-    outputs = controlled_outputs(program.robot or flights.robot, program.config, law_type)
-    return any(axis.startswith("r") for axis in outputs.end_effector)
-
-
 def _decide_goal(
     scenario: Scenario, schedule: GaitSchedule, pose: Array, q: Array
 ) -> tuple[Outcome, str] | str:
@@ -559,10 +554,6 @@ def _evaluated_ticks(ticks: int) -> Array:
     """
     spacing = 1 << max(0, math.ceil(math.log2(ticks / _STATES_PER_FLIGHT)))
     return np.append(np.arange(0, ticks, spacing), ticks)
-
-
-def _goals_by_frame(scenario: Scenario) -> dict[str, Goal | None]:
-    return {"base": scenario.goal, "end_effector": scenario.end_effector_goal}
 
 
 def _goal_poses(goals: Sequence[Goal | None]) -> Array | None:

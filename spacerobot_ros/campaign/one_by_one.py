@@ -14,7 +14,6 @@ from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draw, drawn_flight
 from spacerobot_ros.campaign.targets import DrawnFlight, description_of
 from spacerobot_ros.errors import SpaceRobotError
-from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import Robots, fly_scenario, require_flyable
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
@@ -50,23 +49,18 @@ class FlightsEngine:
             if stopped():
                 return
             try:
-                flown = self.fly_draw(campaign, drawn_flight(campaign, draw, common), stopped)
+                flight = drawn_flight(campaign, draw, common)
+                flown = fly_scenario(
+                    flight.seeded_scenario,
+                    robots=robots_of(flight),
+                    progress=lambda now, end: stopped(),
+                    longest=campaign.max_flight_time,
+                )
                 if stopped() and flown.outcome is Outcome.INTERRUPTED:
                     return
                 yield Row.of(campaign, draw, flown, self.name)
             except Exception as error:  # The error becomes a row with its message as the reason.
                 yield Row.of_error(draw, error, self.name)
-
-    def fly_draw(
-        self, campaign: Campaign, flight: DrawnFlight, stopped: Callable[[], bool] = lambda: False
-    ) -> Flight:
-        """Fly one draw; raise :class:`.SpaceRobotError` if it is refused."""
-        return fly_scenario(
-            flight.seeded_scenario,
-            robots=robots_of(flight),
-            progress=lambda now, end: stopped(),
-            longest=campaign.max_flight_time,
-        )
 
 
 def robots_of(flight: DrawnFlight) -> Robots:
@@ -94,10 +88,10 @@ def nominal_robots(scenario: Scenario) -> Robots:
     def build(node: str, config: RobotConfig) -> SpaceRobot | None:
         # Commanders without a robot parameter use the plant's robot.
         text = config.robot_description or ("" if config.robot else plant)
-        error, seed = 0.0, 0
+        errors: tuple[float, int] | tuple[()] = ()
         if isinstance(config, AssumedRobotConfig):
-            error, seed = config.model_error, config.model_error_seed
-        return _build_robot(node, text, config.robot, config.world, error, seed)
+            errors = config.model_error, config.model_error_seed
+        return _build_robot(node, AssumedRobotConfig(text, config.robot, config.world, *errors))
 
     return Robots.of(scenario, build)
 
@@ -123,19 +117,15 @@ def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
 
 def plant_robot(flight: DrawnFlight) -> SpaceRobot:
     """Return the plant's robot without mass dispersions."""
-    robot = _build_robot("plant", flight.nominal.urdf, "", "", 0.0, 0)
+    robot = _build_robot("plant", AssumedRobotConfig(flight.nominal.urdf))
     assert robot is not None
     return robot
 
 
 @lru_cache(maxsize=32)
-def _build_robot(
-    node: str, text: str, name: str, world: str, error: float, seed: int
-) -> SpaceRobot | None:
+def _build_robot(node: str, config: AssumedRobotConfig) -> SpaceRobot | None:
     # Each node has its own robot, because a robot's functions have buffers.
-    if error:
-        return robot_of(AssumedRobotConfig(text, name, world, error, seed))
-    return robot_of(RobotConfig(text, name, world))
+    return robot_of(config)
 
 
 class FirstPlans:

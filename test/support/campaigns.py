@@ -9,8 +9,9 @@ from typing import Any
 from spacerobot_ros.campaign.config import Campaign, parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.one_by_one import FlightsEngine
+from spacerobot_ros.campaign.one_by_one import robots_of
 from spacerobot_ros.flight.flight import Flight
+from spacerobot_ros.flight.lockstep import fly_scenario
 
 SHORT = {
     "scenario": "faults/stuck_slider",
@@ -32,7 +33,9 @@ def campaign(**given: Any) -> Campaign:
 def flown(made: Campaign, number: int = 0) -> tuple[Flight, dict[str, Any]]:
     """Fly one draw; return the flight and what was drawn."""
     draw = Draws(made)[number]
-    return FlightsEngine().fly_draw(made, drawn_flight(made, draw)), dict(draw.values)
+    drawn = drawn_flight(made, draw)
+    robots, longest = robots_of(drawn), made.max_flight_time
+    return fly_scenario(drawn.seeded_scenario, robots=robots, longest=longest), dict(draw.values)
 
 
 def written(folder: Path, made: Campaign, rows: Sequence[Row]) -> Dataset:
