@@ -476,10 +476,9 @@ def momentum_html(state: StackState) -> str:
     return padded(f"<b>Angular momentum</b>{_table_html(rows)}{dumping * command.dumping}")
 
 
-def has_tool(state: StackState) -> bool:
-    """Whether the end-effector accepts goals: a controller is running, and the end-effector pose is
-    known."""
-    return state.controller is not None and state.tool is not None
+def steered_tool(state: StackState) -> Array | None:
+    """Return the end-effector pose (7,) if a controller accepts goals for it, otherwise None."""
+    return None if state.controller is None else state.tool
 
 
 # -- faults -------------------------------------------------------------------------------------

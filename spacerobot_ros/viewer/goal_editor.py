@@ -157,18 +157,6 @@ class GoalEditor:
         """Whether the editor has a goal."""
         return BASE_GOAL_KEY in self._poses
 
-    @property
-    def has_tool(self) -> bool:
-        """Whether the editor has an end-effector goal."""
-        return _TOOL in self._poses
-
-    def add_tool(self, pose: Array | None) -> None:
-        """Add an end-effector goal at a pose (7,)."""
-        if pose is not None and self.placed:
-            self._add_gizmo(_TOOL)
-            self._move_gizmo(_TOOL, pose)
-            self.touch(time.monotonic())
-
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
         """Start again with another robot, in an empty scene; None: no robot."""
         self._gizmos.clear()
@@ -196,7 +184,7 @@ class GoalEditor:
         self._move_gizmo(BASE_GOAL_KEY, base)
         for link in self._parts.links:
             self._place_link_gizmo(link)
-        if tool is not None and self.has_tool:
+        if tool is not None and _TOOL in self._gizmos:
             self._move_gizmo(_TOOL, tool)
         self.update_robot(base, q)
         self._show_fields()
@@ -230,7 +218,7 @@ class GoalEditor:
         self._parts.choose(asked)
         if base is not None:
             self._move_gizmo(BASE_GOAL_KEY, _pose_of(base))
-        if tool is not None and not tool.end_effectors and self.has_tool:
+        if tool is not None and not tool.end_effectors and _TOOL in self._gizmos:
             self._move_gizmo(_TOOL, _pose_of(tool))
         for link, aim in links.items():
             self._place_link_gizmo(link)
@@ -301,20 +289,31 @@ class GoalEditor:
         bent = float(np.abs(shape - q).max(initial=0.0))
         return max(distance / self._reach, turned, bent) < _HIDDEN_GHOST_DISTANCE
 
-    def show_flight(self, *, flies: bool) -> None:
-        """Hide the gizmos while the robot flies to the displayed goal."""
+    def show_parts(self, *, tool: Array | None, planned: bool, flies: bool) -> None:
+        """Show the controls for the parts that accept goals.
+
+        Parameters
+        ----------
+        tool
+            Pose (7,) of the end-effector of a controller, where its goal begins; None: it does not
+            accept goals.
+        planned
+            Whether a planner accepts goals: for end-effectors, and for final joint positions.
+        flies
+            Whether the robot flies to its goal; if this is the displayed goal, the gizmos are
+            hidden.
+        """
+        if tool is not None and self.placed and _TOOL not in self._gizmos:
+            self._add_gizmo(_TOOL)
+            self._move_gizmo(_TOOL, tool)
+            self.touch(time.monotonic())
         in_flight = flies and self.shows_sent_goal
         if in_flight != self._in_flight:
             self._in_flight = in_flight
             self._show_parts()
-
-    def show_parts(self, *, tool: bool, planned: bool) -> None:
-        """Show or hide the controls for the end-effector of a controller, and the controls for
-        planners: the choice of end-effectors, and the final joint positions.
-        """
-        self._tool_too.visible = tool
+        self._tool_too.visible = tool is not None
         if _TOOL in self._gizmos:
-            shown = tool and self._tool_too.value and not self._in_flight
+            shown = self._tool_too.visible and self._tool_too.value and not in_flight
             self._gizmos[_TOOL].visible = shown
         self._parts.show(visible=planned)
         self._final.show(visible=planned)
@@ -354,7 +353,7 @@ class GoalEditor:
         goals: dict[Part, Goal] = {}
         if self._parts.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING:
             goals[BASE_GOAL_KEY] = self._goal_at(BASE_GOAL_KEY, shape)
-        if self._tool_too.visible and self._tool_too.value and self.has_tool:
+        if self._tool_too.visible and self._tool_too.value and _TOOL in self._gizmos:
             goals[DEFAULT_END_EFFECTOR] = self._goal_at(_TOOL)
         for link, asked in self._parts.requested_links().items():
             pose = self._poses[link]
@@ -449,7 +448,7 @@ class GoalEditor:
     def _set_goal(self, part: Part, pose: Array) -> None:
         before = self._poses.get(part, pose)
         self._poses[part] = pose
-        if part == BASE_GOAL_KEY and self.has_tool:
+        if part == BASE_GOAL_KEY and _TOOL in self._gizmos:
             self._move_gizmo(_TOOL, move_along(self._poses[_TOOL], before, pose))
         self._mark_changed()
 

@@ -117,11 +117,11 @@ class TimeLine:
         self._act = act
         self._folder = gui.add_folder("Replay", visible=False)
         with self._folder:
-            self._buttons = gui.add_button_group("Replay", ("Play", "Hold"))
+            buttons = gui.add_button_group("Replay", ("Play", "Hold"))
             self._slider: Any = gui.add_slider("Time (s)", 0.0, 1.0, 1e-3, 0.0)
         self._duration = 0.0
         self._left_alone_until = -math.inf
-        react(self._buttons.on_click, defer, lambda label: act(Request(label.lower())))
+        react(buttons.on_click, defer, lambda label: act(Request(label.lower())))
         react(self._slider.on_update, defer, self._seek)
 
     def show(self, state: StackState, now: float) -> None:
@@ -274,20 +274,20 @@ class Plots:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._gui = gui
-        self._tab_group = gui.add_tab_group()
-        self._error_tab = self._tab_group.add_tab("Errors")
+        tabs = gui.add_tab_group()
+        self._error_tab = tabs.add_tab("Errors")
         with self._error_tab:
             self._logarithmic: Any = gui.add_checkbox("Logarithmic", initial_value=False)
             self._no_errors: Any = gui.add_html(content.hint_html("No goal is pursued."))
         self._errors: dict[tuple[Part, int], _Plot] = {}
-        with self._tab_group.add_tab("Momentum"):
+        with tabs.add_tab("Momentum"):
             # In millionths, because axis labels have three decimals.
             units = ("1e-6 kg m/s", "1e-6 kg m²/s")
             self._momentum = _Plot(gui, "Momentum drift", units, 1.0, units)
             self._budget_text = gui.add_html("")
             self._budget = _Plot(gui, "Momentum budget (N m s)", BUDGET_PARTS, 0.01)
             self._budget.handle.visible = False
-        self._joint_tab = self._tab_group.add_tab("Shape")
+        self._joint_tab = tabs.add_tab("Shape")
         self._shape: _Plot | None = None
         self._first: Array | None = None
 
@@ -840,12 +840,10 @@ class Page:
         self.faults.show(state)
         self._plots.show_budget(shown)
         self._log.content = content.log_html(self._notices)
-        self.editor.show_flight(flies=content.time_to_go(state) is not None)
-        has_tool = content.has_tool(state)
-        if has_tool and state.measured is not None and not self.editor.has_tool:
-            self.editor.add_tool(state.tool)
-        steered, planned = state.replay is None, state.planner is not None
-        self.editor.show_parts(tool=has_tool and steered, planned=planned and steered)
+        steered, flies = state.replay is None, content.time_to_go(state) is not None
+        tool = content.steered_tool(state) if steered else None
+        planned = steered and state.planner is not None
+        self.editor.show_parts(tool=tool, planned=planned, flies=flies)
 
     def _is_due(self, part: str, period: float) -> bool:
         if self._now < self._due.get(part, 0.0):
@@ -885,7 +883,7 @@ class Page:
     def _goal_to_robot(self) -> None:
         measured = self._state.measured
         if measured is not None and self._robot is not None:
-            tool = self._state.tool if content.has_tool(self._state) else None
+            tool = content.steered_tool(self._state)
             self.editor.place(measured.pose, tool, measured.q, self._now)
 
     def _refuse(self, message: str) -> None:

@@ -96,7 +96,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for() -> None:
     q = np.array([0.05, -0.1, 0.15])
     page.editor.place(POSE, None, q, 0.0)
     assert not page.field(FINAL).visible, "no planner is there"
-    page.editor.show_parts(tool=False, planned=True)
+    page.editor.show_parts(tool=None, planned=True, flies=False)
     assert page.field(FINAL).visible
     assert not page.field("At the end").visible
     goal = page.editor.goals()["base"]
@@ -122,7 +122,7 @@ def test_a_goal_ends_in_the_joint_positions_that_are_asked_for() -> None:
     moved = [float(np.linalg.norm(a - b)) for a, b in zip(page.ghost(), at_rest, strict=True)]
     np.testing.assert_allclose(moved, [0.02, 0.02, 0.35], atol=1e-9)
     # Without a planner nobody takes it.
-    page.editor.show_parts(tool=False, planned=False)
+    page.editor.show_parts(tool=None, planned=False, flies=False)
     assert not page.field("At the end").visible
     assert page.editor.goals()["base"].joint_positions is None
 
@@ -164,7 +164,7 @@ def test_the_ghost_is_not_drawn_where_the_robot_is() -> None:
 
 def test_fields_of_joints_stay_within_their_limits() -> None:
     page = Editor("servicer")
-    page.editor.show_parts(tool=False, planned=True)
+    page.editor.show_parts(tool=None, planned=True, flies=False)
     page.editor.place(POSE, None, np.full(6, 100.0), 0.0)
     page.set(FINAL, True)
     shape, upper = page.shape, page.robot.limits("upper")
@@ -187,8 +187,7 @@ def test_a_goal_of_the_end_effector_that_appears_is_checked() -> None:
     assert goals is not None
     assert set(goals) == {"base"}
     assert page.editor.settled_goals(LATER) is None, "it is checked once"
-    page.editor.add_tool(np.array([1.0, 0, 0, 0, 0, 0, 1]))
-    page.editor.show_parts(tool=True, planned=False)
+    page.editor.show_parts(tool=np.array([1.0, 0, 0, 0, 0, 0, 1]), planned=False, flies=False)
     goals = page.editor.settled_goals(LATER)
     assert goals is not None
     assert set(goals) == {"base", "end_effector"}
@@ -224,7 +223,7 @@ def two_hands() -> Editor:
     page = Editor("dual_arm")
     page.editor.offer_end_effectors(HANDS)
     page.editor.place(STANDING, None, np.linspace(0.1, 0.7, 14), 0.0)
-    page.editor.show_parts(tool=False, planned=True)
+    page.editor.show_parts(tool=None, planned=True, flies=False)
     return page
 
 
@@ -357,18 +356,18 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     page = two_hands
     page.set(HANDS[0], "position")
     shape = np.full(14, 0.5)
-    page.editor.show_parts(tool=False, planned=True)
+    page.editor.show_parts(tool=None, planned=True, flies=False)
     page.set(FINAL, True)
     for field, position in zip(page.ends, shape, strict=True):
         field.value = position
     asked = page.editor.goals()[HANDS[0]].joint_positions
     assert asked is not None
     np.testing.assert_array_equal(asked, shape)
-    page.editor.show_parts(tool=False, planned=False)
+    page.editor.show_parts(tool=None, planned=False, flies=False)
     assert not page.field("Goal for").visible
     assert not gizmo(page, HANDS[0]).visible
     assert set(page.editor.goals()) == {"base"}
-    page.editor.show_parts(tool=False, planned=True)
+    page.editor.show_parts(tool=None, planned=True, flies=False)
     assert set(page.editor.goals()) == {HANDS[0]}, "as it was chosen"
     assert gizmo(page, HANDS[0]).visible
     # A recording takes no goals; after it everything is as before.
@@ -389,7 +388,7 @@ def test_hands_are_offered_while_a_planner_is_there(two_hands: Editor) -> None:
     page.editor.settled_goals(LATER)
     page.editor.offer_end_effectors(())
     assert page.editor.moving, "the goal is another one"
-    page.editor.show_parts(tool=False, planned=True)
+    page.editor.show_parts(tool=None, planned=True, flies=False)
     assert not page.field("Goal for").visible
     assert not gizmo(page, HANDS[0]).visible
     assert set(page.editor.goals()) == {"base"}
@@ -441,7 +440,7 @@ def test_goals_of_links_that_others_send_are_shown_with_their_parts() -> None:
     editor.follow(sent, 1.0)
     assert set(editor.goals()) == {"base"}, "the page offers no goals of links yet"
     editor.offer_end_effectors([link])
-    editor.show_parts(tool=False, planned=True)
+    editor.show_parts(tool=None, planned=True, flies=False)
     editor.follow(sent, 2.0)
     found = editor.goals()
     assert set(found) == {link}
