@@ -205,8 +205,14 @@ def test_goals_are_shifted_in_the_world(scenario: Scenario) -> None:
 
 def test_joints_start_as_near_to_zero_as_their_limits_allow() -> None:
     plain = campaign().scenario
-    flight = targets_of("initial.joints.slider_1", plain)[0].apply(DrawnFlight.of(plain), 0.25)
-    assert flight.scenario.plant.initial_joint_positions == (0.25, 0.0, 0.0)
+    urdf = description_of(plain).urdf.replace('lower="-2.5"', 'lower="0.5"', 1)
+    beyond = plain.with_overrides("plant", {"robot_description": urdf})
+    for name, start in (
+        ("initial.joints.slider_1", (0.75, 0.0, 0.0)),
+        (f"{SHAPE}[1]", (0.5, 0.25, 0)),
+    ):
+        flight = targets_of(name, beyond)[0].apply(DrawnFlight.of(beyond), 0.25)
+        assert flight.scenario.plant.initial_joint_positions == start
 
 
 def test_the_parts_of_a_fault_are_drawn_in_any_order(scenario: Scenario) -> None:
