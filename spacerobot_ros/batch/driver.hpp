@@ -474,8 +474,8 @@ static void start(const Job &job, long long g, V *group) {
 }
 
 // Fly a group until a tick, or until lanes need Python for a command: the group is then pending.
-static void fly(const Job &job, long long g, V *group, long long until) {
-  while (job.at[g] < until && any(group[row::alive])) {
+static void fly(const Job &job, long long g, V *group) {
+  while (job.at[g] < job.until && any(group[row::alive])) {
     const long long tick = job.at[g];
 #ifdef CONTROL
     const bool report = true;
@@ -532,8 +532,8 @@ ENTRY_POINT start_flights(const Job *job) {
   each_group(*job, [=](long long g, V *group) { start(*job, g, group); });
 }
 
-ENTRY_POINT fly_until(const Job *job, long long until) {
-  each_group(*job, [=](long long g, V *group) { fly(*job, g, group, until); });
+ENTRY_POINT fly_until(const Job *job) {
+  each_group(*job, [=](long long g, V *group) { fly(*job, g, group); });
 }
 
 #ifdef CONTROL

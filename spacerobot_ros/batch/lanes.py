@@ -252,9 +252,9 @@ class LaneBlock:
 
     def fly(self, stopped: Callable[[], bool]) -> None:
         """Fly the flights and write the results, unless stopped."""
-        flights, job, library = self._flights, self._job, self._tick.library
+        flights = self._flights
         # A zero-duration tick without a command reports the start.
-        library.start_flights(job)
+        self._call("start_flights")
         self._memory[:, self._rows["h"]] = flights.control_period
         for begin in range(0, flights.ticks, _CHUNK_TICKS):
             if stopped():
@@ -266,14 +266,18 @@ class LaneBlock:
                 self._begin_control()
             self._fly_until(min(begin + _CHUNK_TICKS, flights.ticks))
         if self._controller is not None:
-            library.end_flights(job)
+            self._call("end_flights")
         self._write_results()
 
+    def _call(self, function: str) -> None:
+        self._target.call(self._tick.driver, function, self._job)
+
     def _fly_until(self, tick: int) -> None:
-        self._tick.library.fly_until(self._job, tick)
+        self._job.until = tick
+        self._call("fly_until")
         while self._controller is not None and self._pending.any():
             self._command_outside_lanes()
-            self._tick.library.fly_until(self._job, tick)
+            self._call("fly_until")
         if self._memory[:, self._rows["failure"]].any():
             reasons, ticks = self._read_rows("failure")[:, 0], self._read_rows("failed_at")[:, 0]
             for lane in np.flatnonzero(reasons).tolist():
@@ -289,7 +293,7 @@ class LaneBlock:
         controller = self._controller
         if controller is None:
             return
-        self._tick.library.measure_starts(self._job)
+        self._call("measure_starts")
         states = self._read_rows("measured")
         numbers = np.zeros_like(self._read_rows("profile"))
         most = np.zeros_like(self._read_rows("bounds"))

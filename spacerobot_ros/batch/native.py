@@ -256,6 +256,7 @@ _JOB_MEMBERS = (
     ("V *", "memory", "(groups, ROWS)"),
     ("long long", "groups", ""),
     ("long long *", "at", "(groups,) the next tick"),
+    ("long long", "until", "fly_until: the first tick that is not flown"),
     ("unsigned char *", "pending", "(groups,) whether lanes wait for commands"),
     ("double", "period", "s"),
     ("long long", "period_ns", ""),
@@ -284,15 +285,12 @@ class Job(ctypes.Structure):
     _fields_ = [(name, _MEMBER_TYPES.get(kind, ctypes.c_void_p)) for kind, name, _ in _JOB_MEMBERS]
 
 
-_JOB = ctypes.POINTER(Job)
-
-
 @dataclass(frozen=True)
 class CompiledTick:
     """The compiled tick for flights that differ only in numerical values, and its memory layout."""
 
-    library: Any
-    """The functions of ``driver.hpp``, which take a :class:`Job`."""
+    driver: Any
+    """The functions of ``driver.hpp``; see :meth:`.Target.call`."""
     target: Target
     """Target on which they run."""
     rows: dict[str, slice]
@@ -412,15 +410,9 @@ class CompiledTick:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
         limits = JointStops.limits(robot) if has_stops else {}
         declarations = _shared_declarations(first, constants, arrays, spans, limits)
-        entries: dict[str, list[Any]] = {
-            "start_flights": [_JOB],
-            "fly_until": [_JOB, ctypes.c_longlong],
-        }
-        if controller is not None:
-            entries |= {"measure_starts": [_JOB], "end_flights": [_JOB]}
-        library = target.compile(functions, declarations, entries)
+        driver = target.compile(functions, declarations)
         rows = {name: slice(row, row + sizes[name]) for name, row in first.items()}
-        return cls(library, target, rows, row_count, width, controller)
+        return cls(driver, target, rows, row_count, width, controller)
 
 
 _TICK_INPUTS = {

@@ -317,7 +317,7 @@ class _SteppedLanes(LaneBlock):
         # A zero-duration tick reports the start; it leaves groups without starts unchanged.
         self._write_rows("h", 0.0, rows)
         self._instants[0] = 0
-        self._tick.library.start_flights(self._job)
+        self._call("start_flights")
         self._write_rows("h", self._flights.control_period, rows)
         return self._reports_of_flights()[rows]
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import ctypes
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
@@ -42,9 +41,6 @@ warnings."""
 _THREADS = 64
 """Threads per device block; more would not be faster, given the registers that each flight
 needs."""
-
-Entries = Mapping[str, Sequence[Any]]
-"""Driver functions by name, with their argument types."""
 
 
 @dataclass(frozen=True)
@@ -98,10 +94,8 @@ class Target:
         """Return a driver array as a NumPy array."""
         return np.asarray(array)
 
-    def compile(
-        self, functions: Mapping[str, ca.Function], declarations: str, entries: Entries
-    ) -> Any:
-        """Return the driver functions as attributes; their first argument is a job.
+    def compile(self, functions: Mapping[str, ca.Function], declarations: str) -> Any:
+        """Return the compiled driver, for :meth:`call`.
 
         Parameters
         ----------
@@ -111,8 +105,6 @@ class Target:
             ``SHAPE_EQUATIONS``, for joints on their stops.
         declarations
             Declarations from :mod:`.native`.
-        entries
-            Driver functions.
 
         Raises
         ------
@@ -132,10 +124,11 @@ class Target:
         if library is None:
             source = self.source(functions, declarations)
             library = load_library(name, source, ctypes.CDLL, flags=flags, language="cpp")
-        for entry, arguments in entries.items():
-            function = getattr(library, entry)
-            function.argtypes, function.restype = list(arguments), None
         return library
+
+    def call(self, driver: Any, function: str, job: Any) -> None:
+        """Call a function of a compiled driver with a job."""
+        getattr(driver, function)(ctypes.byref(job))
 
     def source(
         self, functions: Mapping[str, ca.Function], declarations: str, libmvec: str = ""
@@ -277,29 +270,23 @@ class CudaDevice(Target):
         """Return a copy of an array in host memory."""
         return np.asarray(self.arrays.asnumpy(array))
 
-    def compile(
-        self, functions: Mapping[str, ca.Function], declarations: str, entries: Entries
-    ) -> Any:
-        """Return the driver functions; CuPy caches compiled functions by source."""
+    def compile(self, functions: Mapping[str, ca.Function], declarations: str) -> Any:
+        """Return the compiled driver; CuPy caches compiled functions by source."""
         source = self.source(functions, declarations).replace("#include <math.h>", "")
         module = self.arrays.RawModule(code=source, options=CUDA_OPTIONS, backend="nvrtc")
         try:
-            kernels = {entry: module.get_function(entry) for entry in entries}
+            module.compile()
         except self.arrays.cuda.compiler.CompileException as error:
             raise NoLibraryError(f"NVRTC failed: {str(error).strip().splitlines()[0]}") from error
-        return SimpleNamespace(**{name: self._launcher(each) for name, each in kernels.items()})
+        return module
 
-    def _launcher(self, kernel: Any) -> Callable[..., None]:
-        """Return a function that runs a kernel, one thread per flight of a job."""
-
-        def launch(job: Any, *arguments: int) -> None:
-            with self.named_errors() as cupy:
-                on_device = cupy.asarray(np.frombuffer(bytes(job), np.uint8))
-                blocks = -(-job.groups // _THREADS)
-                kernel((blocks,), (_THREADS,), (on_device, *map(np.int64, arguments)))
-                cupy.cuda.get_current_stream().synchronize()
-
-        return launch
+    def call(self, driver: Any, function: str, job: Any) -> None:
+        """Run a function of a compiled driver as a kernel, one thread per flight of the job."""
+        with self.named_errors() as cupy:
+            on_device = cupy.asarray(np.frombuffer(bytes(job), np.uint8))
+            blocks = -(-job.groups // _THREADS)
+            driver.get_function(function)((blocks,), (_THREADS,), (on_device,))
+            cupy.cuda.get_current_stream().synchronize()
 
 
 _DEVICE_NAME = re.compile(r"(?:host|cuda(?::(\d{1,4}))?)(:single)?")

@@ -35,7 +35,7 @@ from spacerobot_ros.batch import (
 )
 from spacerobot_ros.batch.lanes import symbolic_model_of
 from spacerobot_ros.batch.native import CompiledTick
-from spacerobot_ros.batch.targets import CUDA_OPTIONS, CudaDevice, Entries, Target, device_named
+from spacerobot_ros.batch.targets import CUDA_OPTIONS, CudaDevice, Target, device_named
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
@@ -441,9 +441,7 @@ class Compiler(Target):
 
     architecture: str = ""
 
-    def compile(
-        self, functions: Mapping[str, ca.Function], declarations: str, entries: Entries
-    ) -> Any:
+    def compile(self, functions: Mapping[str, ca.Function], declarations: str) -> Any:
         library, program = nvrtc(), ctypes.c_void_p()
         code = self.source(functions, declarations).replace("#include <math.h>", "").encode()
         options = [each.encode() for each in (*CUDA_OPTIONS, f"-arch={self.architecture}")]
@@ -493,7 +491,7 @@ def test_devices_have_a_binary_of_the_program(
     flights = flights_of(name, actuation, controlled=controlled)
     tick = CompiledTick.of(flights, symbolic_model_of(flights)[0], target)
     for entry in (b"start_flights", b"fly_until"):
-        assert entry in tick.library
+        assert entry in tick.driver
 
 
 class _CupyError(Exception):
