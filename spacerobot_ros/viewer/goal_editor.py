@@ -114,25 +114,15 @@ class GoalEditor:
         on_reset: Callable[[], None],
     ) -> None:
         self._server, self._defer, self._on_note = server, defer, on_note
-        self._gizmos: dict[str, Any] = {}
-        self._marks: dict[str, Any] = {}
-        self._poses: dict[str, Array] = {}
-        self._ghost: RobotDrawing | None = None
         self._ghost_shown = True
-        self._present: tuple[Array, Array] | None = None
-        self._changed_at: float | None = None
         self._origin = Origin.ROBOT
         self._in_flight = False
         """Whether the robot is flying to the displayed goal, which hides the gizmos."""
-        self._followed: Mapping[Part, Goal] = {}
-        """The last followed goals."""
-        self.check = GoalCheck(Verdict.UNCHECKED)
-        """The displayed check result."""
         gui = server.gui
         recorded = hint_html("A recording does not accept goals.")
         self._none_taken = gui.add_html(recorded, visible=False)
         self._hint = gui.add_html(hint_html("Drag the arrows or enter numbers, then press Fly."))
-        self._verdict = gui.add_html(check_html(self.check))
+        self._verdict = gui.add_html("")
         edit = self._defer_edit
         self._parts = _PartMenu(gui, defer, edit, on_note, self._on_parts_chosen)
         # Any: for mypy viser's values are read-only.
@@ -151,6 +141,7 @@ class GoalEditor:
         react(self._to_robot.on_click, defer, lambda _: on_reset())
         for field in (self._position, self._angles):
             field.on_update(self._on_field)
+        self.show_robot(None, 1.0)
 
     @property
     def placed(self) -> bool:
@@ -159,11 +150,14 @@ class GoalEditor:
 
     def show_robot(self, robot: RobotDescription | None, reach: float) -> None:
         """Start again with another robot, in an empty scene; None: no robot."""
-        self._gizmos.clear()
-        self._marks.clear()
-        self._poses.clear()
-        self._ghost, self._present, self._changed_at = None, None, None
-        self._followed = {}
+        self._gizmos: dict[Part, Any] = {}
+        self._marks: dict[Part, Any] = {}
+        self._poses: dict[Part, Array] = {}
+        self._ghost: RobotDrawing | None = None
+        self._present: tuple[Array, Array] | None = None
+        self._changed_at: float | None = None
+        self._followed: Mapping[Part, Goal] = {}
+        """The last followed goals."""
         self._reach, self._robot = reach, robot
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._parts.offer(())
@@ -391,6 +385,7 @@ class GoalEditor:
     def show_check(self, check: GoalCheck) -> None:
         """Show the goal check result."""
         self.check = check
+        """The displayed check result."""
         self._verdict.content = check_html(check)
         if self._ghost is not None:
             self._ghost.paint(COLORS[check.verdict])

@@ -553,27 +553,20 @@ class Page:
         self._server, self._config = server, config
         self._inbox: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._actions: list[Action] = []
-        self._robot: RobotDescription | None = None
-        self._drawing: scene.RobotDrawing | None = None
         self._target: RobotDescription | None = None
-        self._target_drawing: scene.RobotDrawing | None = None
         self._obstacles: tuple[RobotDescription | None] | None = None
         """The obstacles shown last; None if the obstacles of the robot are shown."""
-        self._drawn_obstacles: list[viser.MeshHandle] = []
-        self._table: ThrusterTable | None = None
         self.tolerance: Tolerance | None = None
         self._state = StackState()
         self._due: dict[str, float] = {}
         self._now = 0.0
-        self._last: Measured | None = None
-        """The last received state, from which users can look back."""
-        self._drawn: Measured | None = None
         self._looked_back = False
         self._notices: deque[Notice] = deque(maxlen=_MAX_SHOWN_NOTICES)
         """Events and warnings, newest first."""
         self._announced: tuple[Notice, float] | None = None
         """The line at the top, and the wall time, s, until which it is shown."""
         self._build()
+        self.show_robot(None)
 
     def _build(self) -> None:
         gui, defer = self._server.gui, self._inbox.put
@@ -634,15 +627,19 @@ class Page:
 
     def show_robot(self, robot: RobotDescription | None) -> None:
         """Start again with another robot; None: there is none."""
-        self._robot, self._table, self._drawing = robot, None, None
-        self._last = self._drawn = None
+        self._robot = robot
+        self._table: ThrusterTable | None = None
+        self._drawing: scene.RobotDrawing | None = None
+        self._target_drawing: scene.RobotDrawing | None = None
+        self._drawn_obstacles: list[viser.MeshHandle] = []
+        self._drawn: Measured | None = None
+        self._last: Measured | None = None
+        """The last received state, from which users can look back."""
         self._past: RecentItems[StackState] = RecentItems()
         self._look_back.time_s = None
         self._kinematics = None if robot is None else ForwardKinematics(robot)
         self._around: scene.Surroundings | None = None
         self._server.scene.reset()
-        self._target_drawing = None
-        self._drawn_obstacles = []
         reach = 1.0 if robot is None else scene.reach_of(robot)
         self._reach = reach
         self._flown: dict[Part, RecentItems[Array]] = {}

@@ -118,7 +118,6 @@ class ViewerNode(FlightNode):
                 "can steer the robot."
             )
         self._page = Page(self._server, config)
-        self._page.show_robot(None)
         self._robot: RobotDescription | None = None
         self._urdf = ""
         self._full_names: dict[str, str] = {}
