@@ -332,6 +332,14 @@ class ChunkUnpacker:
             raise ValueError(f"the checksum of the chunk at byte {place} is wrong")
         return data
 
+    def unpack_message(self, data: bytes, place: int) -> bytes:
+        """Return a message of the chunk at ``place``, unpacked if rosbag2 compressed it on its own
+        (``compression_mode: message``). No message in CDR starts like a zstd frame."""
+        if not data.startswith(zstandard.FRAME_HEADER):
+            return data
+        self.count(max(zstandard.frame_content_size(data), 0), place)
+        return zstandard.ZstdDecompressor().decompress(data)
+
 
 _DECOMPRESSORS: dict[str, Callable[[bytes, int], bytes]] = {
     "zstd": lambda data, most: zstandard.ZstdDecompressor().stream_reader(data).read(most),
@@ -426,6 +434,7 @@ def blocks_in_time_order(
     places = {topic: number for number, topic in enumerate(topics)}
     numbers = np.full((len(files), _MOST_CHANNELS), _NOT_WANTED, np.intp)
     sections: list[_Section] = []
+    unpackers = [ChunkUnpacker(file.size) for file in files]
     for n, (file, of_channel) in enumerate(zip(files, numbers, strict=True)):
         for channel in file.summary.channels.values():
             of_channel[channel.id] = places.get(channel.topic, _NOT_WANTED)
@@ -446,7 +455,9 @@ def blocks_in_time_order(
             with files[n].open() as opened:
                 for place_in_file, data in _unpacked(opened, section.chunk):
                     block = _messages_in(data, place_in_file, numbers[n], start_ns, end_ns)
-                    blocks.append(block)
+                    unpack = unpackers[n].unpack_message
+                    whole = [unpack(message, place_in_file) for message in block[2]]
+                    blocks.append((*block[:2], whole))
         nothing: MessageBlock = np.zeros(0, np.intp), np.zeros(0, np.uint64), []
         topics_of, log_times, parts = zip(nothing, *blocks, strict=True)
         times = np.concatenate(log_times)

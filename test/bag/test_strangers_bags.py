@@ -64,12 +64,15 @@ def joint_states(k: int, names: Sequence[str]) -> bytes:
 
 
 def rosbag2(
-    folder: Path, counts: range, *, plugin: StoragePlugin, compressed: bool = False
+    folder: Path,
+    counts: range,
+    *,
+    plugin: StoragePlugin = StoragePlugin.MCAP,
+    compression: CompressionMode = CompressionMode.NONE,
 ) -> Path:
     """Write joint states by rosbags; return the folder."""
     writer = Writer(folder, version=9, storage_plugin=plugin)
-    if compressed:
-        writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         connection = writer.add_connection("/joint_states", JOINT_STATE, typestore=STORE)
         for k in counts:
@@ -84,7 +87,7 @@ def split_bag(tmp_path: Path) -> Path:
     folder.mkdir()
     parts = [f"split_{n}.mcap" for n in range(11)]
     for n, name in enumerate(parts):
-        made = rosbag2(tmp_path / f"part_{n}", range(2 * n, 2 * n + 2), plugin=StoragePlugin.MCAP)
+        made = rosbag2(tmp_path / f"part_{n}", range(2 * n, 2 * n + 2))
         (made / f"{made.name}.mcap").rename(folder / name)
     metadata = yaml.safe_load((made / "metadata.yaml").read_text())
     metadata["rosbag2_bagfile_information"]["relative_file_paths"] = parts
@@ -177,7 +180,7 @@ def test_the_name_of_a_split_recording_is_all_of_its_files(tmp_path: Path) -> No
 
 
 def test_a_compressed_file_is_read(tmp_path: Path) -> None:
-    folder = rosbag2(tmp_path / "zst", range(20), plugin=StoragePlugin.MCAP, compressed=True)
+    folder = rosbag2(tmp_path / "zst", range(20), compression=CompressionMode.FILE)
     (file,) = folder.glob("*.zstd")
     for number, path in enumerate((folder, file)):
         table = exported(path, tmp_path / f"out_{number}")["joint_states"]
@@ -188,6 +191,31 @@ def test_a_compressed_file_is_read(tmp_path: Path) -> None:
         read_bag(file)
     refused = spacerobot("salvage", file, code=2).stderr
     assert_one_sentence(refused, "is compressed: unpack it with 'zstd -d'")
+
+
+def test_messages_that_were_compressed_one_by_one_are_read(tmp_path: Path) -> None:
+    folder = rosbag2(tmp_path / "zst", range(20), compression=CompressionMode.MESSAGE)
+    table = exported(folder, tmp_path / "out")["joint_states"]
+    assert_has_all_that_rosbags_reads(table, folder)
+    playback = Playback(read_bag(folder))
+    playback.run(0)
+    replayed = [each.data for _ in range(20) if (each := playback.step(0))]
+    assert replayed == [joint_states(k, ("j1", "j2")) for k in range(20)]
+    flight = altered(FLIGHT, tmp_path / "flight.mcap", packed=zstandard.compress)
+    assert verify_bag(flight) == verify_bag(FLIGHT)
+
+
+def test_all_messages_together_are_bounded(tmp_path: Path) -> None:
+    path, size = tmp_path / "a.mcap", 20 * 2**20
+    packed = message(zstd_zeros(size, claims=size))
+    path.write_bytes(bag(plain(packed)))
+    assert sum(len(data) for *_, data in read_bag(path).raw_messages(["/a"])) == size
+    path.write_bytes(bag(plain(packed), plain(packed)))
+    with pytest.raises(RecordingError, match=f"inflates to {2 * size} bytes"):
+        list(read_bag(path).raw_messages(["/a"]))
+    path.write_bytes(bag(plain(message(zstd_zeros(size)))))
+    with pytest.raises(RecordingError, match=r"a.mcap is damaged: .*content size"):
+        list(read_bag(path).raw_messages(["/a"]))
 
 
 def test_a_bag_in_sqlite_says_how_to_convert_it(tmp_path: Path) -> None:

@@ -34,13 +34,14 @@ def altered(
     end_ns: int = 2**63,
     node: str = "plant",
     log_time: Callable[[int], int] = lambda time_ns: time_ns,
+    packed: Callable[[bytes], bytes] = bytes,
 ) -> Path:
     """Copy a bag with something changed.
 
     The message of that number on a topic, some of the parameters of a ``node``, or one text in the
     URDF that another takes the place of. ``injected`` adds messages on /fault_injection, by log
     time; messages are kept from ``begin_ns`` to before ``end_ns``. ``log_time`` gives messages
-    other log times, ns.
+    other log times, ns. ``packed`` gives every message that is kept other bytes.
     """
     count = 0
     with bag.open("rb") as source, out.open("wb") as target:
@@ -79,7 +80,7 @@ def altered(
             writer.add_message(
                 channels[channel.id],
                 log_time(message.log_time),
-                data,
+                packed(data),
                 message.publish_time,
                 message.sequence,
             )

@@ -114,6 +114,9 @@ _COUNTS = ("message_count", "message_start_time", "message_end_time")
 
 CASES |= {
     "zstd: two hundred chunks of 60 MB": lambda: bag(*[ALLOWED] * 200),
+    "messages: 6 GiB in 197 kB, claimed": lambda: bag(plain(message(MUCH))),
+    "messages: 6 GiB in 197 kB": lambda: bag(plain(message(zstd_zeros(6 * GIB)))),
+    "messages: two hundred of 60 MB": lambda: bag(*[plain(message(ALLOWED.data))] * 200),
     "one chunk, a thousand times in the index": lambda: bag(ALLOWED, repeat=1000),
     "one small chunk, ten thousand times in the index": lambda: bag(
         plain(message(string("x" * 50_000))), repeat=10_000
