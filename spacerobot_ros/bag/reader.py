@@ -73,12 +73,19 @@ def bag_files(path: Path) -> list[Path]:
     Raises
     ------
     RecordingError
-        A folder contains no MCAP file, or several that are not listed in its ``metadata.yaml``.
+        A folder contains no MCAP file, or several that are not listed in its ``metadata.yaml``, or
+        not all of several that are.
     """
     if path.is_dir():
-        listed = [path / name for name in _listed_files(path)]
-        if listed and all(file.is_file() for file in listed):
-            return _salvaged(listed)
+        listed = _as_found([path / name for name in _listed_files(path)])
+        missing = [file.name for file in listed if not os.path.isfile(file)]
+        if listed and not missing:
+            return listed
+        if len(listed) > 1:
+            raise RecordingError(
+                f"The bag {path} lacks {_format_list(missing)}, listed in its metadata.yaml: "
+                "restore what is missing, or name one of the other files to read it alone."
+            )
         # Files in other formats are rejected individually, with a remedy.
         found = (sorted(path.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
         files = next(filter(None, found), [])
@@ -100,12 +107,17 @@ def bag_files(path: Path) -> list[Path]:
     parts: list[Path] = []
     while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
         parts.append(part)
-    return _salvaged(parts) or [path]
+    return _as_found(parts) or [path]
 
 
-def _salvaged(files: list[Path]) -> list[Path]:
-    copies = map(salvaged_copy, files)
-    return [copy if copy.exists() else file for file, copy in zip(files, copies, strict=True)]
+def _as_found(files: list[Path]) -> list[Path]:
+    """Return the files of a bag under the names they have now: salvaged, packed or unpacked."""
+    found = []
+    for file in files:
+        plain = file.with_suffix("") if file.suffix == ".zstd" else file
+        names = salvaged_copy(plain), file, plain, plain.with_name(f"{plain.name}.zstd")
+        found.append(next(filter(os.path.exists, names), file))
+    return found
 
 
 def _listed_files(folder: Path) -> list[str]:
@@ -117,7 +129,7 @@ def _listed_files(folder: Path) -> list[str]:
         text = file.read_text("utf-8")
         listed = load_yaml(text)["rosbag2_bagfile_information"]["relative_file_paths"]
         # Old versions of rosbag2 include the folder; other paths may lead anywhere.
-        return list(dict.fromkeys(PurePath(name).name for name in listed))
+        return list(dict.fromkeys(filter(None, (PurePath(name).name for name in listed))))
     except (OSError, ValueError, TypeError, KeyError):
         return []
 

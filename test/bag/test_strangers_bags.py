@@ -154,6 +154,35 @@ def test_a_file_of_a_split_bag_that_was_cut_is_replaced_by_its_salvaged_copy(
         salvage_bag(split_bag)
 
 
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_split_bag_that_lacks_a_file_is_refused(
+    split_bag: Path, packed: bool, own_domain: None, tmp_path: Path
+) -> None:
+    lost = split_bag / "split_3.mcap"
+    if packed:
+        metadata = split_bag / "metadata.yaml"
+        metadata.write_text(metadata.read_text().replace(".mcap", ".mcap.zstd"))
+        for file in split_bag.glob("*.mcap"):
+            file.with_name(f"{file.name}.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+            file.unlink()
+        # What a user has unpacked is there, under another name.
+        file = lost.with_name(f"{lost.name}.zstd")
+        lost.write_bytes(zstandard.decompress(file.read_bytes()))
+        file.unlink()
+    assert read_bag(split_bag).message_count() == 22
+    lost.rename(tmp_path / lost.name)
+    sentence = (
+        f"The bag {split_bag} lacks {lost.name}{'.zstd' * packed}, listed in its metadata.yaml: "
+        "restore what is missing, or name one of the other files to read it alone."
+    )
+    with pytest.raises(RecordingError) as caught:
+        read_bag(split_bag)
+    assert str(caught.value) == sentence
+    for command in ("report", "export", "figures", "verify", "salvage", "replay"):
+        assert_one_sentence(spacerobot(command, split_bag, code=2).stderr, sentence)
+    assert {each.name for each in tmp_path.glob("split*")} == {"split", lost.name}
+
+
 def test_a_split_flight_is_verified_as_the_whole(tmp_path: Path) -> None:
     """Its commands, and the states between two files, are in both."""
     folder = tmp_path / "flight"
