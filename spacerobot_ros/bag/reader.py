@@ -488,6 +488,26 @@ class RecordedRobot:
     def __contains__(self, name: str) -> bool:
         return self.get(name) is not None
 
+    def instead_of(self, name: str) -> str:
+        """Return what the bag has instead of a topic of the stack, as the end of a clause: messages
+        of another type, or the type under other names; empty if it has neither."""
+        topic, kind = f"{self.namespace}/{name}", topic_named(name).type
+        recorded, found = self.bag.topics.get(topic, kind), []
+        if recorded != kind:
+            found.append(f"{topic} of type {recorded}, not {kind}")
+        stack = tuple(f"/{each.lstrip('/')}" for each in TOPICS if each != name)
+        others = [
+            other
+            for other, each in self.bag.topics.items()
+            if each == kind and other != topic and not other.endswith(stack)
+        ]
+        if others:
+            found.append(
+                f"{_format_list(others)} of type {kind} (to rename it, record 'spacerobot replay "
+                f"BAG --remap {others[0]}:={topic}')"
+            )
+        return printable(f", but {' and '.join(found)}") if found else ""
+
     def load(self, names: Iterable[str]) -> None:
         """Read all topics of the stack in the bag in one pass; see :meth:`Bag.load`."""
         types = {f"{self.namespace}/{name}": topic_named(name).type for name in names}

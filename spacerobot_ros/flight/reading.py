@@ -338,7 +338,8 @@ def open_flight_bag(
     if namespace is not None:
         chosen = f"/{namespace.strip('/')}".rstrip("/")
         if chosen not in prefixes:
-            known = ", ".join(name or "/" for name in prefixes) or "no robot"
+            known = ", ".join(name or "/" for name in prefixes)
+            known = known or f"no robot{RecordedRobot(bag, chosen).instead_of('odom')}"
             raise RecordingError(
                 f"The bag {bag.path} has no robot in the namespace '{namespace}': it has {known}."
             )

@@ -236,10 +236,6 @@ def _draw_rows(axes: Axes, group: TraceGroup) -> None:
 
 _JOINTS_PER_PANEL = 6
 
-NO_POSES_TEXT = "The bag contains no base poses (odom); base figures are missing."
-
-NO_JOINTS_TEXT = "The bag contains no joint positions (joint_states)."
-
 
 def position_group(flight: FlightReport) -> TraceGroup:
     """Return the base position and its goals."""
@@ -329,7 +325,7 @@ def axis_groups(signal: Signal, parts: Sequence[tuple[str, str]]) -> list[TraceG
 def position_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position and goal."""
     if not len(flight.time):
-        return NO_POSES_TEXT
+        return flight.no_poses_text
     caption = "Base link position in the world frame"
     return time_figure(flight, "position", "Base position", caption, [position_group(flight)])
 
@@ -337,7 +333,7 @@ def position_figure(flight: FlightReport) -> ReportFigure | str:
 def pose_figure(flight: FlightReport) -> ReportFigure | str:
     """Base position (top), base attitude (bottom), and goals."""
     if not len(flight.time):
-        return NO_POSES_TEXT
+        return flight.no_poses_text
     caption = "Base link position in the world frame, and base attitude as a rotation vector"
     groups = [position_group(flight), attitude_group(flight)]
     return time_figure(flight, "pose", "Base pose", caption, groups)
@@ -346,7 +342,7 @@ def pose_figure(flight: FlightReport) -> ReportFigure | str:
 def attitude_figure(flight: FlightReport) -> ReportFigure | str:
     """Base attitude and goal."""
     if not len(flight.attitude):
-        return NO_POSES_TEXT
+        return flight.no_poses_text
     caption = (
         "Base link attitude as exponential coordinates: a rotation vector along the rotation "
         "axis, with the angle as its length"
@@ -366,7 +362,7 @@ def shape_figure(flight: FlightReport) -> ReportFigure | str:
 
 def _why_no_joints(flight: FlightReport) -> str:
     jointless = flight.robot is not None and not flight.robot.joint_names
-    return "The robot has no joints." if jointless else NO_JOINTS_TEXT
+    return "The robot has no joints." if jointless else flight.no_joints_text
 
 
 def rates_figure(flight: FlightReport) -> ReportFigure | str | None:

@@ -37,8 +37,6 @@ from spacerobot_ros.report.figures import (
 )
 from spacerobot_ros.report.figures_over_time import (
     DASHES,
-    NO_JOINTS_TEXT,
-    NO_POSES_TEXT,
     ONE_STATE_TEXT,
     draw_group,
     error_group,
@@ -210,7 +208,7 @@ _FLIGHT_COLOURS = (BASE_COLOUR, PALETTE[1], *PALETTE[5:])
 def path_figure(flight: FlightReport, beside: Sequence[FlightReport] = ()) -> ReportFigure | str:
     """The base path in three views, with the end-effector path and the paths of other flights."""
     if not len(flight.time):
-        return NO_POSES_TEXT
+        return flight.no_poses_text
     if len(flight.time) < 2 and not beside:
         return ONE_STATE_TEXT
     goals = []
@@ -311,7 +309,7 @@ def loops_figure(flight: FlightReport) -> ReportFigure | str | None:
     if len(names) < 2:
         return "A loop in shape space requires at least two joints."
     if not len(flight.q):
-        return NO_JOINTS_TEXT
+        return flight.no_joints_text
     if len(flight.q) < 2:
         return ONE_STATE_TEXT
     pairs = list(itertools.combinations(range(len(names)), 2))

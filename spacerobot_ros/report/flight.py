@@ -319,6 +319,18 @@ class FlightReport(Flight):
         return flown_time(self.reports, self.end)
 
     @property
+    def no_poses_text(self) -> str:
+        """A message that the bag contains no base poses, and what it contains instead."""
+        instead = self.bag.instead_of("odom")
+        return f"The bag contains no base poses (odom){instead}; base figures are missing."
+
+    @property
+    def no_joints_text(self) -> str:
+        """A message that the bag contains no joint positions, and what it contains instead."""
+        instead = self.bag.instead_of("joint_states")
+        return f"The bag contains no joint positions (joint_states){instead}."
+
+    @property
     def hidden_links_text(self) -> str:
         """A message about missing data that are needed to draw the robot; empty if nothing is
         missing."""

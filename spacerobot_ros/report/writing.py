@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from spacerobot_ros.errors import SpaceRobotError, counted, enumeration, sentence_case
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.files import write_output
+from spacerobot_ros.files import warn_once, write_output
 from spacerobot_ros.report import figures_over_time as over_time
 from spacerobot_ros.report import figures_space as space
 from spacerobot_ros.report.events import event_style, event_text
@@ -123,6 +123,9 @@ def write_report(
         figures.append(space.path_figure(flight, others))
         text = page(flight, player_of(view_of_flight(flight)), figures, others)
     write_output(html, text)
+    for topic, values in (("odom", flight.time), ("joint_states", flight.q)):
+        if not len(values) and (instead := flight.bag.instead_of(topic)):
+            warn_once(f"The bag {bag} contains no {topic}{instead}.")
 
 
 def _report_figure(draw: Draw, flights: Sequence[FlightReport]) -> ReportFigure | str | None:
@@ -245,7 +248,7 @@ def write_picture(bag: Path, picture: Path, *, namespace: str | None = None) -> 
     format = PictureFormat.of(picture)
     flight = read_report(bag, namespace)
     if not len(flight.time):
-        raise SpaceRobotError(over_time.NO_POSES_TEXT)
+        raise SpaceRobotError(flight.no_poses_text)
     with drawing():
         write_output(picture, picture_of(_overview_figure(flight), format, _PICTURE_PIXELS))
 

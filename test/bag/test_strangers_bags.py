@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
 import shlex
@@ -46,6 +47,7 @@ from spacerobot_ros.resources import share_directory
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"
+ODOMETRY = "nav_msgs/msg/Odometry"
 FLIGHT = share_directory() / "bags" / "sliding_masses.mcap"
 
 
@@ -78,6 +80,27 @@ def rosbag2(
         for k in counts:
             writer.write(connection, k * 10**9, joint_states(k, ("j1", "j2")))
     return folder
+
+
+def odometry(k: int) -> bytes:
+    """Return odometry of a body at x = k."""
+    types = STORE.types
+    time = types["builtin_interfaces/msg/Time"](sec=k, nanosec=0)
+    point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
+    pose = types["geometry_msgs/msg/Pose"](
+        position=point(x=float(k), y=0.0, z=0.0),
+        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    still = vector(x=0.0, y=0.0, z=0.0)
+    twist = types["geometry_msgs/msg/Twist"](linear=still, angular=still)
+    unknown = np.zeros(36)
+    message = types[ODOMETRY](
+        header=types["std_msgs/msg/Header"](stamp=time, frame_id="world"),
+        child_frame_id="base",
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=unknown),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=unknown),
+    )
+    return bytes(STORE.serialize_cdr(message, ODOMETRY))
 
 
 @pytest.fixture
@@ -298,6 +321,41 @@ def test_topics_that_cannot_be_read_are_named_and_the_rest_is_written(
     assert bag.to_pandas().keys() == bag.to_xarray().keys() == {"/joint_states"}
     refused = spacerobot("export", mixed, "--topic", "chatter", code=2).stderr
     assert_one_sentence(refused, "'cdr' defined by 'ros2idl'")
+
+
+def test_states_under_other_names_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, names = tmp_path / "chaser", ("j1", "j2")
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, kind, make in (
+            ("/chaser/odometry/filtered", ODOMETRY, odometry),
+            ("/odom", JOINT_STATE, lambda k: joint_states(k, names)),
+            ("/chaser/arm/joint_states", JOINT_STATE, lambda k: joint_states(k, names)),
+            ("/joint_commands", JOINT_STATE, lambda k: joint_states(k, names)),
+        ):
+            connection = writer.add_connection(topic, kind, typestore=STORE)
+            for k in range(5):
+                writer.write(connection, k * 10**9, make(k))
+    as_odom = (
+        f", but /odom of type {JOINT_STATE}, not {ODOMETRY} and /chaser/odometry/filtered of type "
+        f"{ODOMETRY} (to rename it, record 'spacerobot replay BAG --remap "
+        "/chaser/odometry/filtered:=/odom')"
+    )
+    no_poses = f"The bag contains no base poses (odom){as_odom}; base figures are missing."
+    report = tmp_path / "a.html"
+    spacerobot("report", folder, "-o", report)
+    assert no_poses in html.unescape(report.read_text("utf-8"))
+    assert caplog.messages == [
+        f"The bag {folder} contains no odom{as_odom}.",
+        f"The bag {folder} contains no joint_states, but /chaser/arm/joint_states of type "
+        f"{JOINT_STATE} (to rename it, record 'spacerobot replay BAG --remap "
+        "/chaser/arm/joint_states:=/joint_states').",
+    ]
+    refused = spacerobot("figures", folder, "--only", "pose", "-o", tmp_path / "f", code=1).stderr
+    assert refused == f"pose        none: {no_poses}\n"
+    refused = spacerobot("report", folder, "--namespace", "chaser", code=2).stderr
+    assert_one_sentence(refused, "/chaser/odometry/filtered:=/chaser/odom'")
 
 
 def test_columns_of_joints_follow_names(tmp_path: Path) -> None:
