@@ -142,7 +142,7 @@ class _Copy:
     def add_readable_records(self, old: BinaryIO) -> None:
         """Add the readable content of a file, up to the first truncated record."""
         size, whole = file_size(old), MAGIC_SIZE
-        chunks = ChunkUnpacker(size)
+        chunks, self._unpacker = ChunkUnpacker(size), ChunkUnpacker(size)
         # A ValueError from the iteration ends it; processing a record raises none.
         with suppress(ValueError):
             for place, opcode, record in records(old, MAGIC_SIZE):
@@ -171,8 +171,11 @@ class _Copy:
         self.empty &= found is None or isinstance(found, Header)
         match found:
             case Message() as message if message.channel_id in self._channels:
-                number = self._channels[message.channel_id]
-                self._file.add_message(number, message.log_time, message.data, message.publish_time)
+                number, data = self._channels[message.channel_id], message.data
+                # Only the metadata of the old bag say that its messages are compressed.
+                with suppress(*DAMAGE_ERRORS):
+                    data = self._unpacker.unpack_message(data, 0)
+                self._file.add_message(number, message.log_time, data, message.publish_time)
             case Schema() as schema if schema.id not in self._schemas:
                 number = self._file.register_schema(schema.name, schema.encoding, schema.data)
                 self._schemas[schema.id] = number, schema.name
