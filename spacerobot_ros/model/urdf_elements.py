@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from spacerobot_ros.errors import RobotDescriptionError, enumeration
+from spacerobot_ros.errors import RobotDescriptionError, counted, enumeration
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.description import (
     Array,
@@ -128,7 +128,8 @@ class _Part:
             flaw = f"'{name}' of the {self.name} has '{wrong}', which is not a number"
             raise self._malformed(flaw, name)
         if len(words) != count:
-            flaw = f"'{name}' of the {self.name} has {len(words)} numbers instead of {count}"
+            given = counted(len(words), "number")
+            flaw = f"'{name}' of the {self.name} has {given} instead of {count}"
             raise self._malformed(flaw, name)
         numbers = np.array(words, dtype=float)
         if not np.all(np.abs(numbers) <= largest):
@@ -242,7 +243,10 @@ def _read_shape(part: _Part, colours: dict[str, tuple[float, ...]]) -> Shape:
     resource = ""
     if kind == "mesh":
         resource = form.text("filename")
-        size = form.numbers("scale", "1 1 1")  # A negative scale mirrors.
+        scale = form.element.get("scale", "1")
+        if len(scale.split()) == 1:  # One factor for all axes
+            form.element.set("scale", " ".join([scale] * 3))
+        size = form.numbers("scale")  # A negative scale mirrors.
     else:
         size = np.concatenate([form.numbers(name) for name in _ATTRIBUTES[kind]])
         if size.min() < 0:
@@ -251,7 +255,9 @@ def _read_shape(part: _Part, colours: dict[str, tuple[float, ...]]) -> Shape:
                 "Give lengths in m."
             )
     rgba: tuple[float, ...] = Shape.rgba
-    if (material := part.child("material")) is not None:
+    # Of several materials, the first counts, as in urdfdom.
+    if (found := part.element.find("material")) is not None:
+        material = _Part(found, part.where)
         if (color := material.child("color")) is not None:
             rgba = tuple(color.numbers("rgba").tolist())
         else:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from xml.etree.ElementTree import fromstring
 
 import numpy as np
 
@@ -93,6 +94,17 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
         yield (
             f"The mesh '{missing[0]}' was not found{more}: give a path relative to the URDF, or "
             "source the workspace of its package. Only pictures need it."
+        )
+    coloured = [
+        link.get("name", "")
+        for link in fromstring(robot.urdf).iterfind("link")
+        if any(len(visual.findall("material")) > 1 for visual in link.iterfind("visual"))
+    ]
+    if coloured:
+        more = f" (and {counted(len(coloured) - 1, 'other link')})" if coloured[1:] else ""
+        yield (
+            f"A <visual> of link '{coloured[0]}'{more} has several <material> elements, of which "
+            "the first is used. Only pictures need it."
         )
     if not any(link.shapes for link in robot.links):
         yield "No link has a <visual>: the robot is drawn as lines between its joints."

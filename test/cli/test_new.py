@@ -227,6 +227,10 @@ def to_stops(lower: float, upper: float, kind: str = "revolute") -> list[tuple[s
         ([meshes("a.stl")], "The mesh 'a.stl' was not found"),
         ([meshes("b.stl", "a.stl", "b.stl")], "The mesh 'b.stl' was not found (and 1 more)"),
         ([meshes("c.stl", "b.stl", "a.stl")], "The mesh 'c.stl' was not found (and 2 more)"),
+        (
+            [("<visual>", "<visual>" + '<material name="m"/>' * 2)],
+            "A <visual> of link 'base_link' (and 2 other links) has several <material> elements",
+        ),
         ([("<visual>", "<!--"), ("</visual>", "-->")], "No link has a <visual>"),
     ],
 )

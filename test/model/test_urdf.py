@@ -153,6 +153,16 @@ def test_rotor_without_mass_but_with_inertia() -> None:
     assert_agrees(found.connection([0.3])[:, 0], [0, 0, 0, 0, 0, 0.5])
 
 
+def test_of_several_materials_the_first_counts_and_one_scale_is_for_all_axes() -> None:
+    colours = '<material name="first"/><material name="other"><color rgba="0 1 0 1"/></material>'
+    form = '<geometry><mesh filename="package://a/b.stl" scale="0.5"/></geometry>'
+    content = f"<visual>{form}{colours}</visual><collision>{form}{colours}</collision>"
+    first = '<material name="first"><color rgba="1 0 0 1"/></material>'
+    hull = parse_robot(robot(first, link("Hull", BODY + content))).links[0]
+    for (shape,) in (hull.shapes, hull.collisions):
+        assert (shape.size, shape.rgba) == ((0.5, 0.5, 0.5), (1.0, 0.0, 0.0, 1.0))
+
+
 def test_visuals() -> None:
     content = """
       <visual><origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/>
@@ -384,7 +394,7 @@ def test_attributes_have_their_count_of_numbers(
     if count:
         for words in (found[2].split()[1:], [*found[2].split(), "1"]):
             text = refusal(f'{name}="{" ".join(words)}"')
-            assert f"has {len(words)} numbers instead of {count}" in text
+            assert f"has {len(words)} number{'s' * (len(words) != 1)} instead of {count}" in text
             assert text.endswith(remedy)
         assert "has 'one', which is not a number; write" in refusal(f'{name}="{"one " * count}"')
         assert "is not finite: " in refusal(f'{name}="{"nan " * count}"')
