@@ -54,6 +54,8 @@ from spacerobot_ros.simulation.config import PlantConfig
 
 _LONGEST_TF_PERIOD = 0.1  # wall s
 
+_END_EFFECTOR_FRAME = "end_effector_frame"
+
 NO_GOAL = replace(Goal.checked([0, 0, 0], [0, 0, 0, 1]), asked=frozenset())
 """Goal of a scenario without one: the initial pose, of which nothing is requested."""
 
@@ -146,7 +148,13 @@ class Scenario:
             return DEFAULT_POSITION_TOLERANCE  # The robot is rejected when it is built.
 
     def _parameters_as_written(self, node: str) -> dict[str, Any]:
-        return {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+        values = {**self.in_file.get(node, {}), **self.overrides.get(node, {})}
+        if node == "plant" and "coordinated_control" in self.commanders:
+            # Without the pose of the controlled link, its goal could not be judged.
+            frame = self._parameters_as_written("coordinated_control").get(_END_EFFECTOR_FRAME)
+            if frame and not values.get(_END_EFFECTOR_FRAME):
+                values[_END_EFFECTOR_FRAME] = frame
+        return values
 
     @property
     def plant(self) -> PlantConfig:
@@ -245,7 +253,9 @@ class Scenario:
     def with_overrides(self, node: str, values: Mapping[str, Any]) -> Scenario:
         """Return the scenario with additional parameters set for one node."""
         merged = {**self.overrides, node: {**self.overrides.get(node, {}), **values}}
-        others = {name: config for name, config in self._configs.items() if name != node}
+        # The plant may take its end-effector from the controller.
+        changed = {node, "plant"} if _END_EFFECTOR_FRAME in values else {node}
+        others = {name: config for name, config in self._configs.items() if name not in changed}
         return replace(self, overrides=merged, _configs=others)
 
     def in_real_time(self, factor: float) -> Scenario:

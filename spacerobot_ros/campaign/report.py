@@ -74,8 +74,8 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     write_output(path, html_page(title, _page_body(results, found), _FOOTER))
     lines = [f"success     {share(results.passed)}"]
     lines += [f"{name:<11} {each}" for name, each in results.sampler_shares.items()]
-    note = results.incompleteness_warning
-    lines += [f"note        {note}"] if note else []
+    notes = [results.incompleteness_warning, *results.warnings_on_criteria]
+    lines += [f"note        {note}" for note in notes if note]
     lines += [f"required    {c}: {results.share_meeting(c)}" for c in results.campaign.criteria]
     lines += [
         f"{outcome:<11} {count} of {len(results)}: {message}"
@@ -187,7 +187,7 @@ def _criteria_section(results: Results) -> str:
         rows.append([str(criterion), *_share_cells(met), f"{middle:.4g}", f"{high:.4g}"])
     rows.append(["all together", *_share_cells(share(results.passed)), "", ""])
     head = ["requirement", "met by", "95 % interval", "median", "95 percentile"]
-    return table("requirements", head, rows)
+    return table("requirements", head, rows) + "".join(map(missing, results.warnings_on_criteria))
 
 
 def _share_cells(met: Share) -> list[str]:

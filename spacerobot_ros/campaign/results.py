@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.campaign.config import Campaign, Criterion
-from spacerobot_ros.campaign.dataset import DRAW_PREFIX, Dataset
+from spacerobot_ros.campaign.dataset import DRAW_PREFIX, ERROR, Dataset
 from spacerobot_ros.campaign.draws import Draws, require_module, sobol_problem
 from spacerobot_ros.campaign.metrics import metric_of
 from spacerobot_ros.measures import METRICS
@@ -175,6 +175,18 @@ class Results:
         """Return the share of flights that meet a criterion."""
         values = self.columns[criterion.metric]
         return share((criterion.minimum <= values) & (values <= criterion.maximum))
+
+    @property
+    def warnings_on_criteria(self) -> list[str]:
+        """A sentence for each criterion whose metric has no value, although flights ended without
+        an error."""
+        flown = self.columns["outcome"] != ERROR
+        return [
+            f"No flight has a value of '{name}', so no flight meets its criterion: remove the "
+            "criterion, or choose a scenario in which this metric is measured."
+            for name in dict.fromkeys(each.metric for each in self.campaign.criteria)
+            if flown.any() and np.isnan(self.columns[name][flown]).all()
+        ]
 
     def influences(self) -> list[Influence]:
         """Return the sensitivities, strongest first, with Sobol indices if available."""

@@ -338,6 +338,20 @@ def test_flights_that_all_failed_have_a_report(tmp_path: Path, count: int) -> No
     assert "The mass is negative." in text
 
 
+def test_a_criterion_that_no_flight_can_meet_is_named(tmp_path: Path) -> None:
+    """The flight has no end-effector goal; its base error has a value, though it is too large."""
+    bounds = {name: {"max": 1e-3} for name in ("end_effector_position_error_m", "position_error_m")}
+    made = campaign(disperse=MASSES, flights=3, criteria=bounds)
+    page = tmp_path / "report.html"
+    lines = write_campaign_report(filled(tmp_path / "made", made, lambda draw: 0.02), page)
+    assert [line for line in lines if line.startswith("note")] == [
+        "note        No flight has a value of 'end_effector_position_error_m', so no flight meets "
+        "its criterion: remove the criterion, or choose a scenario in which this metric is "
+        "measured."
+    ]
+    assert "No flight has a value of 'end_effector_position_error_m'" in unescape(page.read_text())
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(chromium() is None, reason="no Chromium to look at the page with")
 def test_the_pages_open_without_a_complaint_and_need_nothing_else(tmp_path: Path) -> None:

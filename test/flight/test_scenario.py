@@ -14,6 +14,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.nodes import NODE_TYPES
@@ -71,6 +72,29 @@ planner: {ros__parameters: {lie_bracket: {t1: 5}, world_frame: "1e1"}}
     # Likewise of a scenario whose configurations nobody has looked at.
     unread = load_scenario(str(path)).with_settings(["planner.lie_bracket.t1=7"])
     assert unread.planner.options["lie_bracket"].t1 == 7.0
+
+
+def test_the_hand_that_the_controller_names_is_judged_by_the_plant(tmp_path: Path) -> None:
+    """The servicer flies alike if its end-effector has another name, which one section gives."""
+    named = robot_file("servicer").read_text("utf-8")
+    (tmp_path / "servicer.urdf").write_text(named.replace("end_effector", "tool_tip"))
+    path = tmp_path / "mine.yaml"
+    packaged = load_scenario("servicer")
+    text = packaged.path.read_text("utf-8").replace("robot: servicer", "robot: servicer.urdf")
+    path.write_text(text)
+    unnamed = load_scenario(str(path))
+    scenario = unnamed.with_settings(["coordinated_control.end_effector_frame=tool_tip"])
+    path.write_text(text.replace("law:", "end_effector_frame: tool_tip\n    law:"))
+    assert unnamed.plant.end_effector_frame == ""
+    for each in (scenario, load_scenario(str(path))):
+        assert each.plant.end_effector_frame == "tool_tip"
+        assert each.parameters("plant")["end_effector_frame"] == "tool_tip"
+    other = scenario.with_settings(["plant.end_effector_frame=wrist_roll_link"])
+    assert other.parameters("plant")["end_effector_frame"] == "wrist_roll_link"
+    found, wanted = (fly_scenario(each).summary() for each in (scenario, packaged))
+    assert 0 < found["end_effector_position_error_m"] < 5e-4
+    for key in ("end_effector_position_error_m", "end_effector_attitude_error_rad", "verdict"):
+        assert found[key] == wanted[key]
 
 
 def test_overrides_go_before_the_file_and_have_the_declared_types() -> None:
