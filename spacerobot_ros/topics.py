@@ -336,8 +336,9 @@ _TOPIC_TABLE = (
         "end_effector/goal_pose",
         _POSE_STAMPED_TYPE,
         "end-effector goal pose in the world; also `NAME/goal_pose` for links in the planner's "
-        "`end_effectors`. For the planner, an all-zero orientation means any attitude, and poses "
-        "with the same stamp, including the base pose, form one goal",
+        "`end_effectors`, and for the controller's `end_effector_frame`. For the planner, an "
+        "all-zero orientation means any attitude, and poses with the same stamp, including the "
+        "base pose, form one goal",
     ),
     _from_user(
         "end_effector/twist",
@@ -434,7 +435,7 @@ def link_topic(end_effector: str, kind: str) -> str:
     """Return the topic ``goal_pose``, ``twist``, ``path`` or ``pose`` of an end-effector, with the
     link name converted to a valid topic name.
     """
-    return re.sub(r"\W", "_", end_effector, flags=re.ASCII) + f"/{kind}"
+    return re.sub(r"\W|^(?=\d)", "_", end_effector, flags=re.ASCII) + f"/{kind}"
 
 
 def pose_topic(end_effector: str) -> Topic:

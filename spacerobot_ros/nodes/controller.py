@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -44,13 +44,15 @@ from spacerobot_ros.planning.core.goal import Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
 from spacerobot_ros.times import first_time_ns, stamp_bytes
+from spacerobot_ros.topics import link_topic
 
 
 class CoordinatedControlNode(CommanderNode):
     """Closed-loop control of spacecraft and arm (paper 4): one command for every measured state.
 
-    ``goal_pose`` is the base goal, ``end_effector/goal_pose`` the end-effector goal, and
-    ``goal_path`` a base goal with waypoints.
+    ``goal_pose`` is the base goal, ``end_effector/goal_pose`` the end-effector goal (also
+    ``NAME/goal_pose`` for the link NAME of ``end_effector_frame``), and ``goal_path`` a base goal
+    with waypoints.
     If a planner publishes ``joint_reference`` (or ``base_reference``), the node tracks it. Until
     a goal arrives, the robot holds the pose of its first state. The node converts messages; a
     :class:`ControllerCommander` and its :class:`~spacerobot_ros.control.executive.ControlExecutive`
@@ -96,6 +98,9 @@ class CoordinatedControlNode(CommanderNode):
             self._path_topic = self.create_publisher(Path, "planned_path", LATCHED)
         self.subscribe_to_goals("goal_pose")
         self.subscribe_to_goals("end_effector/goal_pose", END_EFFECTOR)
+        if (link := self.config.end_effector_frame) not in ("", END_EFFECTOR):
+            topic = link_topic(link, "goal_pose")
+            self.create_subscription(PoseStamped, topic, self._on_goal_of_link, STREAM)
         self.create_subscription(Path, "goal_path", self._on_goal_path, STREAM)
         if self.config.watchdog_timeout:
             self.create_subscription(DiagnosticStatus, HEARTBEAT, self._on_heartbeat, HEARTBEAT_QOS)
@@ -132,6 +137,11 @@ class CoordinatedControlNode(CommanderNode):
         header = {"frame_id": robot.base_link}
         self._wrench_message = MessageTemplate(WRENCH, encode(WRENCH, {"header": header}))
         self._wrench_message.feed("wrench.force.x", commander.wrench)
+
+    def _on_goal_of_link(self, message: PoseStamped) -> None:
+        # A planner whose reference is tracked takes the goals of named links.
+        if not self.has_publisher(JOINT_REFERENCE):
+            self.receive(END_EFFECTOR, message, lambda: self._read_goal(END_EFFECTOR, message))
 
     def _on_goal_path(self, message: Path) -> None:
         def read() -> Goal:

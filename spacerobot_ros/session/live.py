@@ -315,7 +315,8 @@ def _find_goal_commander(
                 executor.spin_once(timeout_sec=0.05)
             _await_active(client, executor, deadline)
             return client
-    listed = "; the planner's parameter end_effectors lists other links" if aims[1:] else ""
+    listed = "; other links are named in the planner's parameter end_effectors or the controller's "
+    listed = f"{listed}end_effector_frame" if aims[1:] else ""
     raise SpaceRobotError(
         f"No commander accepted goals on {topics} within {patience:g} s: start a planner or a "
         f"controller, `spacerobot up SCENARIO`, in the same ROS domain and namespace{listed}."

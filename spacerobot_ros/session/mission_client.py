@@ -23,6 +23,7 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.builders import goal_messages
 from spacerobot_ros.messages.diagnostics import read_status
+from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
 from spacerobot_ros.nodes.common.messages import shape_message
 from spacerobot_ros.nodes.common.node import LATCHED_QUEUE, STREAM, UNKNOWN_NODE
 from spacerobot_ros.nodes.common.process import spin_until
@@ -30,6 +31,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.execution.goal_file import GoalIds
 from spacerobot_ros.planning.execution.status import PlannerStatus
 from spacerobot_ros.times import LATEST_NS, SECOND
+from spacerobot_ros.topics import link_topic
 
 _STATUS_CHECK_PERIOD = 0.2  # wall s
 
@@ -152,12 +154,14 @@ class MissionClient:
         """Whether a commander that publishes its status and subscribes to goals is connected.
 
         A recorder also subscribes to goals, and may be discovered first, before its node's name.
+        The default end-effector may be the controller's while the planner decides.
         """
         if not self._status_topic.get_publisher_count():
             return False
         deciders = self.node.get_publishers_info_by_topic(self._status_topic.topic_name)
         named = [each for each in deciders if each.node_name != UNKNOWN_NODE]
-        return bool(_names_of(named) & self._readers(self._goal_topic))
+        own = set(self._sends) - {_SHAPE, link_topic(DEFAULT_END_EFFECTOR, "goal_pose")}
+        return all(_names_of(named) & self._readers(self._sends[each].topic_name) for each in own)
 
     def knows_commander(self) -> bool:
         """Whether a publisher of the commander's status has been discovered."""

@@ -25,6 +25,7 @@ from nav_msgs.msg import Odometry
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
+from scipy.spatial.transform import Rotation
 from support.awaited import processes_with
 from support.nodes_apart import NodesApart
 from support.raw_messages import iterate_raw
@@ -40,6 +41,7 @@ from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
+from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import Scenario, load_scenario
 from spacerobot_ros.session.live import ros, send_goal
 from spacerobot_ros.session.processes import MultiProcessStack, checked_namespace
@@ -205,6 +207,36 @@ def test_goals_are_sent_to_a_robot_that_is_up(
     bag = read_bag(tmp_path / "up.mcap")
     last = [bag["/odom"].field(f"pose.pose.position.{x}")[-1] for x in "xyz"]
     np.testing.assert_allclose(last, [0.02, 0.0, 0.0], atol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_goal_for_the_link_of_a_controller_arrives_by_its_name(
+    spacerobot: Command, tmp_path: Path
+) -> None:
+    """The servicer's, which has another name; of a link that is not controlled, none arrives."""
+    named = robot_file("servicer").read_text("utf-8")
+    (tmp_path / "servicer.urdf").write_text(named.replace("end_effector", "tool_tip"))
+    text = load_scenario("servicer").path.read_text("utf-8")
+    text = text.replace("robot: servicer", "robot: servicer.urdf")
+    (tmp_path / "own.yaml").write_text(
+        text.replace("law:", "end_effector_frame: tool_tip\n    law:")
+    )
+    hand = ["2.28", "1.85", "0.79", *map(str, Rotation.from_rotvec([-0.56, 0.95, 1.05]).as_quat())]
+    base = ["1", "0.4", "-0.2", *map(str, Rotation.from_rotvec([0.1, -0.2, 0.5]).as_quat())]
+    words = ("--end-effector-goal", *hand, "--end-effector")
+    # In lockstep, a busy machine loses no state.
+    up = ("up", "own.yaml", "--set", "plant.time_mode=lockstep", "--bag", "up.mcap")
+    with spacerobot.start(*up) as robot:
+        reached = spacerobot("goal", *base, *words, "tool_tip", "--timeout", "60")
+        assert reached.returncode == 0, reached.stdout + reached.stderr
+        other = spacerobot("goal", *words, "wrist_roll_link", "--timeout", "3")
+        assert other.returncode == 2, other.stdout + other.stderr
+        assert "or the controller's end_effector_frame" in other.stderr
+        robot.send_signal(signal.SIGINT)
+        assert robot.wait(PATIENCE) == 0
+    bag = read_bag(tmp_path / "up.mcap")
+    last = [bag["/end_effector_pose"].field(f"pose.position.{x}")[-1] for x in "xyz"]
+    np.testing.assert_allclose(last, [2.28, 1.85, 0.79], atol=1e-3)
 
 
 @pytest.mark.slow

@@ -267,18 +267,23 @@ def test_a_goal_waits_for_a_commander_that_is_known_beside_a_viewer(
 
 def test_a_recorder_that_reads_goals_is_no_commander(harness: Harness) -> None:
     """It may be known before the commander: then a goal would be lost without a word."""
-    client = MissionClient("planner", "world", lambda: NOW, GOAL, context=harness.context)
+    goal = Goal.of_end_effectors([EndEffectorGoal.checked("left", [0.1, 0.2, 0.3])])
+    client = MissionClient("planner", "world", lambda: NOW, goal, context=harness.context)
     harness.add(client.node)
-    recorder = harness.probe({"goal_pose": PoseStamped}, name="recorder")
+    topics = {"goal_pose": PoseStamped, "left/goal_pose": PoseStamped}
+    recorder = harness.probe(topics, name="recorder")
     commander = harness.probe({}, name="commander")
     status = commander.create_publisher(DiagnosticStatus, "planner/status", LATCHED)
     harness.spin_until(lambda: status.get_subscription_count() and client.is_connected())
     harness.settle(recorder)
     assert not client.has_goal_commander()
     commander.watch("goal_pose", PoseStamped)
+    harness.settle(commander)
+    assert not client.has_goal_commander(), "which the named link has none of, either"
+    commander.watch("left/goal_pose", PoseStamped)
     harness.spin_until(lambda: client.has_goal_commander() and client.is_connected(2))
-    client.send(GOAL)
-    harness.spin_until(lambda: commander.count("goal_pose"), "the goal")
+    client.send(goal)
+    harness.spin_until(lambda: commander.count("left/goal_pose"), "the goal")
 
 
 NAMELESS = """
