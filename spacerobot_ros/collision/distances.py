@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -41,6 +42,8 @@ WORLD_BODY = -1
 
 _MAX_PROJECTIONS = 60
 """Number of alternating projections; the bound is valid after any number."""
+
+_MAX_NAMED_LINKS = 4
 
 _PARALLEL_TOLERANCE = 1e-9
 """Length of the cross product of two unit vectors below which they are considered parallel."""
@@ -169,15 +172,21 @@ class UnreadMesh:
 
 
 def unread_mesh_notes(meshes: Sequence[UnreadMesh]) -> list[str]:
-    """Return a one-sentence warning for each reason why meshes cannot be read."""
-    links: dict[str, list[str]] = {}
+    """Return a warning for each reason why meshes cannot be read; it names one of the meshes."""
+    by_reason: dict[str, list[UnreadMesh]] = {}
     for each in meshes:
-        links.setdefault(each.reason, []).append(each.link)
+        reason = re.sub(r"^The mesh ('.*?'|\S+)", "", each.reason)
+        by_reason.setdefault(reason, []).append(each)
     notes = []
-    for reason, named in links.items():
-        quoted = enumeration(f"'{name}'" for name in dict.fromkeys(named))
-        which = "link" if len(set(named)) == 1 else "links"
-        notes.append(f"Some contacts of {which} {quoted} are not detected: {reason}")
+    for unread in by_reason.values():
+        links = [f"'{name}'" for name in dict.fromkeys(each.link for each in unread)]
+        if len(links) > _MAX_NAMED_LINKS:
+            links[_MAX_NAMED_LINKS - 1 :] = [f"{len(links) - _MAX_NAMED_LINKS + 1} more"]
+        which = "link" if len(links) == 1 else "links"
+        note = f"Some contacts of {which} {enumeration(links)} are not detected: {unread[0].reason}"
+        others = len({each.reason for each in unread}) - 1
+        more = f" The same applies to {others} other mesh{'es' * (others > 1)}." if others else ""
+        notes.append(note + more)
     return notes
 
 

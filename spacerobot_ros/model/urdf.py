@@ -9,6 +9,7 @@ obstacles around the robot (``<world>``). Nodes and bags therefore need only the
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -119,7 +120,8 @@ def _loaded(path: Path, parse: Callable[[str], RobotDescription]) -> RobotDescri
         return parse(text)
     except RobotDescriptionError as error:
         remedy = ""
-        if path.suffix != ".xacro" and ("<xacro:" in text or "${" in text):
+        code = re.sub("<!--.*?-->", "", text, flags=re.DOTALL)
+        if path.suffix != ".xacro" and ("<xacro:" in code or "${" in code):
             remedy = f" To expand xacro in it, rename it to {path.stem}.xacro."
         raise RobotDescriptionError(f"{path}: {error}{remedy}") from error
 

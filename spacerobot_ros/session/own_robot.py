@@ -82,13 +82,15 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
                 f"The inertia of link '{link.name}' {flaw} The links welded to it compensate for "
                 "this."
             )
-    meshes = {
+    # Notes on distances name the meshes that contacts need.
+    pictures = {
         shape.resource: None
         for link in robot.links
         for shape in link.shapes
-        if shape.kind == "mesh"
+        if shape.kind == "mesh" and link.collisions
     }
-    missing = [each for each in meshes if mesh_file(each) is None]
+    solid = {shape.resource for link in robot.links for shape in link.collisions or link.shapes}
+    missing = [each for each in pictures if each not in solid and mesh_file(each) is None]
     if missing:
         more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
         yield (

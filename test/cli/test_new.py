@@ -86,7 +86,8 @@ def test_no_scenario_is_overwritten(robot: Path) -> None:
 def test_a_robot_whose_collision_meshes_are_missing_flies_without_them(
     robot: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    mesh = '<collision><geometry><mesh filename="package://gone/link.stl"/></geometry></collision>'
+    form = '<geometry><mesh filename="package://gone/link.stl"/></geometry>'
+    mesh = f"<visual>{form}</visual><collision>{form}</collision>"
     text = re.sub(r'(<link name="[^"]*"(?<!/)>)', rf"\1{mesh}", robot.read_text("utf-8"))
     robot.write_text(text, "utf-8")
     turn = ["plan", robot.name, "--goal-rotvec", "0", "0", "0.02"]
@@ -95,7 +96,9 @@ def test_a_robot_whose_collision_meshes_are_missing_flies_without_them(
         said = plan.output + caplog.text
         assert len(re.findall("cannot be checked: .*'package://gone/", said)) == 1
         caplog.clear()
-    new(robot.name)
+    printed = new(robot.name)
+    assert printed.count("'package://gone/link.stl' was not found") == 1
+    assert "Only pictures need it" not in printed
     assert "clearance: 0.0   # m; contacts are not detected" in Path("mine.yaml").read_text("utf-8")
     scenario = load_scenario("mine.yaml")
     assert try_method(PlanningProblem.of(scenario), scenario.planner.method).reached
@@ -195,6 +198,7 @@ def changed(changes: list[tuple[str, str]]) -> RobotDescription:
 def meshes(*names: str) -> tuple[str, str]:
     """Return the change that gives the base pictures of files that are not there."""
     drawn = "".join(f'<visual><geometry><mesh filename="{n}"/></geometry></visual>' for n in names)
+    drawn += '<collision><geometry><sphere radius="1"/></geometry></collision>'
     return '<link name="base_link">', f'<link name="base_link">{drawn}'
 
 

@@ -157,15 +157,23 @@ def test_a_damaged_srdf_is_refused(tmp_path: Path, text: str, message: str) -> N
         with_srdf(robot, tmp_path / "none.srdf")
 
 
-def test_meshes_that_are_missing_are_named_with_their_links_together() -> None:
-    mesh = solid("visual", '<mesh filename="package://nowhere/arm.stl"/>')
-    other = solid("collision", '<mesh filename="package://nowhere/tool.stl"/>')
-    geometry = CollisionGeometry(parse_robot(chain((mesh,), (mesh,), (other,), (BALL,))))
+def test_meshes_that_are_missing_are_named_with_their_links_together(tmp_path: Path) -> None:
+    damaged = tmp_path / "damaged.stl"
+    damaged.write_text("damaged")
+    files = [*(f"package://nowhere/{k}.stl" for k in (1, 1, 2, 3, 4)), str(damaged)]
+    forms = [f'<mesh filename="{file}"/>' for file in files]
+    meshes = [(solid(("visual", "collision")[k % 2], form),) for k, form in enumerate(forms)]
+    geometry = CollisionGeometry(parse_robot(chain(*meshes, (BALL,))))
     together, alone = (each for each in geometry.notes if "not detected" in each)
-    begin = "are not detected: The mesh 'package://nowhere"
-    assert together.startswith(f"Some contacts of links 'a' and 'b' {begin}")
-    assert alone.startswith(f"Some contacts of link 'c' {begin}")
-    assert [each.link for each in geometry.solids] == ["d"]
+    assert together.startswith(
+        "Some contacts of links 'a', 'b', 'c' and 2 more are not detected: The mesh "
+        "'package://nowhere/1.stl' was not found: "
+    )
+    assert together.endswith(". The same applies to 3 other meshes.")
+    assert alone.startswith("Some contacts of link 'f' are not detected: The mesh ")
+    assert "damaged.stl" in alone
+    assert "The same" not in alone
+    assert [each.link for each in geometry.solids] == ["g"]
 
 
 def test_a_tilted_flat_mesh_lies_where_its_corners_are(tmp_path: Path) -> None:

@@ -85,6 +85,12 @@ def test_xacro_in_a_urdf_file_and_in_a_text_is_not_expanded(tmp_path: Path) -> N
         load_robot(file_with(tmp_path, text, "probe.urdf"))
     with pytest.raises(RobotDescriptionError, match=r"'value' of the <mass> of link 'hull' has"):
         parse_robot(text)
+    comment = "<!-- <xacro:read/>\n ${mass} -->"
+    plain = urdf(mass="heavy").replace("  <link", f"  {comment}\n  <link", 1)
+    assert comment in plain
+    with pytest.raises(RobotDescriptionError) as refused:
+        load_robot(file_with(tmp_path, plain, "probe.urdf"))
+    assert "rename" not in str(refused.value)
 
 
 def test_a_xacro_file_takes_macros_properties_lists_and_files_of_its_package(
