@@ -381,6 +381,9 @@ def read_flight(bag: FlightBag) -> Flight:
     }
     decider = next((name for name in COMMANDERS if statuses[name]), COMMANDERS[0])
     goals, tool_goals = bag.goals(), bag.goals(DEFAULT_END_EFFECTOR)
+    link = scenario.in_file.get("coordinated_control", {}).get("end_effector_frame")
+    if link and not tool_goals and "planner" not in scenario.commanders:
+        tool_goals = bag.goals(link)
     reports = [status for _, status in statuses[decider]]
     # Bags from version 0.1 have no ids.
     sent = goals or next(filter(None, map(bag.goals, scenario.goal_links)), ())

@@ -35,6 +35,7 @@ from support.warm_python import WarmProcess, WarmPython
 from spacerobot_ros import __version__
 from spacerobot_ros.bag import read_bag
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError
+from spacerobot_ros.flight.reading import read_run
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.planning import Goal
@@ -236,7 +237,11 @@ def test_a_goal_for_the_link_of_a_controller_arrives_by_its_name(
         assert robot.wait(PATIENCE) == 0
     bag = read_bag(tmp_path / "up.mcap")
     last = [bag["/end_effector_pose"].field(f"pose.position.{x}")[-1] for x in "xyz"]
-    np.testing.assert_allclose(last, [2.28, 1.85, 0.79], atol=1e-3)
+    left = float(np.linalg.norm(np.array(last) - [2.28, 1.85, 0.79]))
+    assert left < 1e-3
+    error = read_run(tmp_path / "up.mcap").end_effector_error
+    assert error is not None
+    assert error.distance == pytest.approx(left, abs=1e-12)
 
 
 @pytest.mark.slow
