@@ -113,7 +113,7 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
     if not robot.end_effector():
         yield (
             "No link is named 'end_effector': for coordinated control, set the parameter "
-            "end_effector_frame."
+            "coordinated_control.end_effector_frame."
         )
 
 
