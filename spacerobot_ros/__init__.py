@@ -6,8 +6,7 @@ import logging
 import os
 from typing import TYPE_CHECKING
 
-from spacerobot_ros.lazy import lazy_names
-from spacerobot_ros.version import __version__
+from spacerobot_ros.resources import __version__, lazy_names
 
 if TYPE_CHECKING:
     from spacerobot_ros.bag import read_bag

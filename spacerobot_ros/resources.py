@@ -1,14 +1,21 @@
-"""Files that come with the package: robots, scenarios, reference bags."""
+"""The installed package: its version and files (robots, scenarios, reference bags), and names and
+packages imported on first use, so that importing this package is fast."""
 
 from __future__ import annotations
 
+import hashlib
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
+
+__version__ = "0.2.0"
+"""The version of the package; ``package.xml`` has the same."""
 
 _PACKAGE = "spacerobot_ros"
 
@@ -93,3 +100,64 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean ...?`` with the most similar known name, or an empty string."""
     found = get_close_matches(name, list(known), n=1)
     return f" Did you mean '{found[0]}'?" if found else ""
+
+
+def lazy_names(package: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
+    """Return the ``__getattr__`` of a package whose names are defined in other modules.
+
+    Parameters
+    ----------
+    package
+        Package name, for messages about missing names.
+    names
+        Names in each module, which is below ``spacerobot_ros``.
+    """
+    modules = {name: module for module, those in names.items() for name in those}
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(import_module(f"spacerobot_ros.{modules[name]}"), name)
+
+    return get
+
+
+def optional_module(
+    name: str, extra: str, needed_by: str, error: type[SpaceRobotError] = SpaceRobotError
+) -> Any:
+    """Return a module from a package that is installed by one of this package's extras.
+
+    Parameters
+    ----------
+    name, extra
+        The module, and the extra in ``setup.cfg``.
+    needed_by
+        Beginning of the error message, such as "Campaigns need".
+    error
+        Class of the error.
+
+    Raises
+    ------
+    SpaceRobotError
+        The package is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as missing:
+        package = name.partition(".")[0]
+        if (missing.name or package).partition(".")[0] != package:
+            raise  # The package is installed, but lacks another package.
+        raise error(
+            f"{needed_by} {package}, which is not installed: pip install '.[{extra}]' in the clone."
+        ) from missing
+
+
+@lru_cache(maxsize=1)
+def source_hash() -> str:
+    """Return a hash of the package's code, which distinguishes different checkouts of one
+    version.
+    """
+    found, package = hashlib.sha256(), Path(__file__).parent
+    for path in sorted(each for each in package.rglob("*") if each.suffix in (".py", ".hpp")):
+        found.update(f"{path.relative_to(package)}\n".encode() + path.read_bytes())
+    return found.hexdigest()[:12]

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from spacerobot_ros.errors import RecordingError
-from spacerobot_ros.lazy import lazy_names
 from spacerobot_ros.parameters import WatchdogConfig, nonnegative, parameter
+from spacerobot_ros.resources import lazy_names
 
 if TYPE_CHECKING:
     from spacerobot_ros.bag.mcap_file import LATCHED, QosProfile, RecordedTopic

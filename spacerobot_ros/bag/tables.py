@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from spacerobot_ros.bag.series import TopicSeries
 from spacerobot_ros.errors import RecordingError, reason
 from spacerobot_ros.files import write_output
-from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.messages.diagnostics import key_values
+from spacerobot_ros.resources import optional_module
 from spacerobot_ros.topics import TOPICS
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.compilation import NoLibraryError, load_library
+from spacerobot_ros.resources import optional_module
 
 _SOURCE_FOLDER = Path(__file__).resolve().parent
 

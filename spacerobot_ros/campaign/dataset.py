@@ -33,10 +33,9 @@ from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotErro
 from spacerobot_ros.files import load_yaml, warn_once, write_whole
 from spacerobot_ros.measures import Measures, metric_names, metrics_of_each
 from spacerobot_ros.model.urdf import load_robot, parse_robot
-from spacerobot_ros.resources import is_path, robot_file
+from spacerobot_ros.resources import __version__, is_path, robot_file, source_hash
 from spacerobot_ros.scenario import load_scenario, scenario_text
 from spacerobot_ros.simulation.capture import load_target, target_parameters
-from spacerobot_ros.version import __version__, source_hash
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.flight import Flight

@@ -23,10 +23,9 @@ import numpy as np
 from spacerobot_ros.campaign.targets import DispersionTarget, DrawnFlight, MassFactors, targets_of
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError, counted, reason
 from spacerobot_ros.files import read_regular
-from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.resources import suggestion
+from spacerobot_ros.resources import optional_module, suggestion
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.scenario_files import number_in
 

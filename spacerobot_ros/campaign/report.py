@@ -43,8 +43,8 @@ from spacerobot_ros.report.figures import (
     picture_of,
 )
 from spacerobot_ros.report.page_parts import facts, figure, html_page, missing, table, tiles
+from spacerobot_ros.resources import __version__
 from spacerobot_ros.scenario import different_parameters
-from spacerobot_ros.version import __version__
 
 _FOOTER = f"Made by spacerobot_ros {__version__}."
 

@@ -40,8 +40,8 @@ from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.files import warn_once
+from spacerobot_ros.resources import __version__, source_hash
 from spacerobot_ros.termination import end_with_parent
-from spacerobot_ros.version import __version__, source_hash
 
 TARGET_TASK_TIME = 2.0
 """Desired wall time of a task, s; it is long enough to keep the distribution overhead small."""

@@ -12,7 +12,7 @@ import click
 
 from spacerobot_ros.cli import start
 from spacerobot_ros.cli.terminal import sentences
-from spacerobot_ros.version import __version__
+from spacerobot_ros.resources import __version__
 
 _COMMAND_NAMES_BY_MODULE = {
     "bags": ("export", "figures", "replay", "report", "salvage", "verify"),

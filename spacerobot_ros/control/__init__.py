@@ -21,8 +21,8 @@ from spacerobot_ros.control.state import (
     Reference,
     TargetNotSetError,
 )
-from spacerobot_ros.lazy import lazy_names
 from spacerobot_ros.model.description import plane_normal
+from spacerobot_ros.resources import lazy_names
 
 if TYPE_CHECKING:
     from spacerobot_ros.control.laws.registry import LAWS

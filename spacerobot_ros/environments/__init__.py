@@ -10,7 +10,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import Any
 
-from spacerobot_ros.lazy import optional_module
+from spacerobot_ros.resources import optional_module
 
 __all__ = ["register"]
 

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from spacerobot_ros.environments import register
-from spacerobot_ros.lazy import optional_module
+from spacerobot_ros.resources import optional_module
 
 optional_module("stable_baselines3", "sb3", "This adapter needs")
 

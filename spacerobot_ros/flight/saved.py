@@ -41,9 +41,9 @@ from spacerobot_ros.model.meshes import meshes_for_bag
 from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.execution.status import PlannerStatus
+from spacerobot_ros.resources import __version__
 from spacerobot_ros.times import SECOND
 from spacerobot_ros.topics import TOPICS, Topic, pose_topic, state_topics, topic_named
-from spacerobot_ros.version import __version__
 
 _GOAL_STAMP_NS = 1
 """Stamp of mission goals at time zero, ns."""

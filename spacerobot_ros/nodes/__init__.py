@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from spacerobot_ros.lazy import lazy_names
+from spacerobot_ros.resources import lazy_names
 
 if TYPE_CHECKING:
     from spacerobot_ros.nodes.common.node import FlightNode

@@ -52,9 +52,9 @@ from spacerobot_ros.nodes.common.node import STREAM, UNKNOWN_NODE, FlightNode
 from spacerobot_ros.nodes.common.process import run_node
 from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.watchdog import Role
+from spacerobot_ros.resources import __version__
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns
 from spacerobot_ros.topics import TOPICS_NOT_RECORDED
-from spacerobot_ros.version import __version__
 
 RawCallback = Callable[[bytes], None]
 

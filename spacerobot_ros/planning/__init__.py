@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from spacerobot_ros.lazy import lazy_names
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.goal import Goal, PoseError, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
+from spacerobot_ros.resources import lazy_names
 
 if TYPE_CHECKING:
     from spacerobot_ros.planning.api import plan

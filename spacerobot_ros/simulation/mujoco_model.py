@@ -12,7 +12,6 @@ import numpy as np
 from spacerobot_ros.collision import CollisionGeometry, Solid
 from spacerobot_ros.collision.distances import solids_of
 from spacerobot_ros.errors import RobotDescriptionError
-from spacerobot_ros.lazy import optional_module
 from spacerobot_ros.model.description import Array, Inertia, RobotDescription
 from spacerobot_ros.model.integration import LoadLayout
 from spacerobot_ros.model.rotations import (
@@ -21,6 +20,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_from_matrix,
     rpy_from_matrix,
 )
+from spacerobot_ros.resources import optional_module
 
 TARGET = "target/"
 """Prefix of target body and geometry names."""

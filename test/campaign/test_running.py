@@ -32,9 +32,8 @@ from spacerobot_ros.campaign.running import (
 from spacerobot_ros.campaign.workers import fly_all
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError
-from spacerobot_ros.resources import robot_file
+from spacerobot_ros.resources import __version__, robot_file, source_hash
 from spacerobot_ros.scenario import load_scenario
-from spacerobot_ros.version import __version__, source_hash
 
 MASSES: dict[str, Any] = {
     "mass.*": {"norm": {"loc": 1.0, "scale": 0.03}},

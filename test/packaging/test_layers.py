@@ -39,7 +39,7 @@ LAYERS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("collision",),
         ("model",),
         ("events", "parameters", "registry", "resources", "termination"),
-        ("lazy", "times", "topics", "version"),
+        ("times", "topics"),
         ("files",),
         ("errors",),
     ),

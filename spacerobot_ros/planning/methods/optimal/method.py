@@ -61,7 +61,7 @@ from spacerobot_ros.planning.methods.optimal.search import (
     NoClearPathError,
     SearchProblem,
 )
-from spacerobot_ros.version import __version__
+from spacerobot_ros.resources import __version__
 
 _MAX_STARTS_IN_MOTION = 12
 """Largest number of guesses for a manoeuvre that starts with moving joints, which keep moving
