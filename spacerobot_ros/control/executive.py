@@ -608,10 +608,10 @@ class ControlExecutive:
             if job is None:
                 return
         pursued = self._goals if self._pursues else {}
-        again = self._goal_id == self._latest_id() and bool(pursued)
+        again = self._pursues and self._goal_id == self._latest_id()
         self._goal_id = self._latest_id()
         self._goals = with_later_goals(pursued, pending)
-        if not again:
+        if not (again and pursued):
             self._after_tasks = dict(pending) if carried else {}
         self._take_tolerance(next(reversed(pending.values())).tolerance)
         if BASE_GOAL_KEY not in pursued:
@@ -623,7 +623,7 @@ class ControlExecutive:
         else:
             controller.set_goals(time, state, **aims_of(controller, pending, state))
         self._pending = {}
-        if not (carried or again):
+        if not again:
             self._report_acceptance(None if job is None else job.result())
             self._watch.forget_touch(time)
         self._begin_tracking(time)
