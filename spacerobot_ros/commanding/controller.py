@@ -307,6 +307,7 @@ class ControllerCommander(Commander):
         except PlanningError as error:
             if self._leaves_to_planner(key, goal):
                 self._fly_to.leave(goal.goal_id)
+                self._goal_file.end(goal.goal_id, refused=True)
                 self.host.log("info", f"The goal is left to the planner. {error}")
             else:
                 self._refuse_goal(str(error), goal.goal_id)

@@ -120,6 +120,7 @@ class ControlExecutive:
         self.servicing.end()
         self._after_tasks: dict[str, IdentifiedGoal] = {}
         self._carried_id: str | None = None
+        """Id of the goals whose tasks are done; None: no goals have had tasks."""
         self._requested: tuple[Task, ...] | None = None
         """Tasks requested without a goal, waiting for the next measured state."""
         self._guided = False

@@ -61,10 +61,13 @@ def controller(arm: SpaceRobot) -> Rig:
 
 
 def test_goals_of_the_base_are_left_to_a_planner_whose_reference_a_law_of_joints_tracks(
-    arm: SpaceRobot,
+    arm: SpaceRobot, tmp_path: Path
 ) -> None:
+    file = tmp_path / "goal.json"
+
     def told(*publishers: str) -> Rig:
-        rig = Rig(ControllerCommander, config(ControllerConfig, law="computed_torque"), arm.n)
+        settings = {"law": "computed_torque", "resume_file": str(file)}
+        rig = Rig(ControllerCommander, config(ControllerConfig, **settings), arm.n)
         rig.use(arm)
         rig.host.publishers |= {*publishers}
         rig.commander.activate()
@@ -75,6 +78,7 @@ def test_goals_of_the_base_are_left_to_a_planner_whose_reference_a_law_of_joints
     assert left.host.states == ["waiting"]
     assert left.host.events == []
     assert left.host.lines[-1][1].startswith("The goal is left to the planner. The law 'computed_")
+    assert not file.exists(), "the planner's goal is not resumed by the controller"
     refused = told()
     assert refused.host.states == ["waiting", "refused"]
     assert_one_sentence(refused.host.statuses[0].message)
