@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -27,7 +27,13 @@ from spacerobot_ros.errors import (
 )
 from spacerobot_ros.events import Event
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.flight.series import Commands, SentGoal, Signal, goal_at_end
+from spacerobot_ros.flight.series import (
+    Commands,
+    SentGoal,
+    Signal,
+    goal_at_end,
+    with_reported_goals,
+)
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.messages.diagnostics import read_status
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
@@ -242,35 +248,48 @@ class FlightBag(RecordedRobot):
         path, the last pose is the goal."""
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
-        goals: list[SentGoal] = []
+        goals, shapes = list[SentGoal](), [] if link else self._goal_shapes()
+        poses_W = self.quantity("odom", TOPICS["odom"].state[0])
+        for topic, time_ns, goal_id, message in self._goal_messages(link):
+            poses = getattr(message, "poses", [message])
+            if not poses:
+                continue
+            shape = None
+            if topic == "goal_pose":
+                shape = next((each for since, each in reversed(shapes) if since <= time_ns), None)
+            frame = poses[-1].header.frame_id or message.header.frame_id
+            *through, (position, attitude) = map(pose_of, poses)
+            if topic != "goal_pose" and not any(attitude):
+                # Zeros request only the position of an end-effector.
+                attitude = _NO_GOAL.quaternion.tolist()
+            time = time_ns / SECOND - self._zero
+            try:
+                goal = Goal.received(position, attitude, shape)
+                if len(poses_W):
+                    row = max(int(np.searchsorted(poses_W.time, time, side="right")) - 1, 0)
+                    goal = goal.kept_at(*np.split(poses_W.values[row], [3]))
+                if topic == "goal_path" and through:
+                    goal = replace(goal, waypoints=np.array([x + q for x, q in through]))
+            except PlanningError:
+                continue
+            if not world or frame in ("", world):
+                goals.append(SentGoal(time, goal, goal_id))
+        return tuple(sorted(goals, key=lambda sent: sent.time))
+
+    def goal_ids(self, links: Iterable[str]) -> set[str]:
+        """Return the ids of the goals of the base and of links; a goal may be invalid."""
+        return {goal_id for link in ("", *links) for _, _, goal_id, _ in self._goal_messages(link)}
+
+    def _goal_messages(self, link: str) -> Iterator[tuple[str, int, str, Any]]:
+        """Yield the topics, log times (ns), ids and messages of goals of the base or of a link."""
         topics = ["goal_pose", "goal_path"]
         if link:
             topics = [link_topic(link, kind) for kind in ("goal_pose", "path")]
         for topic in topics:
-            ids, shapes = GoalIds(), self._goal_shapes() if topic == "goal_pose" else []
+            ids = GoalIds()
             for time_ns, message in self.messages(topic):
-                shape = next((each for since, each in reversed(shapes) if since <= time_ns), None)
                 stamp = message.header.stamp
-                goal_id = ids.of(stamp.sec, stamp.nanosec)
-                poses = getattr(message, "poses", [message])
-                if not poses:
-                    continue
-                frame = poses[-1].header.frame_id or message.header.frame_id
-                *through, (position, attitude) = map(pose_of, poses)
-                if topic != "goal_pose" and not any(attitude):
-                    # Zeros request only the position of an end-effector.
-                    attitude = _NO_GOAL.quaternion.tolist()
-                try:
-                    goal = Goal.received(position, attitude, shape)
-                    if odom is not None:
-                        goal = goal.kept_at(*map(np.array, pose_of(odom[1].pose)))
-                    if topic == "goal_path" and through:
-                        goal = replace(goal, waypoints=np.array([x + q for x, q in through]))
-                except PlanningError:
-                    continue
-                if not world or frame in ("", world):
-                    goals.append(SentGoal(time_ns / SECOND - self._zero, goal, goal_id))
-        return tuple(sorted(goals, key=lambda sent: sent.time))
+                yield topic, time_ns, ids.of(stamp.sec, stamp.nanosec), message
 
     def _goal_shapes(self) -> list[tuple[int, list[float] | None]]:
         """Return the final shapes required of goals after a time (ns); None: any."""
@@ -385,9 +404,18 @@ def read_flight(bag: FlightBag) -> Flight:
     if link and not tool_goals and "planner" not in scenario.commanders:
         tool_goals = bag.goals(link)
     reports = [status for _, status in statuses[decider]]
-    # Bags from version 0.1 have no ids.
     sent = goals or next(filter(None, map(bag.goals, scenario.goal_links)), ())
-    follower, status = GoalFollower(sent[-1].goal_id if sent else "", unnamed=True), None
+    # Bags from version 0.1 have no ids.
+    goal_id = sent[-1].goal_id if sent else ""
+    known = bag.goal_ids({DEFAULT_END_EFFECTOR, link or DEFAULT_END_EFFECTOR, *scenario.goal_links})
+    # Some goals are sent before the recorder has discovered their sender.
+    missed = [each for each in statuses[decider] if each[1].goal_id not in {"", *known}]
+    if missed and (not sent or missed[-1][0] > sent[-1].time * SECOND):
+        goal_id = missed[-1][1].goal_id
+    goals = with_reported_goals(goals, missed)
+    # A controller's statuses do not contain the pose of the goal.
+    is_unknown = goal_id not in {"", *known, *(each.goal_id for each in goals)}
+    follower, status = GoalFollower(goal_id, unnamed=True), None
     for status in reports:
         if follower.update(status):
             break
@@ -402,7 +430,7 @@ def read_flight(bag: FlightBag) -> Flight:
         events=tuple(bag.timed_events()),
         outcome=Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value),
         message=status.message if status is not None else "",
-        goal=goal_at_end(reports, goals),
+        goal=None if is_unknown else goal_at_end(reports, goals),
         end_effector_goal=tool_goals[-1].goal if tool_goals else None,
         goals=goals,
         end_effector_goals=tool_goals,

@@ -152,14 +152,14 @@ def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
 
 
 def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
-    for sent in reversed(goals):
-        if status.goal_id and status.goal_id == sent.goal_id:
-            return sent.goal
+    as_sent = [each.goal for each in goals if status.goal_id and status.goal_id == each.goal_id]
     named = status.goal if isinstance(status, PlannerStatus) else ()
     try:
         reported = Goal.checked(named[:3], named[3:])
     except PlanningError:
-        return None
+        return as_sent[-1] if as_sent else None
+    if as_sent:
+        return as_sent[-1].kept_at(reported.position, reported.quaternion)
     # Bags from earlier versions have no ids; the goal that was sent has more digits.
     for sent in reversed(goals):
         goal = sent.goal
@@ -167,6 +167,19 @@ def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | Non
         if same and np.allclose(goal.quaternion, reported.quaternion, rtol=0.0, atol=1e-7):
             return goal
     return reported
+
+
+def with_reported_goals(
+    goals: Sequence[SentGoal], statuses: Iterable[tuple[int, Status]]
+) -> tuple[SentGoal, ...]:
+    """Return the goals that were sent, and the base goals in statuses (time in ns) of others."""
+    found, ids = list(goals), {each.goal_id for each in goals}
+    for time_ns, status in statuses:
+        goal = None if status.goal_id in ids else reported_goal(status, ())
+        if goal is not None and goal.base:
+            found.append(SentGoal(time_ns / SECOND, goal, status.goal_id))
+            ids.add(status.goal_id)
+    return tuple(sorted(found, key=lambda sent: sent.time))
 
 
 def goal_at_end(statuses: Iterable[Status], goals: Sequence[SentGoal]) -> Goal | None:
