@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from planning.flown import STEP, fly, plant_at
 from scipy.spatial.transform import Rotation
+from support.hand_motion import attitude_after
+from support.oracles.pinocchio_oracle import PinocchioOracle
 from support.planner_loop import robot_of
 from support.planners import Planner, planner_of
 
-from spacerobot_ros.errors import PlanningError
+from spacerobot_ros.errors import PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning import (
     METHODS,
@@ -28,11 +30,14 @@ from spacerobot_ros.planning import (
     build_method,
     method_options,
 )
+from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.methods.registry import AutoGait
 
 PERIOD = 0.25
 TOLERANCE = Tolerance(0.02, 0.02)
+
+QUICK = {"cache": 0, "answers": 1, "intervals": 40}
 
 ANGLES = {"attitude", "shape"}
 START = {
@@ -263,6 +268,32 @@ def test_attitude_alone_is_no_substitute_for_a_pose() -> None:
     assert schedule.notes["chosen"] == "turns"
     assert built == ["turns"]
     assert schedule.controls == ATTITUDE
+
+
+def test_a_goal_without_attitude_moves_an_arms_base_and_turns_it_back() -> None:
+    robot, start = robot_of("three_joint_arm"), START["three_joint_arm"]
+    begun, way = Rotation.from_rotvec([0.3, -0.5, 0.9]), np.array([0.03, -0.02, 0.04])
+    state = RobotState(np.array([1.0, 2.0, 3.0]), begun.as_quat(), start)
+    method = build_method("auto", robot, 0.1, STEP, {"optimal": method_options("optimal", QUICK)})
+    for attitude, controls in ([np.nan] * 4, POSE), (begun.as_quat().tolist(), {"attitude"}):
+        wanted = Goal.received((state.position + way).tolist(), attitude)
+        goal = wanted.kept_at(state.position, state.quaternion)
+        schedule = method.plan(PlanRequest(state, goal, TOLERANCE))
+        assert schedule.controls & POSE == controls
+        if controls != POSE:
+            continue
+        oracle = PinocchioOracle(robot.description.urdf, robot.joint_names)
+        last = schedule.positions[-1]
+        end = attitude_after(oracle, schedule.positions, begun)
+        assert (end.inv() * begun).magnitude() <= 1e-6
+        # The centre of mass rests.
+        oracle.place(start, begun.as_quat(), state.position)
+        center = oracle.center_of_mass_W()
+        oracle.place(last, end.as_quat(), state.position + way)
+        np.testing.assert_allclose(oracle.center_of_mass_W(), center, atol=1e-7)
+    far = Goal.received([9.0, 0.0, 0.0], [np.nan] * 4).kept_at(state.position, state.quaternion)
+    with pytest.raises(UnreachableError, match="centre of mass"):
+        method.plan(PlanRequest(state, far, TOLERANCE))
 
 
 def test_a_goal_stays_with_its_method() -> None:

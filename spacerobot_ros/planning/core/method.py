@@ -137,8 +137,8 @@ class GaitMethod(ABC):
     name
         Registry name, and name of the parameter group ``<name>.<option>``.
     controls
-        Goal components controlled by the method's schedules. A method that selects among other
-        methods sets these components only in its schedules.
+        Components of a goal with position and attitude that the method's schedules control. A
+        method that selects among other methods sets these components only in its schedules.
     plans_for_base, plans_for_end_effectors
         Whether the method plans for base goals, and for end-effector goals.
     follows_paths
@@ -211,6 +211,10 @@ class GaitMethod(ABC):
         PlanningError
             The method cannot plan for the robot; the message says why.
         """
+
+    def controls_for(self, goal: Goal) -> frozenset[Controlled]:
+        """Return the components of a goal that the method's schedules control."""
+        return self.controls
 
     @abstractmethod
     def plan(self, request: PlanRequest, cancellation: Cancellation = NEVER) -> GaitSchedule:

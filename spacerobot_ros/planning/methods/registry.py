@@ -31,7 +31,7 @@ from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.parameters import configured, declared, require_known
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import Clearance
-from spacerobot_ros.planning.core.goal import POSE, Controlled, PoseError, RobotState
+from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, PoseError, RobotState
 from spacerobot_ros.planning.core.method import NO_JOINTS, GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
@@ -97,7 +97,7 @@ class AutoGait(GaitMethod):
         if not self.robot.n:
             raise PlanningError(NO_JOINTS.format(self.robot.description.name))
         refusals = dict(self._unsuitable)
-        names = self._comparable_methods(refusals)
+        names = self._comparable_methods(request.goal, refusals)
         if request.goal.end_effectors:
             names = [name for name in self._candidates if name not in self._unsuitable]
         if request.goal.has_path:
@@ -152,14 +152,14 @@ class AutoGait(GaitMethod):
         )
         return refusal_of_all(message, of_goal)
 
-    def _comparable_methods(self, refusals: dict[str, SpaceRobotError]) -> list[str]:
+    def _comparable_methods(self, goal: Goal, refusals: dict[str, SpaceRobotError]) -> list[str]:
         """Return the methods to compare; add the refusals of the other methods."""
         pose: dict[str, frozenset[Controlled]] = {}
         for name in self._candidates:
             if name in refusals or not self._candidates[name].plans_for_base:
                 continue
             try:
-                pose[name] = self._get_method(name).controls & POSE
+                pose[name] = self._get_method(name).controls_for(goal) & POSE
             except ParameterError as refusal:
                 refusals[name] = refusal
         for name, parts in pose.items():

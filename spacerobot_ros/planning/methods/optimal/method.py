@@ -135,8 +135,9 @@ class _Plan(NamedTuple):
 class OptimalGait(GaitMethod):
     """Plans manoeuvres of minimum time, or of least effort in a given time, from rest to rest.
 
-    A manoeuvre reaches the attitude; the position, if sliders can move the base to any position or
-    the options request it; and the final shape, if the goal has one. For end-effector goals, it
+    A manoeuvre reaches the attitude; the position, if sliders can move the base to any position,
+    the goal requests nothing else, or the options request it; and the final shape, if the goal has
+    one. For end-effector goals, it
     reaches these goals and the requested components of the base pose. The search has a budget of
     starts and solver steps, so identical requests yield identical schedules on any machine, idle or
     busy, unless the user also limits its wall time.
@@ -173,13 +174,22 @@ class OptimalGait(GaitMethod):
         self._kinds: dict[tuple[object, ...], _GoalKind] = {}
         self._cache = Cache(cache_directory() / "plans") if chosen.cache else None
 
+    @override
+    def controls_for(self, goal: Goal) -> frozenset[Controlled]:
+        """Return the controlled components of a goal; see :meth:`GaitMethod.controls_for`."""
+        return self._kind_of(goal).specification.controls
+
     def _kind_of(self, goal: Goal) -> _GoalKind:
-        key = EndEffectorSpecification.key(goal) if goal.end_effectors else ()
+        base, hands = self._specification, goal.end_effectors
+        if self.options.base_position == 0 and not hands and goal.asked == {"position"}:
+            # Without the position, there would be nothing to reach.
+            base = replace(base, position=True)
+        key = EndEffectorSpecification.key(goal) if hands else (base.position,)
         if key not in self._kinds:
-            specification: GoalSpecification | EndEffectorSpecification = self._specification
+            specification: GoalSpecification | EndEffectorSpecification = base
             model = self._model
-            if goal.end_effectors:
-                specification = of = EndEffectorSpecification.of(self._specification, goal)
+            if hands:
+                specification = of = EndEffectorSpecification.of(base, goal)
                 # A motion to a given shape has no rows at its end: the attitude follows from it.
                 rows = None if of.ends_in_one_shape else of.rows
                 model = replace(model, axes=of.axes, end_effectors=rows)
@@ -306,7 +316,7 @@ class OptimalGait(GaitMethod):
                 "m/s, but optimal plans around obstacles only if the centre of mass is at rest."
             )
         in_frame = replace(request, state=replace(state, linear_momentum=np.zeros(3)))
-        if not goal.end_effectors and "position" not in self._specification.controls:
+        if not goal.end_effectors and "position" not in self.controls_for(goal):
             return self._plan_about_center(in_frame, cancellation, clock)
         if goal.joint_positions is not None and not goal.end_effectors:
             raise PlanningError(
@@ -415,7 +425,7 @@ class OptimalGait(GaitMethod):
         angle = 4.0 * math.acos(min(1.0, abs(float(state.quaternion @ between))))
         limited = options.duration > 0 or options.longest < OptimalOptions().longest
         timed = request.correction or task.boundary.drifts or limited
-        free = goal.end_effectors or "attitude" not in self._specification.controls & goal.base
+        free = goal.end_effectors or "attitude" not in self.controls_for(goal) & goal.base
         if timed or free:
             raise refusal
         if angle < _MIN_HALVED_ANGLE:
@@ -697,7 +707,7 @@ class OptimalGait(GaitMethod):
     def _is_reached(self, state: RobotState, goal: Goal) -> bool:
         error = PoseError.between(state.position, state.quaternion, goal, state.q, self.robot)
         nothing = Tolerance(_ZERO_ERROR, _ZERO_ERROR, _ZERO_ERROR)
-        return nothing.admits(error, self._kind_of(goal).specification.controls)
+        return nothing.admits(error, self.controls_for(goal))
 
     def _build_schedule(self, request: PlanRequest, plan: _Plan) -> GaitSchedule:
         """Return a plan as a schedule, with notes on its end."""
@@ -716,7 +726,7 @@ class OptimalGait(GaitMethod):
         (true_position,) = self._prediction.positions(
             state, path.time[-1:], positions[-1:], true_end[np.newaxis]
         )
-        controls = self._kind_of(goal).specification.controls
+        controls = self.controls_for(goal)
         at_end = self._end_notes(goal, positions[-1], true_position, true_end, controls)
         notes = {**plan.notes, **at_end}
         if L_B is not None:
@@ -767,6 +777,7 @@ class OptimalGait(GaitMethod):
             "limits": vars(self._limits),
             "state": vars(request.state),
             "goal": [goal.position, goal.quaternion, goal.joint_positions, sorted(goal.base)],
+            "controls": sorted(self.controls_for(goal)),
             "end_effectors": [[each.link, each.values] for each in goal.end_effectors],
             "tolerance": vars(request.tolerance),
         }

@@ -64,7 +64,10 @@ class OptimalOptions(MotionOptions):
         "margin of every joint to its limits, except in corrections; []: none", "m or rad"
     )
     base_position: int = nonnegative(
-        0, "goal position: 0: reached if sliders allow it, 1: reached, 2: ignored", maximum=2
+        0,
+        "goal position: 0: reached if sliders allow it or nothing else is requested, 1: reached, "
+        "2: ignored",
+        maximum=2,
     )
     base_attitude: int = nonnegative(1, "1: reached, 0: ignored", maximum=1)
     final_shape: int = nonnegative(
