@@ -273,7 +273,7 @@ class Scenario:
     def with_method(self, method: str) -> Scenario:
         """Return the scenario with another gait method, or another control law.
 
-        With a control law, a robot without a scenario uses a controller instead of a planner.
+        A robot without a scenario uses the node of the method or law.
 
         Raises
         ------
@@ -289,11 +289,11 @@ class Scenario:
         kind, node, parameter = "gait method", "planner", "method"
         if method in LAWS:
             kind, node, parameter = "control law", "coordinated_control", "law"
-            robot = self.in_file.get("plant", {})
-            # A robot alone, as scenario_or_robot returns it, has no other parameters.
-            if len(robot) == 1 and self.in_file == _nodes_of(dict(robot)):
-                nodes = {"plant": robot, "coordinated_control": {**robot, "law": method}}
-                return replace(self, in_file=nodes, commanders=(node,), _configs={})
+        robot = self.in_file.get("plant", {})
+        # A robot alone, as scenario_or_robot returns it, has no other parameters.
+        if len(robot) == 1 and all(each == robot for each in self.in_file.values()):
+            nodes = {"plant": robot, node: {**robot, parameter: method}}
+            return replace(self, in_file=nodes, commanders=(node,), _configs={})
         if node not in self.commanders:
             raise ParameterError(
                 f"'{method}' is a {kind}, and the scenario '{self.name}' has no section "
@@ -527,7 +527,8 @@ def load_scenario(name: str) -> Scenario:
 def scenario_or_robot(name: str) -> Scenario:
     """Return a scenario by name, or a scenario without a goal for a robot (name or URDF file).
 
-    If only a robot is given, the planner selects the method.
+    If only a robot is given, the planner selects the method; a robot without joints is flown by a
+    controller.
 
     Raises
     ------
@@ -543,18 +544,22 @@ def scenario_or_robot(name: str) -> Scenario:
     if name in scenario_names() or not is_robot:
         return load_scenario(name)
     path = path if path.is_file() else robot_file(name)
-    load_robot(path)  # A file that is not a robot is rejected before the missing goal.
+    # A file that is not a robot is rejected before the missing goal.
+    description = load_robot(path)
     robot = {"robot": str(path.resolve()) if path == Path(name) else name}
-    return Scenario(path.name.split(".")[0], path, _nodes_of(robot))
+    return _robot_alone(path.name.split(".")[0], path, robot, description)
 
 
 def scenario_of(robot: RobotDescription) -> Scenario:
     """Return a scenario without a goal for a robot, like :func:`scenario_or_robot`."""
-    return Scenario(robot.name, Path(), _nodes_of({"robot_description": robot.urdf}))
+    return _robot_alone(robot.name, Path(), {"robot_description": robot.urdf}, robot)
 
 
-def _nodes_of(robot: dict[str, str]) -> dict[str, dict[str, Any]]:
-    return {"plant": robot, "planner": robot}
+def _robot_alone(
+    name: str, path: Path, robot: dict[str, str], description: RobotDescription
+) -> Scenario:
+    node = "planner" if description.movable_joints else "coordinated_control"
+    return Scenario(name, path, {"plant": robot, node: robot}, commanders=(node,))
 
 
 def scenario_names() -> list[str]:

@@ -13,7 +13,8 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from spacerobot_ros.errors import GoalError, ParameterError
+from spacerobot_ros import fly
+from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import SpaceRobot
@@ -264,6 +265,19 @@ def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
     half = np.sqrt(0.5)
     assert there.goal.quaternion == pytest.approx([0.0, 0.0, half, half])
     assert there.commanders == ("planner",)
+
+
+def test_a_robot_alone_without_joints_is_flown_by_its_thrusters(tmp_path: Path) -> None:
+    box = tmp_path / "box.urdf"
+    inertia = '<inertia ixx="0.2" iyy="0.25" izz="0.3" ixy="0" ixz="0" iyz="0"/>'
+    body = f'<link name="box"><inertial><mass value="16"/>{inertia}</inertial></link>'
+    box.write_text(f'<robot name="box">{body}</robot>', "utf-8")
+    goal = [0.2, -0.1, 0.05]
+    flight = fly(box, position=goal, rotvec=[0.0, 0.1, 0.2])
+    assert flight.scenario.commanders == ("coordinated_control",)
+    np.testing.assert_allclose(flight.pose[-1, :3], goal, atol=1e-3)
+    with pytest.raises(PlanningError, match="no joints"):
+        fly(box, position=goal, method="auto")
 
 
 def test_degrees_are_roll_pitch_and_yaw_about_fixed_axes() -> None:
