@@ -142,7 +142,8 @@ class AutoGait(GaitMethod):
             if isinstance(refusal, UnreachableError):
                 return refusal
         names_by_reason: dict[str, list[str]] = {}
-        for name in self._candidates:
+        # What other goals could change comes first.
+        for name in sorted(self._candidates, key=self._unsuitable.__contains__):
             if name in refusals:
                 names_by_reason.setdefault(str(refusals[name]), []).append(name)
         reasons = " ".join(f"{', '.join(each)}: {why}" for why, each in names_by_reason.items())
