@@ -3,7 +3,7 @@
 A servicer meets the satellite's grapple fixture, which turns about two axes, at any time. Every
 motion is compared with the target's by scipy, and looked at by coal at 400 instants. With
 `--flown`, draws of the scenario `servicing` are flown with pulses of thrusters and noise of
-sensors, by a planned approach and by the one that holds the base.
+sensors, by planned approaches and by one that holds the base.
 """
 
 from __future__ import annotations
@@ -82,8 +82,13 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool, bare: bool) 
     return f"{line}, {touching} touch it without rows" if bare else line
 
 
-def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> str:
-    """Return a line about flights of the scenario `servicing` up to the grasp."""
+def flown(
+    rate: float, draws: int, seed: int, profile: str, detumble: str, mass_error: float = 0.0
+) -> str:
+    """Return a line about flights of the scenario `servicing` up to the grasp.
+
+    Masses and inertias that the controller believes are wrong by up to ``mass_error``.
+    """
     rng, propellant, left, took, cpu = np.random.default_rng(seed), [], [], [], []
     for number in range(draws):
         axis = rng.normal(size=2)
@@ -102,6 +107,8 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
                     "coordinated_control.target.horizon": 60.0,
                     "coordinated_control.plan.duration": 60.0,
                     "coordinated_control.target.detumble": detumble,
+                    "coordinated_control.model_error": mass_error,
+                    "coordinated_control.model_error_seed": number,
                     # Flights end soon after the grasp: the time for detumbling is over.
                     "coordinated_control.time_limit": 0.1,
                 },
@@ -118,11 +125,13 @@ def flown(rate: float, draws: int, seed: int, profile: str, detumble: str) -> st
         left.append(float(np.linalg.norm(capture["angular_momentum_Nms"])))
         took.append(capture["time_s"])
         print(f"{number}: captured after {took[-1]} s, {cpu[-1]:.1f} s of CPU", flush=True)
-    line = f"{rate:g} deg/s, {profile}, {detumble}: {len(took)} of {draws} captured"
+    line = f"{rate:g} deg/s, {profile}, {detumble}, masses wrong by up to {mass_error:.0%}: "
+    line += f"{len(took)} of {draws} captured"
     if took:
         line += (
             f" after {np.median(took):.1f} s with {1e3 * np.median(propellant):.1f} g, "
-            f"{np.median(left):.3f} N m s left; {np.median(cpu):.1f} s of CPU"
+            f"{np.median(left):.3f} N m s left (95 %: {np.quantile(left, 0.95):.3f}); "
+            f"{np.median(cpu):.1f} s of CPU"
         )
     return line
 
@@ -144,6 +153,8 @@ def main() -> None:
             ways = ("planned", "before"), ("planned", "after"), ("quintic", "after")
             for profile, detumble in ways:
                 print(flown(rate, given.goals, given.seed, profile, detumble), flush=True)
+            few = given.goals // 2
+            print(flown(rate, few, given.seed, "planned", "before", 0.05), flush=True)
         else:
             asked = {"detumbles": given.detumbles, "bare": given.bare}
             print(planned(rate, given.goals, given.seed, **asked), flush=True)
