@@ -102,7 +102,7 @@ class OptimalOptions(MotionOptions):
         maximum=10000,
     )
     agreeing: int = nonnegative(
-        3,
+        4,
         "number of starts that must find the best solution to end the search; 0: not used",
         maximum=10000,
     )
