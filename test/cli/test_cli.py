@@ -22,7 +22,6 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.cli.campaign import campaign_command
 from spacerobot_ros.cli.main import COMMANDS, CommandGroup, main
-from spacerobot_ros.files import load_yaml
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import load_scenario, scenario_names
 
@@ -314,15 +313,6 @@ def test_harmful_yaml_is_one_sentence(words: tuple[str, ...], name: str, tmp_pat
     assert_one_sentence(result.stderr, str(file))
     if name != "number" or sys.version_info >= (3, 11):
         assert reason in result.stderr
-
-
-def test_anchors_and_merged_mappings_are_read() -> None:
-    text = "common: &c {rate: 20, names: [a, b]}\nfirst: {<<: *c, rate: 10}\nsecond: *c\n"
-    content = load_yaml(text)
-    assert content["first"] == {"rate": 10, "names": ["a", "b"]}
-    assert content["second"] == {"rate": 20, "names": ["a", "b"]}
-    assert load_yaml("") is None
-    assert load_yaml("[1, 2.5, x, null]") == [1, 2.5, "x", None]
 
 
 def started(*words: str | bytes, **variables: str) -> subprocess.CompletedProcess[str]:

@@ -31,8 +31,6 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     GoalFile,
-    IdentifiedGoal,
-    PursuedGoals,
 )
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
@@ -321,20 +319,6 @@ def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
     assert (len(server.sent), server.cancelled) == (1, [1])
 
 
-def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
-    planner: Rig,
-) -> None:
-    first, second = Client(), Client()
-    for goal_id, client in (("a", first), ("b", second)):
-        planner.commander.receive_fly_to(goal_id, lambda: FlyTo(GOAL), client)
-    decided = [(each.state.value, each.goal_id) for each in planner.host.statuses if each.goal_id]
-    assert decided == [("aborted", "a")]
-    ended = [each.goal_id for each in planner.host.events if each.kind is EventKind.GOAL_ABORTED]
-    assert ended == ["a"]
-    assert first.end_of[0] == "aborted"
-    assert not second.results
-
-
 def test_goals_that_are_pursued_together_are_aborted_together(controller: Rig) -> None:
     rig = controller
     rig.state(1)
@@ -353,19 +337,6 @@ def test_goals_that_are_pursued_together_are_aborted_together(controller: Rig) -
     outcome, message = client.end_of
     assert outcome == "aborted"
     assert "replaced" not in message
-
-
-def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
-    robot: SpaceRobot, tmp_path: Path
-) -> None:
-    path = tmp_path / "goal.json"
-    GoalFile(str(path)).pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "9.000000000")}))
-    rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
-    rig.commander.activate()
-    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("waiting", "9.000000000")
-    rig.commander.give_up_goals("Node '/plant' is silent.")
-    assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
-    assert not path.exists()
 
 
 @pytest.mark.parametrize("kind", [PlannerCommander, ControllerCommander])

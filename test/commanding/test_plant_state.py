@@ -366,19 +366,6 @@ def test_a_restarted_plant_is_believed_when_nothing_contradicts_it(at: float) ->
     assert listener.times.ignored == 0
 
 
-@pytest.mark.parametrize("rate", [0.5, 5.0, 200.0])
-@pytest.mark.parametrize("pace", [1.0, 500.0])
-def test_the_rate_of_any_plant_is_known_after_three_states(rate: float, pace: float) -> None:
-    listener = Listener(pace)
-    for number in range(50):
-        assert (listener.times.rate > 0) == (number > 2)
-        listener.time += 1 / rate
-        listener.wait(1 / rate / pace)
-        assert listener.odom(listener.time)
-        assert listener.joints(listener.time)
-    assert listener.times.rate == pytest.approx(rate, rel=1e-6)
-
-
 def test_a_plant_that_is_restarted_with_another_rate_is_followed() -> None:
     listener = Listener()
     listener.states(20)

@@ -30,7 +30,6 @@ from support.executive_loop import (
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.control import (
-    ControlLaw,
     ControlState,
     JointReference,
     PoseReference,
@@ -40,7 +39,7 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.errors import PlanningError, SpaceRobotError
 from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
@@ -453,15 +452,6 @@ def test_a_reference_of_the_end_effector_from_outside_is_followed() -> None:
     np.testing.assert_allclose(loop.answer(reference=reference)[0][:3], KP * (AIM + up), atol=1e-12)
 
 
-def test_a_body_twist_is_turned_into_the_world() -> None:
-    half = math.sqrt(0.5)
-    turned = PoseReference.with_body_twist(
-        AIM, np.array([0.0, 0.0, half, half]), np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0])
-    )
-    np.testing.assert_allclose(turned.velocity, [-2.0, 1.0, 3.0], atol=1e-15)
-    np.testing.assert_allclose(turned.angular_velocity, [-5.0, 4.0, 6.0], atol=1e-15)
-
-
 # -- statuses, construction -------------------------------------------------------------------
 
 
@@ -528,17 +518,6 @@ def test_a_status_survives_its_values(
 def test_other_values_are_no_status_of_a_controller(values: dict[str, str]) -> None:
     with pytest.raises(SpaceRobotError, match="No status of a controller"):
         ControllerStatus.from_values(values)
-
-
-def test_a_controller_is_built_from_its_configuration() -> None:
-    def built(**chosen: str) -> ControlLaw:
-        return build_controller(planar_manipulator(), configured(ControllerConfig, chosen)).law
-
-    assert built().outputs.selection.end_effector_link == "end_effector"
-    law = built(law="model_based", base_outputs="x y", joint_outputs="elbow")
-    assert (law.name, law.outputs.labels) == ("model_based", ("base.x", "base.y", "joint.elbow"))
-    with pytest.raises(ParameterError, match="tail"):
-        built(joint_outputs="tail")
 
 
 # -- events, and a plant that does not obey ---------------------------------------------------
@@ -693,30 +672,6 @@ def test_force_and_torque_that_thrusters_cannot_give_are_reported_apart() -> Non
 
 
 # -- without odom -----------------------------------------------------------------------------
-
-
-def test_the_base_is_estimated_for_a_while_and_then_the_thrusters_are_off() -> None:
-    loop = ExecutiveLoop(estimation_time=0.05)
-    loop.aim(base=goal_at([1.0, 0.0, 0.0], "3"), end_effector=goal_at(TIP, "3"))
-    measured = loop.answer()[0]
-    for tick in range(5):
-        wrench, _ = loop.answer(measured=False)
-        np.testing.assert_allclose(wrench, measured, atol=0.15 * np.abs(measured).max())
-        # A single pose may be late.
-        reported = ("estimating", 1) if tick else ("tracking", 0)
-        assert (loop.state, loop.status.state.level) == reported
-        assert loop.status.goal_id == "3"
-    loop.rates = np.array([0.1, -0.2])
-    for _ in range(4):
-        wrench, effort = loop.answer(measured=False)
-        np.testing.assert_array_equal(wrench, np.zeros(6))
-    # The joints are slowed: their efforts take energy out of them.
-    assert effort @ loop.rates < 0.0
-    assert (loop.state, loop.status.state.level) == ("stopped", 2)
-    assert_one_sentence(loop.status.message, "thrusters off")
-    loop.rates = np.zeros(2)
-    np.testing.assert_allclose(loop.answer()[0][:3], [KP, 0.0, 0.0], atol=1e-12)
-    assert loop.state == "tracking"
 
 
 def test_the_estimate_takes_what_the_thrusters_gave_and_not_what_was_wanted() -> None:

@@ -308,26 +308,6 @@ def test_a_reader_learns_a_layout_once(
         check_reads(reader, message)
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
-def test_a_reader_sees_that_a_name_of_equal_length_has_changed(quantity: str) -> None:
-    reader = TemplateReader(JOINT_STATE)
-    changes = ((["a", "b"], True), (["a", "b"], False), (["b", "a"], True), (["b", "a"], False))
-    for names, changed in changes:
-        numbers: dict[str, Any] = {q: [1.0, 2.0] for q in QUANTITIES}
-        assert reader.accept(serialize_message(JointState(name=names, **numbers))) is changed
-        assert reader.texts("name") == names
-        np.testing.assert_array_equal(reader.floats(quantity), [1.0, 2.0])
-
-
-def test_a_reader_sees_that_numbers_have_moved_from_one_field_to_the_next() -> None:
-    # The same size and names, and other lengths.
-    reader = TemplateReader(JOINT_STATE)
-    for position, velocity in (([1.0, 2.0], [3.0]), ([1.0], [2.0, 3.0]), ([1.0, 2.0], [3.0])):
-        message = JointState(name=["a"], position=position, velocity=velocity, effort=[0.0])
-        assert reader.accept(serialize_message(message))
-        check_reads(reader, message)
-
-
 def test_a_name_without_its_final_zero_is_whole_as_in_other_readers() -> None:
     raw = bytearray(serialize_message(JointState(name=["ab", "cd"])))
     raw[raw.index(b"ab\0") + 2] = 1

@@ -84,16 +84,6 @@ def engine(request: pytest.FixtureRequest, case: Case) -> Oracle:
     return case.engines[request.param]
 
 
-def test_robots_have_every_kind_of_joint() -> None:
-    for seed in SEEDS:
-        robot = random_case(seed).robot
-        kinds = {joint.kind.value for joint in robot.description.joints}
-        assert kinds == {"prismatic", "revolute", "continuous", "fixed"}
-        assert np.linalg.norm(robot.description.bodies[0].inertia.com) > 0.01
-        children = [body.parent for body in robot.description.bodies[1:]]
-        assert len(set(children)) < len(children), "the tree branches"
-
-
 def test_inertia_matrix(case: Case, engine: Oracle) -> None:
     H = case.robot.inertia_matrix(case.motion.q)
     assert_agrees(H, engine.mass_matrix(case.motion))

@@ -9,10 +9,9 @@ import pytest
 from support.command_line import CliRunner
 
 from spacerobot_ros.cli.main import main
-from spacerobot_ros.errors import ParameterError, RobotDescriptionError
+from spacerobot_ros.errors import RobotDescriptionError
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.urdf import mesh_file
-from spacerobot_ros.resources import robot_file
 from spacerobot_ros.session.own_robot import urdf_remarks
 
 INERTIAL = """<inertial><mass value="{mass}"/>
@@ -500,12 +499,3 @@ def test_meshes_of_this_package_are_found_without_a_ros_environment() -> None:
     assert found is None or found.name == "package.xml"
     assert mesh_file("package://no_such_package/a.stl") is None
     assert mesh_file("http://example.org/a.stl") is None
-
-
-def test_a_folder_and_a_misspelt_file_are_named(tmp_path: Path) -> None:
-    (tmp_path / "robots").mkdir()
-    with pytest.raises(ParameterError, match="is a folder; name the URDF file in it"):
-        robot_file(str(tmp_path / "robots"))
-    file_with(tmp_path, urdf(), "inspector.urdf")
-    with pytest.raises(ParameterError, match=r"Did you mean 'inspector\.urdf'\?"):
-        robot_file(str(tmp_path / "inspectr.urdf"))

@@ -69,22 +69,6 @@ from spacerobot_ros.simulation import InitialState, VelocityPlant
 # -- why plans are requested ------------------------------------------------------------------
 
 
-def test_a_goal_is_planned_from_rest_or_blended_into() -> None:
-    loop = resting(ticks=40)
-    loop.propose_goal(NEAR)
-    loop.tick(10)
-    loop.propose_goal(OTHER)
-    loop.tick()
-    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.BLEND]
-    first, second = stub_of(loop).requests
-    assert first.previous is None
-    assert second.previous is None
-    assert not second.correction
-    # The second plan begins where the joints will be at rest, not where they are.
-    assert np.abs(second.state.q - loop.shapes[-2]).max() > 1e-3
-    assert loop.until(PlannerState.REACHED).goal_id == "goal-2"
-
-
 def test_what_is_missed_is_corrected_and_counts() -> None:
     loop = resting()
     stub_of(loop).overshoot = 0.1
@@ -349,25 +333,6 @@ def test_after_a_reset_the_shape_of_before_is_not_held() -> None:
 
 
 # -- what the statuses say --------------------------------------------------------------------
-
-
-def test_statuses_speak_of_a_goal_by_its_id() -> None:
-    loop = resting(ticks=40)
-    loop.propose_goal(NEAR)
-    loop.tick(5)
-    loop.propose_goal(FAR)
-    loop.tick()
-    loop.until(PlannerState.REACHED)
-    loop.propose_goal(OTHER)
-    loop.tick(3)
-    loop.abort()
-    assert [(s.state.value, s.goal_id) for s in loop.statuses] == [
-        ("executing", "goal-1"),
-        ("refused", "goal-2"),
-        ("reached", "goal-1"),
-        ("executing", "goal-3"),
-        ("aborted", "goal-3"),
-    ]
 
 
 def test_times_and_corrections_are_those_of_the_goal() -> None:

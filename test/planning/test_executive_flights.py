@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planning.test_given_paths import distance_from
 from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod
 from support.planner_phases import until
 from support.sentences import assert_one_sentence
@@ -30,28 +29,6 @@ COARSE = {
 
 
 # -- reached, or refused with the true reason -------------------------------------------------
-
-
-def test_the_pose_that_is_already_there_is_reached() -> None:
-    loop = Loop()
-    status = loop.decide(HERE)
-    assert status.state is PlannerState.REACHED
-    assert_one_sentence(status.message, "reached")
-    (start,) = loop.starts
-    assert start.schedule.ticks <= 1
-    loop.tick(5)
-    assert not any(loop.speeds)
-
-
-def test_the_measured_error_is_reported() -> None:
-    loop = Loop({"position_tolerance": 2e-3, "attitude_tolerance": 3e-4})
-    status = loop.decide(TURNED)
-    distance, angle = loop.error_to(TURNED)
-    assert distance <= 2e-3
-    assert angle <= 3e-4
-    assert status.position_error_m == pytest.approx(distance, rel=1e-3, abs=1e-9)
-    assert status.attitude_error_rad == pytest.approx(angle, rel=1e-3, abs=1e-9)
-    assert loop.states == ["executing", "reached"]
 
 
 def test_a_goal_that_is_missed_fails_with_a_sentence() -> None:
@@ -136,34 +113,6 @@ def test_small_tracking_errors_are_left_to_the_end() -> None:
     assert loop.states == ["executing", "reached"]
 
 
-def test_abortion_brings_the_joints_to_rest_on_their_path() -> None:
-    loop = Loop()
-    loop.propose_goal(NEAR)
-    loop.tick(15)
-    assert loop.abort() == "The joints brake along the planned path within 1 s."
-    assert_one_sentence(loop.statuses[-1].message, "Aborted on request.")
-    began = len(loop.commands)
-    loop.tick(83)
-    path = loop.starts[0].schedule.positions
-    for shape in loop.shapes[began:]:
-        assert distance_from(path, shape) < 1e-9, "it rests on its path"
-    braking = loop.speeds[began : began + 23]
-    assert max(np.abs(np.diff(braking))) < 0.5 * max(braking), "and does not stop dead"
-    assert not any(loop.speeds[began + 21 :])
-    assert loop.states == ["executing", "aborted"]
-    assert loop.abort() is None
-    assert loop.decide(NEAR).state is PlannerState.REACHED
-    assert max(loop.error_to(NEAR)) <= 1e-3
-
-
-def test_a_goal_that_waits_for_a_state_can_be_aborted() -> None:
-    loop = Loop()
-    loop.propose_goal(NEAR)
-    loop.abort()
-    loop.tick(10)
-    assert not loop.starts
-
-
 # -- planned in the background ----------------------------------------------------------------
 
 
@@ -232,13 +181,6 @@ def wait(loop: Loop, goal_id: str, state: PlannerState = PlannerState.REACHED) -
     while not any((s.goal_id, s.state) == (goal_id, state) for s in loop.statuses[-1:]):
         assert time.monotonic() < end, f"{goal_id} is not {state.value}: {loop.statuses}"
         loop.tick()
-
-
-def test_a_thread_plans_while_states_are_answered() -> None:
-    loop = threaded(searching())
-    for place in (NEAR, HERE):
-        wait(loop, loop.propose_goal(place))
-        assert loop.error_to(place)[0] < 1e-3
 
 
 def test_a_worker_that_is_closed_has_its_search_end_soon() -> None:

@@ -10,8 +10,6 @@ import pytest
 from support.wheels import wheeled_robot
 
 from spacerobot_ros.errors import CommandError, ParameterError
-from spacerobot_ros.messages.definitions import encode
-from spacerobot_ros.messages.readers import JOINT_STATE, WRENCH, CommandReader, JointReader
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
@@ -71,26 +69,6 @@ def test_a_tick_is_answered_once_and_by_its_own_stamp() -> None:
     assert rig.reason(2 * TICK + 1, 2 * TICK) is Reason.EARLY
     assert not rig.commands.complete, "commands of other ticks answer nothing"
     assert rig.commands.counts == {Reason.STALE: 2, Reason.EARLY: 2}
-
-
-@pytest.mark.parametrize(
-    ("values", "reason"),
-    [
-        (CommandError("joint 'rudder' is unknown"), Reason.MALFORMED),
-        (np.array([0.1, np.nan, 0.0]), Reason.NOT_FINITE),
-        (np.array([np.inf, -np.inf, 0.0]), Reason.NOT_FINITE),
-        (np.array([0.0, 0.0, -9.0]), Reason.BEYOND_LIMITS),
-    ],
-)
-def test_a_bad_command_is_a_tick_at_rest(values: Any, reason: Reason) -> None:
-    rig = Rig(beyond_limits="refuse")
-    assert rig.offer(0, 0) is None
-    rig.commands.begin_step()
-    assert rig.reason(TICK, TICK, values) is reason
-    assert rig.commands.complete, "time goes on"
-    assert rig.in_force() == [0.0, 0.0, 0.0]
-    assert rig.offer(2 * TICK, 2 * TICK) is None
-    assert rig.in_force() == list(FAST)
 
 
 def test_a_tick_takes_no_second_command_also_after_a_bad_one() -> None:
@@ -391,37 +369,6 @@ def test_a_limit_is_named_beside_what_is_beyond_it() -> None:
     assert refusal is not None
     limits = SLIDERS.velocity_limit.tolist()
     assert refusal.clause == f"[0.0, 0.5, -9.0] exceeds the limits {limits}"
-
-
-def test_names_and_lengths() -> None:
-    reader = JointReader(("a", "b", "c"), ["effort"])
-
-    def read(named: list[str], efforts: list[float]) -> list[float]:
-        reader.accept(encode(JOINT_STATE, {"name": named, "effort": efforts}))
-        return reader.values["effort"].tolist()
-
-    assert read(["c", "a", "b"], [3.0, 1.0, 2.0]) == [1.0, 2.0, 3.0]
-    for named, words in (
-        (["c", "x"], "'x' is unknown"),
-        (["a", "b"], "'c' is missing: each message must name all joints"),
-        ([], "'a' is missing"),
-        (["a", "a", "b"], "named twice"),
-    ):
-        with pytest.raises(CommandError, match=words):
-            read(named, [0.0] * len(named))
-    with pytest.raises(CommandError, match=r"3 joint names and 2 effort"):
-        read(["a", "b", "c"], [1.0, 2.0])
-
-
-def test_a_wrench_is_in_the_frame_of_the_base_link() -> None:
-    base = SLIDERS.base_link
-    reader = CommandReader(CommandSource("base_wrench", "wrench", np.full(6, np.inf)), SLIDERS)
-    for frame in ("", base):
-        _, values = reader.read(encode(WRENCH, {"header": {"frame_id": frame}}))
-        assert not isinstance(values, CommandError)
-    for _ in range(2):
-        _, refused = reader.read(encode(WRENCH, {"header": {"frame_id": "world"}}))
-        assert str(refused) == f"the wrench is in frame 'world'; it must be in '{base}'"
 
 
 def test_wheels_keep_their_rates_where_commands_end_until_a_reset() -> None:

@@ -114,13 +114,6 @@ NOISY = SensorConfig(
 )
 
 
-def test_perfect_sensors_do_nothing_at_all() -> None:
-    flight = Flight(SensorConfig(), ticks=5)
-    assert not flight.sensors.used
-    # They have not even looked.
-    np.testing.assert_array_equal(flight.measured, np.tile(flight.true[0], (5, 1)))
-
-
 def test_every_component_has_its_noise_and_no_mean() -> None:
     ticks = 3000
     flight = Flight(NOISY, ticks=ticks)
@@ -177,18 +170,6 @@ def test_faults_of_sensors_come_and_go() -> None:
     assert np.flatnonzero(flight.dropouts).tolist() == list(range(200, 220))
     biased = flight.errors()["joints"][:, 2]
     assert np.flatnonzero(biased).tolist() == list(range(400, 420))
-
-
-def test_a_late_pose_is_that_of_as_many_ticks_before() -> None:
-    flight = Flight(SensorConfig(), "sensor_delay odom 0.2 at 1 until 3", ticks=80)
-    pose, late = flight.true[:, :13], flight.measured[:, :13]
-    np.testing.assert_array_equal(late[:20], pose[:20])
-    # As long as less is known of the past, it is the oldest that is.
-    np.testing.assert_array_equal(late[24:60], pose[20:56])
-    np.testing.assert_array_equal(late[60:], pose[60:])
-    np.testing.assert_array_equal(
-        flight.measured[:, 13:], flight.true[:, 13:], "joints are on time"
-    )
 
 
 def test_a_bias_of_other_joints_is_refused() -> None:
@@ -438,30 +419,6 @@ def reported(robot: SpaceRobot, **parameters: Any) -> ReportedState:
 
 def names(state: ReportedState) -> list[str]:
     return [topic.name for topic in state.topics]
-
-
-def test_topics_follow_from_the_plant() -> None:
-    perfect = ["base_pose", "momentum", "odom", "joint_states"]
-    assert [n for n in names(reported(SLIDERS)) if n != "end_effector_pose"] == perfect
-    assert "momentum_expected" in names(reported(SLIDERS, actuation="effort"))
-    noisy = names(reported(SLIDERS, sensors=SensorConfig(joint_noise=1e-3)))
-    assert noisy[-4:] == ["odom_true", "joint_states_true", "odom", "joint_states"]
-    with pytest.raises(ParameterError, match="'end_effector_frame' is 'claw'"):
-        reported(SLIDERS, end_effector_frame="claw")
-
-
-def test_the_truth_goes_to_its_own_topics_once_the_sensors_err() -> None:
-    config = PlantConfig()
-    plant = build_plant(ARM, config)
-    state = ReportedState(plant, config)
-    assert not state.update()
-    assert state.quantities["measured_q"] is plant.q
-    plant.inject(f"sensor_bias {ARM.joint_names[0]} 0.5")
-    assert state.update()
-    assert "odom_true" in names(state)
-    assert state.quantities["true_q"] is plant.q
-    assert state.quantities["measured_q"][0] == plant.q[0] + 0.5
-    assert not state.update()
 
 
 def test_named_links_are_where_pinocchio_sees_them_in_the_measured_state() -> None:

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.events import Event, EventKind
+from spacerobot_ros.events import EventKind
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
-from spacerobot_ros.simulation import InitialState
 from spacerobot_ros.simulation.actuators import PLANTS, build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
@@ -69,13 +68,6 @@ def test_a_plant_in_real_time_rests_until_commanded_and_again_when_commands_are_
     rig.commands.rest()
     assert rig.events() == [EventKind.RESTING], "another reason"
     assert rig.state == (PlantState.RESTING, "no_command")
-
-
-def test_a_plant_in_lockstep_that_waits_is_running() -> None:
-    rig = Rig("lockstep")
-    assert rig.events() == [EventKind.RUNNING]
-    rig.command()
-    assert rig.events() == []
 
 
 def test_a_latched_fault_shows_in_every_state() -> None:
@@ -140,15 +132,6 @@ def test_faults_begin_and_end_one_by_one() -> None:
     assert not rig.monitor.status.faults
 
 
-def test_a_failure_says_why() -> None:
-    rig = Rig()
-    rig.monitor.failure = "exception", "The plant has failed: no luck."
-    rig.events(PlantState.FAILED)
-    assert rig.state == (PlantState.FAILED, "exception")
-    assert rig.monitor.status.message == "The plant has failed: no luck."
-    assert rig.monitor.status.level == 2
-
-
 @pytest.mark.parametrize("state", PlantState)
 def test_a_status_survives_its_message(state: PlantState) -> None:
     status = PlantStatus(
@@ -162,18 +145,6 @@ def test_a_status_survives_its_message(state: PlantState) -> None:
 def test_what_is_no_status_is_refused(values: dict[str, str]) -> None:
     with pytest.raises(SpaceRobotError, match="No status of a plant"):
         PlantStatus.from_values(values)
-
-
-def test_an_event_survives_its_message() -> None:
-    event = Event(EventKind.GOAL_REACHED, "It is reached.", 0, 2.5, "7", {"error": "0.1"})
-    values = event.to_values(1e9)
-    assert values["event"] == "goal_reached"
-    assert float(values["time"]) == 2.5
-    assert float(values["wall_time"]) == 1e9
-    assert Event.from_values(values, "It is reached.") == event
-    assert Event(EventKind.NODE_SILENT, "").to_values(None) == {"event": "node_silent"}
-    with pytest.raises(SpaceRobotError, match="No event"):
-        Event.from_values({"event": "lunch"})
 
 
 def test_the_stamp_of_the_last_command_is_exact_also_after_a_long_time() -> None:
@@ -231,32 +202,6 @@ def test_ticks_are_due_by_the_clock_two_at_a_time_and_ten_at_most() -> None:
     assert time.due_ticks(1070 * MS, 17) == 1
 
 
-def test_reports_count_ticks_and_answers_since_the_start_and_the_rate_since_the_last() -> None:
-    time = RealTime(10 * MS)
-    time.start(0, 0)
-    for tick in range(5):
-        # After tick k its successor is due at 10 (k + 1) ms, and late from 10 (k + 2) ms on.
-        time.count_tick((10 * (tick + 1) + (12 if tick == 3 else 0)) * MS, tick)
-    tick_rate, worse = time.report()
-    assert tick_rate == pytest.approx(5 / 0.05)
-    assert (time.ticks, time.ticks_late) == (5, 1)
-    assert time.worst_tick == pytest.approx(0.002)
-    assert worse
-    time.count_command(45 * MS, 40 * MS)
-    time.count_command(46 * MS, 40 * MS)
-    time.count_command(66 * MS, 50 * MS)
-    for tick in range(5, 9):
-        time.count_tick((50 + 20 * (tick - 4)) * MS, tick)
-    tick_rate, worse = time.report()
-    assert tick_rate == pytest.approx(4 / 0.08)
-    assert time.ticks == 9
-    assert (time.commands, time.commands_late) == (2, 1)
-    assert time.worst_command == pytest.approx(0.006)
-    assert time.command_age == pytest.approx(0.03)
-    assert worse
-    assert time.report() == (0.0, False)
-
-
 # -- plants from their configuration: which steps are refused, and what the steps do -------------
 
 
@@ -292,13 +237,6 @@ def test_steps_of_the_configuration_are_taken() -> None:
     errors = {step: float(np.abs(end - exact).max()) for step, end in ends.items()}
     assert errors[0.5] > 4 * errors[0.25] > 4e-9
     assert errors[0.0] < errors[0.25], "the default is a short step"
-
-
-def test_an_initial_state_takes_the_place_of_that_of_the_configuration() -> None:
-    given = config(initial_joint_positions=(0.1, -0.2, 0.3), initial_position=(1.0, 2.0, 3.0))
-    assert build_plant(ARM, given).q.tolist() == [0.1, -0.2, 0.3]
-    other = InitialState(joint_positions=np.array([0.3, -0.1, 0.2]))
-    assert build_plant(ARM, given, other).q.tolist() == [0.3, -0.1, 0.2]
 
 
 def test_thrusters_need_a_plant_that_takes_a_wrench() -> None:

@@ -267,16 +267,6 @@ def test_each_link_with_a_goal_has_a_plot_of_its_own(server: Any) -> None:
     assert shown() == []
 
 
-def test_a_link_is_where_its_joints_have_it() -> None:
-    robot = load_robot(robot_file("three_joint_arm"))
-    q, link = np.array([0.3, -0.8, 1.1]), robot.links[-1].name
-    base = np.array([1.0, -2.0, 0.5, 0.5, -0.1, 0.7, 0.5])
-    R, r = PinocchioOracle(robot.urdf, robot.joint_names).link_pose(link, q, base)
-    pose = ForwardKinematics(robot).link_in_world(link, base, q)
-    np.testing.assert_allclose(pose[:3], r, atol=1e-12)
-    np.testing.assert_allclose(matrix_from_quaternion(pose[3:]), R, atol=1e-12)
-
-
 def test_plumes_point_against_the_thrust() -> None:
     table = find_thrusters("urdf", load_robot(robot_file("servicer")))
     duty = np.zeros(len(table.names))
