@@ -19,7 +19,7 @@ from spacerobot_ros.commanding.fly_to import (
     GoalErrors,
     Progress,
 )
-from spacerobot_ros.commanding.goal_follower import GoalFollower, Status, decision_event
+from spacerobot_ros.commanding.goal_follower import GoalFollower, decision_event
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.events import EventKind
@@ -277,25 +277,6 @@ def test_time_that_goes_back_begins_the_goal_anew() -> None:
 
 
 ID, OTHER = "12.000000346", "12.000000345"
-
-
-def test_the_first_schedule_and_the_first_decision_of_the_goal_count() -> None:
-    follower = GoalFollower(ID)
-    first, second = (status("executing", ID, text) for text in ("one", "two"))
-    reached, later = status("reached", ID), status("aborted", ID)
-    told: list[Status] = [status("planning", ID), first, second, reached, later]
-    assert [follower.update(each) for each in told] == [False, False, False, True, False]
-    assert (follower.gait, follower.decision) == (first, reached)
-
-
-@pytest.mark.parametrize("state", ["executing", "refused"])
-def test_statuses_of_other_goals_tell_nothing(state: str) -> None:
-    for follower, others in ((GoalFollower(ID), (OTHER, "")), (GoalFollower(), (ID, OTHER, ""))):
-        for other in others:
-            assert not follower.is_about_goal(status(state, other))
-            assert not follower.update(status(state, other))
-        assert follower.gait is None
-        assert follower.decision is None
 
 
 def test_statuses_without_an_id_are_those_of_the_goal_in_old_bags() -> None:

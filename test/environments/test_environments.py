@@ -29,7 +29,6 @@ from spacerobot_ros.environments.tasks import (
     RewardWeights,
     RobotStates,
     Task,
-    action_scale,
     command_of,
 )
 from spacerobot_ros.errors import CommandError, ParameterError, SpaceRobotError
@@ -621,17 +620,6 @@ def test_a_link_of_a_planar_robot_reaches_in_its_plane() -> None:
         assert bool(np.abs(ways[:, 2]).max() < 1e-12) is planar
 
 
-def test_actions_are_shares_of_limits() -> None:
-    robot = SpaceRobot(load_robot(robot_file("planar_chain")))
-    np.testing.assert_array_equal(
-        action_scale(robot, "effort", 2.0, 3.0), [*robot.effort_limit, 2, 2, 2, 3, 3, 3]
-    )
-    np.testing.assert_array_equal(action_scale(robot, "velocity", 2.0, 3.0), robot.velocity_limit)
-    commands = command_of([[0.5, -3.0], [2.0, 0.25]], np.array([2.0, 9.0, 4.0]), [0, 2])
-    assert commands.tolist() == [[1.0, 0.0, -4.0], [2.0, 0.0, 1.0]]
-    assert RewardWeights.of(None) == RewardWeights()
-
-
 def test_a_force_on_the_base_is_an_action_where_there_is_one() -> None:
     for force, torque, taken in (
         (0.0, 0.0, [0, 1]),
@@ -645,7 +633,9 @@ def test_a_force_on_the_base_is_an_action_where_there_is_one() -> None:
     # Without limits of its own, those of the controller of the scenario.
     config = EpisodeConfig("reorient", scenario="wheels")
     limits = load_scenario("wheels").controller
-    scale = Episodes(config, 1, in_lanes=False).scale
+    episodes = Episodes(config, 1, in_lanes=False)
+    scale, n = episodes.scale, episodes.robot.n
+    np.testing.assert_array_equal(scale[:n], episodes.robot.effort_limit)
     assert scale[-6:].tolist() == [limits.max_force] * 3 + [limits.max_torque] * 3
     assert limits.max_force != limits.max_torque
 

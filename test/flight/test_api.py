@@ -79,24 +79,6 @@ def test_a_scenario_plans_with_its_own_limits() -> None:
     assert fly(scenario).manoeuvre_time == own.duration
 
 
-def test_goals_are_given_in_many_ways() -> None:
-    short = (0.01, 0.02, -0.01)
-    flights = [
-        fly("faults/stuck_slider", short, rotvec=(0.01, 0.0, 0.0), parameters=QUICK),
-        fly("faults/stuck_slider", [*short, np.sin(0.005), 0, 0, np.cos(0.005)], parameters=QUICK),
-    ]
-    np.testing.assert_allclose(flights[0].pose[-1], flights[1].pose[-1], atol=1e-12)
-    alone = fly(
-        "sliding_masses", short, rotvec=(0.01, 0, 0), method="lie_bracket", parameters=QUICK
-    )
-    assert alone.succeeded
-    np.testing.assert_allclose(alone.pose[-1, :3], short, atol=0.02)
-    with pytest.raises(ParameterError, match=r"no parameter 'sensors\.position'"):
-        fly("sliding_masses", parameters={"plant.sensors.position": 1.0})
-    with pytest.raises(ParameterError, match="'position_noise' is not a parameter"):
-        fly("sliding_masses", parameters={"position_noise": 1.0})
-
-
 def test_goals_of_a_plan_are_given_as_those_of_a_flight_are() -> None:
     """A robot by its name, by its file and by its model; a pose, or parts of one."""
     name, at, turn = "sliding_masses", (0.01, 0.02, -0.01), (0.01, -0.02, 0.015)

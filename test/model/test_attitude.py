@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.oracles import Array
@@ -26,6 +26,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     rotvec_from_quaternion,
     rotvecs_from_quaternions,
+    rpy_from_matrix,
     swing_angle,
     unit_quaternion,
 )
@@ -73,10 +74,14 @@ def test_hat_is_the_cross_product(a: Array, b: Array) -> None:
 
 @repeatable
 @given(rpy=vectors(7.0))
-def test_matrix_from_rpy(rpy: Array) -> None:
+@example(rpy=np.array([0.3, math.pi / 2, 0.8]))
+@example(rpy=np.array([0.3, -math.pi / 2, 0.8]))
+def test_matrix_from_rpy_and_back(rpy: Array) -> None:
     # URDF: about the fixed axes x, y, z in that order.
     expected = Rotation.from_euler("xyz", rpy).as_matrix()
     assert_near(matrix_from_rpy(rpy), expected)
+    # At a pitch of 90 deg the angles are badly conditioned, like the arcsine.
+    assert_near(matrix_from_rpy(rpy_from_matrix(expected)), expected, within=2e-7)
 
 
 @repeatable

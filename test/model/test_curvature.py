@@ -78,19 +78,6 @@ def test_curvature_is_the_derivative_and_bracket_of_the_connection(seed: int) ->
 # -- paper 1 ----------------------------------------------------------------------------------
 
 
-def test_brackets_of_centred_slots_at_the_origin() -> None:
-    """``2 m_i m_j / M J^-1 (R_j(1) x R_i(1))`` at z = 0 without offsets."""
-    robot = of_package("sliding_masses")
-    J, axes = np.diag([1.0, 1.5, 1.5]), np.eye(3)
-    expected = np.zeros((3, 3, 3))
-    for i in range(3):
-        for j in range(3):
-            expected[:, i, j] = (
-                2 * 2.0 * 2.0 / 16.0 * np.linalg.solve(J, np.cross(axes[j], axes[i]))
-            )
-    assert_agrees(-robot.curvature(np.zeros(3))[3:], expected)
-
-
 @pytest.mark.parametrize("seed", [30, 31, 32])
 def test_brackets_and_connection_of_sliders_anywhere(seed: int) -> None:
     """Eqs (3) and (7), the derivatives by central differences of fourth order."""

@@ -115,15 +115,7 @@ def test_a_lost_pose_is_not_published_and_a_late_one_is(harness: Harness) -> Non
 def test_a_lockstep_plant_does_not_wait_for_an_answer_to_a_lost_pose(harness: Harness) -> None:
     flight = Commanded(harness, "sensor_dropout odom at 0.1 until 0.25")
     flight.run(2)
-    # Nobody answers any more: what was commanded holds until the pose is there again. A tick ends
-    # at the second look.
-    while flight.plant.tick == 2:
-        flight.plant._on_subscriber_check()
-    for tick in (3, 4):
-        assert flight.plant.tick == tick
-        flight.plant._on_subscriber_check()
-        assert flight.plant.tick == tick
-        flight.plant._on_subscriber_check()
+    # Nobody answers any more: what was commanded holds until the pose is there again.
     flight.harness.spin_until(lambda: flight.plant.tick == 5, "the end of the dropout")
     flight.harness.spin_for(0.3)
     assert flight.plant.tick == 5

@@ -199,6 +199,8 @@ REFUSED: dict[str, tuple[str, dict[str, Any], tuple[str, ...]]] = {
     ),
     "no tick rate": ("plant", {"tick_rate": 0.0}, ("'tick_rate'", "0.001", "Hz")),
     "not a number": ("plant", {"tick_rate": math.nan}, ("'tick_rate'",)),
+    "too small": ("plant", {"sensors.position_bias": [0, 1e-200, 0]}, ("0 or from 1e-100",)),
+    "NUL": ("plant", {"world": "a\0b"}, ("a string without NUL characters",)),
     "choice": ("plant", {"time_mode": "foo"}, ("'time_mode'", "foo", "realtime", "lockstep")),
     "zero quaternion": ("plant", {"initial_orientation": [0.0] * 4}, ("initial orientation",)),
     "three quaternion entries": (
@@ -281,19 +283,6 @@ def test_a_refused_list_is_shown_as_a_list_and_not_to_its_end(harness: Harness) 
     (result,) = planner.set_parameters([Parameter("max_corrections", value=[2.5] * 50)])
     assert not result.successful
     assert "is [2.5, 2.5, 2.5, 2.5, 2.5, 2.5, ...]; it must be a number." in result.reason
-
-
-def test_given_values_and_defaults_are_declared(harness: Harness) -> None:
-    given = {"rate": 20, "names": ["a", "b"]}
-    node = harness.add(Node("any", **construction(harness.context, given)))
-    declared = (
-        Declaration("rate", 1.0, description="given as a whole number"),
-        Declaration("left", 2.5, description="not given"),
-        Declaration("names", (), description="given", texts=True),
-    )
-    values = declare(node, declared)
-    assert values == {"rate": 20.0, "left": 2.5, "names": ("a", "b")}
-    assert [node.get_parameter(name).value for name in values] == [20.0, 2.5, ["a", "b"]]
 
 
 def test_descriptions_have_units_ranges_and_choices(harness: Harness) -> None:

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from scipy.spatial.transform import Rotation
@@ -22,7 +22,6 @@ from support.ros_harness import LATCHED, Harness, nanoseconds
 from support.sentences import assert_one_sentence
 from visualization_msgs.msg import Marker, MarkerArray
 
-from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.resources import robot_file
 
 # -- commands ---------------------------------------------------------------------------------
@@ -452,25 +451,6 @@ def test_markers_stand_where_the_links_are(harness: Harness) -> None:
         p = marker.pose.position
         np.testing.assert_allclose([p.x, p.y, p.z], place, atol=1e-14)
         assert marker.header.frame_id == "world"
-
-
-def test_a_namespace_moves_all_but_the_clock_and_the_diagnostics(harness: Harness) -> None:
-    harness.make(
-        PlantNode,
-        {"robot": "sliding_masses", "time_mode": "lockstep", "diagnostics_period": 0.05},
-        namespace="/craft",
-    )
-    topics = {f"/craft/{name}" if name[0] != "/" else name: kind for name, kind in STATE.items()}
-    probe = harness.probe({**topics, "/diagnostics": DiagnosticArray})
-    # A newcomer is shown the state that waits.
-    harness.spin_until(lambda: set(topics) <= set(probe.order), "the state in the namespace")
-    publisher = harness.matched(probe.create_publisher(JointState, "/craft/joint_commands", 10))
-    publisher.publish(JointState(name=SLIDERS, velocity=[0.5, 0.0, 0.0]))
-    harness.spin_until(
-        lambda: probe.last("/craft/joint_states").velocity[0] == 0.5, "a step in the namespace"
-    )
-    harness.spin_until(lambda: probe.count("/diagnostics"), "diagnostics")
-    assert probe.last("/diagnostics").status[0].name == "craft/plant: commands"
 
 
 # -- lockstep with latecomers -----------------------------------------------------------------

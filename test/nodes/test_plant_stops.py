@@ -402,7 +402,8 @@ def test_what_is_late_is_counted_with_the_worst() -> None:
     for tick, now in ((1, 20), (2, 39), (3, 54)):
         time.count_tick(now * MS, tick)
     # The states of 10, 20, 30 ms are to be answered by 20, 30, 40 ms.
-    for now, stamp in ((19, 10), (33, 20), (47, 30)):
+    # The first answer to a state counts.
+    for now, stamp in ((19, 10), (33, 20), (47, 30), (48, 30)):
         time.count_command(now * MS, stamp * MS)
     status = timing_record("/plant", "robot", time)
     assert status.level == 1

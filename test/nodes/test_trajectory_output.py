@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from rclpy.action import CancelResponse
+from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from support.planner_flight import NEAR, TURNED, Flight, values_of
 from support.ros_harness import Harness, nanoseconds
 
-from spacerobot_ros.nodes.common.fly_to import _Server
 from spacerobot_ros.nodes.common.messages import interface_class
 
 Array = npt.NDArray[np.float64]
@@ -44,10 +44,11 @@ class TrajectoryServer:
         self.node = harness.probe({}, name="trajectory_server")
         self.commands = self.node.create_publisher(JointState, "joint_commands", 10)
         self._handle: ServerGoalHandle | None = None
+        self._result: Future = Future()
         self._begin = -1
         self._frozen = False
         self.node.create_subscription(JointState, "joint_states", self._on_state, 10)
-        self.server = _Server(
+        self.server = ActionServer(
             self.node,
             FOLLOW,
             "joint_trajectory_controller/follow_joint_trajectory",
@@ -63,7 +64,12 @@ class TrajectoryServer:
 
     def _on_goal(self, handle: ServerGoalHandle) -> None:
         self._end("aborted", -1, "Replaced.")
-        handle.execute()
+        result = self._result = Future(executor=self.node.executor)
+
+        async def followed(_: ServerGoalHandle) -> Any:
+            return await result
+
+        handle.execute(followed)
         self.goals.append(handle.request)
         self._handle, self._begin, self._frozen = handle, -1, False
 
@@ -75,7 +81,7 @@ class TrajectoryServer:
             outcome
         ]()
         self.ends.append(outcome)
-        self.server.end(handle, FOLLOW.Result(error_code=code, error_string=text))
+        self._result.set_result(FOLLOW.Result(error_code=code, error_string=text))
 
     def _on_state(self, state: JointState) -> None:
         now, q = nanoseconds(state.header.stamp), np.array(state.position)

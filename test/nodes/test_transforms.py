@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pinocchio
 import pytest
-from geometry_msgs.msg import Point, Quaternion, TransformStamped
+from geometry_msgs.msg import Point, Quaternion
 from nav_msgs.msg import Odometry
-from rclpy.serialization import serialize_message
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
@@ -25,7 +24,6 @@ from spacerobot_ros.messages.builders import (
     TRANSFORM_TYPE,
     TRANSFORMS,
     RobotTransforms,
-    transform_template,
 )
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
@@ -33,8 +31,7 @@ from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import KnownFrames, pose_array
 from spacerobot_ros.nodes.plant import publisher
-from spacerobot_ros.resources import resource_names, robot_file
-from spacerobot_ros.times import stamp_bytes
+from spacerobot_ros.resources import robot_file
 
 TOLERANCE = 1e-12
 
@@ -246,38 +243,6 @@ def test_transforms_have_the_measured_pose_and_shape_and_not_the_true_ones(
             place = places[link.child_frame_id]
             np.testing.assert_allclose(r, place[:3], atol=TOLERANCE)
             np.testing.assert_allclose(R, matrix_from_quaternion(place[3:]), atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("robot", resource_names("urdf", ".urdf"))
-def test_serialised_frames_are_what_ros_makes_of_each(robot: str) -> None:
-    links = [joint.child for joint in load_robot(robot_file(robot)).joints]
-    frames = tuple((f"p{'x' * i}", name) for i, name in enumerate(links))
-    poses = np.random.default_rng(3).normal(size=(len(frames), 7))
-    template = transform_template(frames)
-    for i, pose in enumerate(poses):
-        template.feed(f"transforms[{i}].transform.translation.x", pose)
-    raw = template.serialised(stamp_bytes(5_000_000_007))
-    place = 8
-    for (parent, child), pose in zip(frames, poses, strict=True):
-        one = TransformStamped(child_frame_id=child)
-        one.header.frame_id = parent
-        one.header.stamp.sec, one.header.stamp.nanosec = 5, 7
-        t = one.transform.translation
-        t.x, t.y, t.z = pose[:3].tolist()
-        o = one.transform.rotation
-        o.x, o.y, o.z, o.w = pose[3:].tolist()
-        # Alone a message begins where doubles are aligned; in the list wherever the last ended.
-        head = serialize_message(one)[4:]
-        first = 8 + 4 + len(parent) + 1
-        second = first + -first % 4
-        text = second + 4 + len(child) + 1
-        assert raw[place : place + first] == head[:first]
-        assert raw[place + second : place + text] == head[second:text], "but for the padding"
-        end = place + text
-        end += -(end - 4) % 8
-        assert raw[end : end + 56] == head[-56:]
-        place = end + 56
-    assert len(raw) == place
 
 
 @pytest.mark.parametrize("links", [False, True])

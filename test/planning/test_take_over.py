@@ -292,15 +292,6 @@ def test_where_no_plan_can_take_over_the_joints_brake(parameters: dict[str, Any]
         assert stub_of(loop).requests[-1].motion is None
 
 
-def test_methods_that_plan_from_rest_are_not_asked_in_motion() -> None:
-    loop = Loop({"takeover_time": AHEAD * TICK}, method=StubMethod(40))
-    loop.propose_goal(NEAR)
-    loop.tick(10)
-    loop.propose_goal(OTHER)
-    loop.until(PlannerState.REACHED)
-    assert [request.motion for request in stub_of(loop).requests] == [None, None]
-
-
 # -- the remaining motion, again --------------------------------------------------------------
 
 

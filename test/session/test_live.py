@@ -467,14 +467,6 @@ def papers_own() -> Scenario:
     return load_scenario("sliding_masses").with_overrides("planner", {"method": "lie_bracket"})
 
 
-def test_a_run_records_the_topics_that_are_chosen(tmp_path: Path) -> None:
-    topics = {"/odom", "/joint_states", "/momentum", "/robot_description"}
-    chosen = short().with_overrides("recorder", {"topics": " ".join(sorted(topics))})
-    result = run_scenario(chosen, tmp_path / "run.mcap")
-    assert result.succeeded
-    assert set(read_bag(tmp_path / "run.mcap").topics) == topics
-
-
 def test_a_bag_lacks_nothing_and_says_how_it_was_made(tmp_path: Path) -> None:
     result = run_scenario(short(attitude_tolerance=1e-4), tmp_path / "run.mcap")
     bag = read_bag(result.summary["bag"])
@@ -539,26 +531,6 @@ def test_a_run_takes_the_next_name_if_its_recorder_is_to(tmp_path: Path) -> None
     following = short().with_overrides("recorder", {"when_exists": "next"})
     assert run_scenario(following, bag, longest=1.0).summary["bag"] == str(tmp_path / "run-1.mcap")
     assert bag.read_bytes() == b"earlier"
-
-
-@pytest.mark.parametrize(
-    ("node", "setting", "sentence"),
-    [
-        ("plant", {"tick_rate": -1.0}, r"Node 'plant': Parameter 'tick_rate' is -1"),
-        ("plant", {"robot": "nothing"}, r"Parameter 'robot' is 'nothing'"),
-        ("planner", {"method": "magic"}, r"Node 'planner': Parameter 'method' is 'magic'"),
-        ("planner", {"spin": 1}, r"Node 'planner' has no parameter 'spin'"),
-        ("plant", {"target.sensors.rate": 1e-322}, "must be 0 or from 1e-100 to 1e[+]100"),
-        ("plant", {"sensors.position_bias": [0, 1e-200, 0]}, "must be 0 or from 1e-100"),
-        ("planner", {"optimal.max_base_rate": 1e-320}, "must be 0 or from 1e-100"),
-        ("plant", {"world": "a\0b"}, "a string without NUL characters"),
-    ],
-)
-def test_bad_parameters_are_named(
-    tmp_path: Path, node: str, setting: dict[str, Any], sentence: str
-) -> None:
-    with pytest.raises(ParameterError, match=sentence):
-        run_scenario(short().with_overrides(node, setting), tmp_path / "run.mcap")
 
 
 @pytest.mark.slow

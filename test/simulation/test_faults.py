@@ -262,27 +262,6 @@ def test_actuator_noise_has_its_sigma_and_its_seed() -> None:
     np.testing.assert_array_equal(flights[0][:, 1:], np.tile([0.01, 0.0], (3000, 1)))
 
 
-def test_faults_are_injected_and_repaired_while_it_runs() -> None:
-    plant = arm("joint_slow shoulder_yaw 0.5 at 0.1")
-    command = np.array([0.1, 0.0, 0.0])
-    for _ in range(4):
-        plant.step(command)
-    plant.inject("joint_stuck shoulder_yaw\njoint_slow elbow_pitch 0.5 at 100")
-    assert [str(f) for f in plant.active] == [
-        "joint_slow shoulder_yaw 0.5 at 0.1",
-        "joint_stuck shoulder_yaw at 0.2",
-    ]
-    plant.step(command)
-    assert plant.q[0] == pytest.approx(0.1 * TICK * 3)
-    with pytest.raises(ParameterError, match="joint_stuck nose"):
-        plant.inject("joint_slow elbow_pitch 0.5\njoint_stuck nose")
-    assert len(plant.active) == 2
-    plant.inject("clear")
-    assert not plant.active
-    plant.step(command)
-    assert plant.q[0] == pytest.approx(0.1 * TICK * 4)
-
-
 def test_a_plant_without_faults_is_the_plant_within() -> None:
     robot = robot_of(urdf("three_joint_arm"))
     bare, wrapped = (

@@ -301,15 +301,6 @@ class Seen:
         return np.array(rows)
 
 
-def test_sensors_without_errors_are_not_used() -> None:
-    seen = Seen(3)
-    assert not seen.sensors.used
-    assert not seen.sensors.missing
-    # They do not even follow.
-    assert seen.measured[2] is not None
-    np.testing.assert_array_equal(seen.measured[2], seen.true[0])
-
-
 @pytest.mark.parametrize(
     ("name", "columns", "sigma"),
     [

@@ -10,14 +10,13 @@ import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from support.crossing import URDF, distance
+from support.crossing import URDF
 from support.effort_flights import random_urdf, robot_of, tumbling
 from support.oracles import Array, PinocchioOracle, assert_agrees, random_motion
 from support.oracles.orbit import relative_motion
 
 from spacerobot_ros.collision import CollisionGeometry, LinkPair, ObstaclePair
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.resources import robot_file
@@ -275,39 +274,6 @@ def test_surroundings_that_do_not_suit_are_refused(
     with pytest.raises(ParameterError) as refused:
         build_plant(model, PlantConfig(actuation="effort", **parameters))
     assert str(refused.value).startswith(message)
-
-
-def test_a_plant_goes_on_through_a_contact_and_says_so() -> None:
-    start = (-0.15, -0.3)
-    config = PlantConfig(initial_joint_positions=start, tick_rate=20.0)
-    plant = build_plant(SpaceRobot(parse_robot(URDF)), config)
-    monitor = ClearanceMonitor.of(plant.robot.description, plant.robot.link_names)
-    assert monitor is not None
-    found: list[ClearanceStatus] = []
-    events: list[Event] = []
-    shapes = []
-    for tick in range(13):
-        status, news = monitor.measure(plant.link_R, plant.link_r, plant.pose, tick / 20)
-        found.append(status)
-        events += news
-        shapes.append(plant.q.copy())
-        plant.step(np.array([0.5, 1.0]))
-    truth = distance(np.array(shapes))
-    np.testing.assert_allclose([each.distance for each in found], truth, atol=1e-6)
-    touching = np.flatnonzero(truth <= 0)
-    assert 1 < len(touching) < 6
-    assert [(each.kind, each.time_s, each.level) for each in events] == [
-        (EventKind.CONTACT, touching[0] / 20, 2),
-        (EventKind.CONTACT_ENDED, (touching[-1] + 1) / 20, 0),
-    ]
-    assert events[0].about == {"first": "left", "second": "right"}
-    assert events[0].message == (
-        "Links 'left' and 'right' touch; the simulation continues through contact."
-    )
-    assert [each.level for each in found] == [2 if d <= 0 else 0 for d in truth]
-    assert found[0].message == f"Links 'left' and 'right' are {truth[0]:.3g} m apart."
-    deepest = found[int(truth.argmin())]
-    assert deepest.message == f"Links 'left' and 'right' touch, {-1e3 * truth.min():.3g} mm deep."
 
 
 def test_a_plant_whose_bodies_push_each_other_says_so() -> None:

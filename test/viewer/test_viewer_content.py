@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.bag.playback import ReplayStatus
@@ -21,10 +19,7 @@ from spacerobot_ros.errors import ParameterError, shortened
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import (
-    matrix_from_quaternion,
-    matrix_from_rpy,
     quaternion_multiply,
-    rpy_from_matrix,
 )
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
@@ -46,21 +41,6 @@ STATE = StackState(Measured(4.0, HERE, np.zeros(3), np.zeros(3), np.zeros(3)), a
 
 def quaternion_of(rpy: Any) -> np.ndarray:
     return Rotation.from_euler("xyz", np.asarray(rpy)).as_quat()
-
-
-angles = st.floats(-math.pi, math.pi)
-
-
-@given(angles, st.floats(-math.pi / 2, math.pi / 2), angles)
-@example(0.3, math.pi / 2, 0.8)
-@example(0.3, -math.pi / 2, 0.8)
-def test_angles_on_the_page_are_those_of_a_urdf(roll: float, pitch: float, yaw: float) -> None:
-    quaternion = quaternion_of((roll, pitch, yaw))
-    R = matrix_from_rpy([roll, pitch, yaw])
-    np.testing.assert_allclose(matrix_from_quaternion(quaternion), R, atol=1e-12)
-    again = matrix_from_rpy(rpy_from_matrix(matrix_from_quaternion(quaternion)))
-    # At a pitch of 90 deg the angles are badly conditioned, like the arcsine.
-    np.testing.assert_allclose(again, R, atol=2e-7)
 
 
 def test_silence_is_said() -> None:
