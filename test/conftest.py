@@ -192,6 +192,12 @@ def own_domain(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(ros_domain))
 
 
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Return where a controller saves its goals."""
+    return tmp_path / "goals.json"
+
+
 @pytest.fixture(scope="session")
 def warm_python(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmPython]:
     """Return what runs Python programs without starting an interpreter for each."""

@@ -277,19 +277,3 @@ def test_state_topics_name_numbers_of_their_messages(topic: Topic) -> None:
                 assert value.typecode == "d"
         width = len(entry.members or entry.array_entry_names) or len(names)
         assert len(entry.labels(names)) == width
-
-
-def test_labels_and_quaternions() -> None:
-    odom, joints = TOPICS["odom"].state, TOPICS["joint_states"].state
-    assert [field.quaternion for field in odom] == [3, None]
-    assert joints[0].labels(["elbow"]) == ["position of elbow"]
-    assert TOPICS["momentum"].state[0].labels([])[-1] == "kinetic energy"
-    assert TOPICS["odom"].short_type == "nav_msgs/Odometry"
-
-
-def test_the_plant_publishes_the_clock_first_and_what_sets_commanders_off_late() -> None:
-    names = list(TOPICS)
-    assert names[0] == "/clock"
-    measured = [names.index("odom"), names.index("joint_states")]
-    before = ["base_pose", "end_effector_pose", "momentum", "momentum_expected", "odom_true"]
-    assert max(map(names.index, before)) < min(measured)

@@ -31,6 +31,8 @@ from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
     GoalFile,
+    IdentifiedGoal,
+    PursuedGoals,
 )
 from spacerobot_ros.resources import robot_file, share_directory
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
@@ -337,6 +339,19 @@ def test_goals_that_are_pursued_together_are_aborted_together(controller: Rig) -
     outcome, message = client.end_of
     assert outcome == "aborted"
     assert "replaced" not in message
+
+
+def test_goals_on_file_are_resumed_and_deleted_when_they_are_aborted(
+    robot: SpaceRobot, tmp_path: Path
+) -> None:
+    path = tmp_path / "goal.json"
+    GoalFile(str(path)).pursue(PursuedGoals({BASE_GOAL_KEY: IdentifiedGoal(GOAL, "9.000000000")}))
+    rig = Rig(PlannerCommander, config(PlannerConfig, resume_file=str(path), **METHOD), robot.n)
+    rig.commander.activate()
+    assert (rig.host.states[-1], rig.host.statuses[-1].goal_id) == ("waiting", "9.000000000")
+    rig.commander.give_up_goals("Node '/plant' is silent.")
+    assert_one_sentence(rig.host.statuses[-1].message, "Aborted", "silent")
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("kind", [PlannerCommander, ControllerCommander])

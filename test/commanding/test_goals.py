@@ -19,7 +19,7 @@ from spacerobot_ros.commanding.fly_to import (
     GoalErrors,
     Progress,
 )
-from spacerobot_ros.commanding.goal_follower import GoalFollower, decision_event
+from spacerobot_ros.commanding.goal_follower import GoalFollower, Status, decision_event
 from spacerobot_ros.control.status import ControllerState, ControllerStatus
 from spacerobot_ros.errors import GoalError, PlanningError
 from spacerobot_ros.events import EventKind
@@ -274,6 +274,15 @@ def test_time_that_goes_back_begins_the_goal_anew() -> None:
     assert rig.goals.abort_reason({"a"}) == ""
     rig.advance(3_000_000_000)
     assert rig.goals.abort_reason({"a"})
+
+
+def test_the_first_schedule_and_the_first_decision_of_the_goal_count() -> None:
+    follower = GoalFollower(ID)
+    first, second = (status("executing", ID, text) for text in ("one", "two"))
+    reached, later = status("reached", ID), status("aborted", ID)
+    told: list[Status] = [status("planning", ID), first, second, reached, later]
+    assert [follower.update(each) for each in told] == [False, False, False, True, False]
+    assert (follower.gait, follower.decision) == (first, reached)
 
 
 ID, OTHER = "12.000000346", "12.000000345"

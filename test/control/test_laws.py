@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -43,7 +43,6 @@ from spacerobot_ros.control import (
     GainPair,
     Gains,
     JointReference,
-    LawOptions,
     OutputSelection,
     PoseReference,
     Reference,
@@ -56,7 +55,7 @@ from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLa
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.inverse_kinematics import AXES
-from spacerobot_ros.parameters import configured, declared, parameter
+from spacerobot_ros.parameters import configured, declared
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario, scenario_names
 
@@ -136,41 +135,16 @@ def test_registry_and_options() -> None:
                     law(robot, built.outputs.selection, PLANAR_GAINS, options)
 
 
-@dataclass(frozen=True)
-class _SpringOptions(LawOptions):
-    strength: float = parameter(2.0, "how strongly joints are damped", minimum=0.0)
-
-
 class _Spring(ControlLaw):
-    """A law as somebody else may write it: it pulls the outputs, and brakes the joints."""
+    """A law as somebody else may write it: it pulls the outputs."""
 
     name = "spring"
     gain_units = ("N/m", "N s/m")
-    Options = _SpringOptions
-
-    def inputs(self) -> dict[str, float]:
-        return {"strength": self.options.strength}
 
     def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
         z1 = self.outputs
         pull = symbols["kp"] * z1.error + symbols["kd"] * z1.error_rate
-        braking = ca.vertcat(ca.SX(6, 1), -symbols["strength"] * z1.qdot)
-        return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull + braking}
-
-
-def test_a_new_law_is_one_class_and_one_line_in_the_registry(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert "spring.strength" not in {each.name for each in declared(ControllerConfig)}
-    monkeypatch.setitem(LAWS, "spring", _Spring)
-    assert "spring.strength" in {each.name for each in declared(ControllerConfig)}
-    options = configured(ControllerConfig, {"spring.strength": 3.0}).options
-    gains = Gains.uniform(1.0, 1e-9)
-    config = ControllerConfig(law="spring", options=options, gains=gains)
-    controller = build_controller(load("planar_manipulator"), config)
-    state = replace(planar_start(), qdot=np.array([0.5, -0.25]))
-    result = controller.command(0.0, state, state.q, state.qdot)
-    np.testing.assert_allclose(result.realised.tau, [-1.5, 0.75], atol=1e-8)
+        return {"actuation": (z1.J_z @ z1.J_q_inverse).T @ pull}
 
 
 def test_a_law_says_which_gains_it_lacks() -> None:

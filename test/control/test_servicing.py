@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from support.executive_loop import (
     AIM,
     PERIOD,
+    SHAPE,
     TIP,
     UPRIGHT,
     ExecutiveLoop,
@@ -106,6 +107,56 @@ def test_tasks_are_named_in_their_order() -> None:
     with pytest.raises(ParameterError) as refused:
         Task.parsed("approach catch")
     assert_one_sentence(str(refused.value), "'catch'", "approach and detumble")
+
+
+def test_a_target_is_approached_captured_brought_to_rest_and_carried() -> None:
+    loop = Meeting()
+    loop.answer(2)
+    loop.aim(base=goal_at(AIM, "5"))
+    loop.answer()
+    assert (loop.state, loop.status.task, loop.status.goal_id) == ("tracking", "approach", "5")
+    assert_one_sentence(loop.status.message, "Approaching the target", "0.459 m", "contact in")
+    assert loop.kinds() == ["goal_accepted", "approach_started"]
+    assert {each.goal_id for each in loop.events} == {"5"}
+    began = {key: float(text) for key, text in loop.events[1].about.items()}
+    assert began["starts_s"] == pytest.approx(0.03)
+    assert began["starts_s"] < began["closes_s"] < began["contact_s"] == loop.contact
+    # The reference of the end-effector has left the place where it was held.
+    loop.answer(40)
+    followed = loop.executive.controller.followed.end_effector
+    assert followed is not None
+    assert 0.001 < np.linalg.norm(followed.position - TIP) < 0.3
+    loop.capture()
+    loop.rates = np.array([0.03, -0.05])
+    loop.answer()
+    assert (loop.state, loop.status.task) == ("tracking", "detumble")
+    assert_one_sentence(loop.status.message, "Detumbling", "50 mrad/s")
+    assert loop.kinds()[2:] == ["detumble_started"]
+    assert_one_sentence(loop.events[-1].message, "N m s takes at least")
+    assert loop.executive.controller.coming_to_rest
+    loop.answer(5)
+    loop.rates = np.array([0.001, -0.002])
+    loop.answer(3)
+    assert loop.status.task == "detumble", "it settles"
+    loop.answer()
+    assert (loop.state, loop.status.task, loop.status.goal_id) == ("tracking", "", "5")
+    assert loop.kinds()[3:] == ["detumbled"]
+    about = {key: float(text) for key, text in loop.events[-1].about.items()}
+    assert about["took_s"] == pytest.approx(0.06)
+    assert about["largest_torque_Nm"] == 0.5
+    assert about["shortest_s"] == pytest.approx(about["angular_momentum_Nms"] / 0.5)
+    joined = HELD.attached_to(planar_manipulator())
+    _, L, _ = joined.momentum(UPRIGHT, SHAPE, np.zeros(3), np.zeros(3), [0.03, -0.05])
+    assert about["angular_momentum_Nms"] == pytest.approx(np.linalg.norm(L))
+    assert_one_sentence(
+        loop.events[-1].message, "came to rest in 0.06 s", f"{about['shortest_s']:.4g} s"
+    )
+    goal = loop.executive.controller.goal
+    assert goal.base is not None
+    assert goal.end_effector is not None
+    np.testing.assert_allclose(goal.base.position, AIM)
+    np.testing.assert_allclose(goal.end_effector.position, TIP + AIM, atol=1e-12)
+    assert loop.executive.controller.followed.end_effector is None
 
 
 def test_a_goal_of_the_end_effector_is_carried_to_where_it_is_given() -> None:

@@ -29,6 +29,10 @@ from spacerobot_ros.topics import TOPICS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [*sorted(ROOT.glob("docs/**/*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+DESIGN = [
+    *(ROOT / "docs" / name for name in ("architecture.md", "choosing.md")),
+    *(ROOT / "docs" / "planner_state_machine.md", *sorted(ROOT.glob("docs/theory/*.md"))),
+]
 _FENCED = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 _CODE = re.compile(r"`([^`\n]+)`")
 _FILE = re.compile(r"(?:[\w.-]+/)*[\w.-]+\.(?:py|js|urdf|yaml|json|rviz)|(?:[\w-]+/)+")
@@ -71,22 +75,21 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
     assert [target for target in targets if not (page.parent / target).exists()] == []
 
 
-def test_classes_that_the_page_of_the_architecture_names_exist() -> None:
+@pytest.mark.parametrize("page", DESIGN, ids=lambda page: page.name)
+def test_classes_that_a_page_of_the_design_names_exist_with_their_methods(page: Path) -> None:
     package = "\n".join(
         path.read_text(encoding="utf-8") for path in (ROOT / "spacerobot_ros").rglob("*.py")
     )
     foreign = {"PoseStamped", "JointState", "EventsExecutor"}
-    found = {
-        match[0]: match
-        for name in named(ROOT / "docs" / "architecture.md")
-        if (match := re.match(r"([A-Z][a-z]\w+)(?:\.(\w+))?", name)) and match[1] not in foreign
-    }
-    assert len(found) > 20
     missing = [
-        name
-        for name, match in found.items()
-        if not re.search(rf"^class {match[1]}\b", package, re.MULTILINE)
-        or (match[2] and f"def {match[2]}(" not in package)
+        match[0]
+        for name in named(page)
+        if (match := re.match(r"([A-Z][a-z]\w+)(?:\.(\w+))?", name))
+        and match[1] not in foreign
+        and not (
+            re.search(rf"^class {match[1]}\b", package, re.MULTILINE)
+            and re.search(rf"def {match[2]}\(|^    {match[2]}:" if match[2] else "", package, re.M)
+        )
     ]
     assert missing == []
 

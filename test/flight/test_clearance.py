@@ -110,6 +110,7 @@ def test_a_flight_through_contacts_has_events_and_a_clearance(through: Flight) -
     }
     assert min(begins.values()) > 0
     events = [each for each in through.events if each.kind is EventKind.CONTACT]
+    assert {each.level for each in events} == {2}
     found = {(e.about["first"], e.about["second"]): e.time_s for e in events}
     assert found == {links: pytest.approx(time) for links, time in begins.items()}
     times = [event.time_s for event in through.events]

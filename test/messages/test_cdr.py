@@ -225,11 +225,6 @@ def test_a_template_stamps_every_header(prototype: MarkerArray, time_ns: int) ->
     assert sent == prototype
 
 
-def test_a_template_stamps_the_clock() -> None:
-    raw = template(Clock()).serialised(stamp_bytes(12_000_000_034))
-    assert deserialize_message(raw, Clock) == Clock(clock=Time(sec=12, nanosec=34))
-
-
 def test_what_a_template_has_given_out_does_not_change() -> None:
     patched = template(Float64MultiArray(data=[0.0] * 3))
     data = np.ones(3)

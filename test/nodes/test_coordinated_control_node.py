@@ -393,11 +393,6 @@ def test_a_silent_reference_is_done_without_until_it_comes_again(harness: Harnes
     )
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    return tmp_path / "goals.json"
-
-
 def test_a_node_that_is_activated_again_or_killed_goes_on(harness: Harness, file: Path) -> None:
     """Another node in its place may be told the robot later."""
     loop = Loop(harness, resume_file=str(file))

@@ -199,7 +199,7 @@ REFUSED: dict[str, tuple[str, dict[str, Any], tuple[str, ...]]] = {
     ),
     "no tick rate": ("plant", {"tick_rate": 0.0}, ("'tick_rate'", "0.001", "Hz")),
     "not a number": ("plant", {"tick_rate": math.nan}, ("'tick_rate'",)),
-    "too small": ("plant", {"sensors.position_bias": [0, 1e-200, 0]}, ("0 or from 1e-100",)),
+    "too small": ("plant", {"sensors.position_bias": [0.0, 1e-200, 0.0]}, ("0 or from 1e-100",)),
     "NUL": ("plant", {"world": "a\0b"}, ("a string without NUL characters",)),
     "choice": ("plant", {"time_mode": "foo"}, ("'time_mode'", "foo", "realtime", "lockstep")),
     "zero quaternion": ("plant", {"initial_orientation": [0.0] * 4}, ("initial orientation",)),

@@ -51,6 +51,25 @@ class Watch:
             self.found.append(back)
 
 
+def test_a_node_that_is_silent_is_named_once_within_a_second() -> None:
+    watch = Watch()
+    watch.spend(5.0, "/plant", "/planner")
+    watch.spend(1.0, "/plant")
+    (silence,) = watch.found
+    assert (silence.name, silence.over) == ("/planner", False)
+    assert 0.8 < silence.seconds <= 1.0
+    watch.spend(5.0, "/plant")
+    assert len(watch.found) == 1
+    assert list(watch.watchdog.silent) == ["/planner"]
+    watch.hear("/planner")
+    back = watch.found[-1]
+    assert (back.name, back.over) == ("/planner", True)
+    assert back.seconds == pytest.approx(6.1, abs=0.2)
+    watch.spend(5.0, "/plant", "/planner")
+    assert len(watch.found) == 2
+    assert not watch.watchdog.silent
+
+
 @pytest.mark.parametrize("pulse", [HeartbeatState.INACTIVE, HeartbeatState.BUSY])
 def test_nothing_is_expected_of_nodes_that_say_so(pulse: HeartbeatState) -> None:
     watch = Watch()

@@ -16,7 +16,7 @@ from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
-from spacerobot_ros.planning.execution.status import Phase, PlannerState
+from spacerobot_ros.planning.execution.status import Phase, PlannerState, PlanReason
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.resources import share_directory
 
@@ -74,6 +74,7 @@ def test_a_new_goal_replaces_the_one_that_is_pursued() -> None:
     assert loop.speeds[-1] > 0.0
     assert loop.decide(TURNED).state is PlannerState.REACHED
     assert loop.states == ["executing", "executing", "reached"]
+    assert loop.plan_reasons == [PlanReason.NEW_GOAL, PlanReason.BLEND]
     assert max(loop.error_to(TURNED)) <= 1e-3
     first, second = loop.starts
     assert second.stamp_ns < first.stamp_ns + first.schedule.duration * 1e9
@@ -111,6 +112,14 @@ def test_small_tracking_errors_are_left_to_the_end() -> None:
     loop = Loop({"drift_position": 2e-3, "drift_attitude": 2e-3})
     loop.decide(NEAR)
     assert loop.states == ["executing", "reached"]
+
+
+def test_a_goal_that_waits_for_a_state_can_be_aborted() -> None:
+    loop = Loop()
+    loop.propose_goal(NEAR)
+    loop.abort()
+    loop.tick(10)
+    assert not loop.starts
 
 
 # -- planned in the background ----------------------------------------------------------------

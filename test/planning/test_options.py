@@ -7,7 +7,6 @@ import itertools
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -306,26 +305,6 @@ def test_constraints_that_make_no_sense_are_refused(
 ) -> None:
     with pytest.raises(ParameterError, match=re.escape(words)):
         plan(arm, rotvec=[0, 0, 0.1], **options)
-
-
-# -- the pages of planning name classes, methods and options that exist --------------------------
-
-
-ROOT = Path(__file__).resolve().parents[2]
-THEORY = "area_loop", "controllability", "lie_bracket", "optimal", "singularities", "square_path"
-PAGES = [
-    *(ROOT / "docs" / name for name in ("choosing.md", "planner_state_machine.md")),
-    *(ROOT / "docs" / "theory" / f"{name}.md" for name in THEORY),
-]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_classes_that_a_page_names_exist_with_their_methods(page: Path) -> None:
-    text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.M | re.S)
-    package = "\n".join(path.read_text("utf-8") for path in ROOT.glob("spacerobot_ros/**/*.py"))
-    for name, member in re.findall(r"`([A-Z][a-z]+(?:[A-Z][a-z]+)*)(?:\.(\w+))?[(`]", text):
-        assert re.search(rf"^class {name}\b", package, re.M), name
-        assert not member or re.search(rf"(def {member}\(|^    {member}:)", package, re.M), member
 
 
 @pytest.mark.parametrize("profile", [lambda s: s, lambda s: s**2, lambda s: np.sin(np.pi * s / 2)])

@@ -33,7 +33,6 @@ from spacerobot_ros.errors import UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.planning import GaitMethod, GaitSchedule, Goal, Tolerance
-from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
 from spacerobot_ros.planning.execution.measured_states import BaseMeasurement
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
@@ -243,11 +242,6 @@ def test_every_joint_keeps_its_own_limits_in_both_directions(name: str) -> None:
     assert np.all(fastest <= np.array([0.7, 0.4]) * (1 + 1e-9))
     if name == "optimal":
         assert np.all(fastest >= 0.95 * np.array([0.7, 0.4])), "each is as fast as it may be"
-
-
-def test_each_tolerance_is_that_of_its_own_parameter() -> None:
-    config = PlannerConfig(position_tolerance=0.01, attitude_tolerance=0.02, joint_tolerance=0.03)
-    assert config.tolerance == Tolerance(0.01, 0.02, 0.03)
 
 
 SHAPES = {

@@ -397,27 +397,3 @@ def test_the_remaining_motion_is_planned_again_where_plans_are_made_beside_the_f
     for background in (True, False):
         config = PlannerConfig(plan_in_background=background, replan_period=2.5)
         assert config.replanning == 2.5
-
-
-@pytest.mark.parametrize(
-    ("parameters", "averaged"),
-    [
-        ({"averaging": 1, "replan_period": 0.0}, 0),
-        ({"averaging": 7, "replan_period": 0.0}, 7),
-        ({"averaging": 1, "replan_period": 2.0}, 1),
-        ({"averaging": 7, "replan_period": 2.0, "takeover_time": 0.0}, 0),
-    ],
-)
-def test_measured_poses_are_averaged_where_they_are_needed(
-    parameters: dict[str, Any], averaged: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    wanted: list[int] = []
-    monkeypatch.setattr(
-        TrajectoryTracker,
-        "start",
-        lambda tracker, schedule, stamp_ns, average: wanted.append(average),
-    )
-    loop = Loop({"takeover_time": AHEAD * TICK, **parameters}, method=MovingStub())
-    loop.propose_goal(NEAR)
-    loop.tick(parameters["averaging"])
-    assert wanted == [averaged]

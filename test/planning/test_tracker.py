@@ -332,18 +332,6 @@ def test_the_mean_of_noisy_states_is_nearer_by_the_root_of_their_number() -> Non
     assert np.std(single) > 3 * np.std(averaged)
 
 
-def test_the_mean_of_two_attitudes_is_half_way() -> None:
-    average = StateAverage(ARM, 2)
-    first = Rotation.from_rotvec([2.0, -1.5, 1.0])
-    for angle in (0.0, 0.02):
-        turned = first * Rotation.from_rotvec([0.0, angle, 0.0])
-        average.add(pose(10 * angle, turned), STILL, Q, REST)
-    state = average.state()
-    half = (first.inv() * Rotation.from_quat(state.quaternion)).as_rotvec()
-    np.testing.assert_allclose(half, [0.0, 0.01, 0.0], atol=1e-12)
-    np.testing.assert_allclose(state.position, [0.1, 0.0, 0.0])
-
-
 def test_momenta_are_those_measured_last_at_rest() -> None:
     average = StateAverage(ARM)
     twist = np.array([0.01, 0.0, -0.02, 0.03, 0.0, 0.01])

@@ -213,6 +213,24 @@ def test_an_unset_stamp_means_now() -> None:
         assert early.joints.stamp_ns == 0
 
 
+def test_commands_are_taken_and_hold_until_they_are_older_than_the_timeout() -> None:
+    period = 1_000_000
+    rig, now = real_time(tick_rate=SECOND / period), 10 * SECOND
+    assert rig.commands.drop_old(now) == [], "there has been none"
+    assert rig.offer(now - SECOND // 2, now) is None
+    assert rig.reason(now - SECOND // 2 - period, now) is Reason.STALE
+    assert rig.commands.drop_old(now) == []
+    assert rig.in_force() == list(FAST)
+    assert rig.commands.drop_old(now + 1) == [rig.joints]
+    assert rig.in_force() == [0.0, 0.0, 0.0]
+    assert rig.commands.drop_old(now + SECOND) == [], "it is counted once"
+    assert (rig.commands.timeouts, rig.commands.timed_out) == (1, True)
+    assert rig.commands.last_stamp_ns == now - SECOND // 2
+    for_ever = Rig(time_mode="realtime", command_timeout=0.0)
+    assert for_ever.offer(1, now) is None
+    assert for_ever.commands.drop_old(10**18) == []
+
+
 def test_a_latched_fault_refuses_everything_until_it_is_rearmed() -> None:
     rig = Rig(latched_faults="not_finite stale")
     bad = np.full(3, np.nan)

@@ -184,14 +184,6 @@ def test_commands_that_are_not_finite_are_refused(bad: float) -> None:
     assert plant.limit_counts["effort"].tolist() == [0, 0, 0]
 
 
-def test_commands_of_the_wrong_length_are_refused() -> None:
-    plant = EffortPlant(robot_of(random_urdf(0)), TICK)
-    with pytest.raises(ValueError, match="could not broadcast"):
-        plant.step([0.1, 0.2])
-    with pytest.raises(ValueError, match="could not broadcast"):
-        plant.step([0.1, 0.2, 0.3], [1, 2, 3])
-
-
 def test_a_tick_without_limits_is_taken_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stops are only looked at where a joint touches one: a tick is one compiled function."""
     plant = EffortPlant(robot_of(random_urdf(0)), TICK)
