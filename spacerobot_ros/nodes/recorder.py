@@ -27,7 +27,6 @@ from spacerobot_ros.bag import (
     Recording,
     RecordingState,
 )
-from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS
 from spacerobot_ros.errors import (
     CommandError,
     ParameterError,
@@ -54,7 +53,7 @@ from spacerobot_ros.nodes.common.ros_parameters import RemoteParameters
 from spacerobot_ros.nodes.common.watchdog import Role
 from spacerobot_ros.resources import __version__
 from spacerobot_ros.times import HEADER_STAMP, SECOND, first_time_ns
-from spacerobot_ros.topics import TOPICS_NOT_RECORDED
+from spacerobot_ros.topics import TOPICS, TOPICS_NOT_RECORDED
 
 RawCallback = Callable[[bytes], None]
 
@@ -64,13 +63,11 @@ _SHARED_TOPICS = ("/diagnostics", TRANSFORMS, STATIC_TRANSFORMS)
 _DESCRIPTION_TOPIC = "robot_description"
 
 _PRELIMINARY_TOPICS = tuple(
-    f"/{name}"
-    for name in (
-        *(status for status, _ in STATUS_TOPICS.values()),
-        *("events", "diagnostics", "heartbeat", "goal_pose", "goal_path", _DESCRIPTION_TOPIC),
-    )
+    f"/{name.lstrip('/').removeprefix('end_effector/')}"
+    for name, topic in TOPICS.items()
+    if not topic.state
 )
-"""Suffixes of topics on which commanders and clients publish before a plant starts."""
+"""Suffixes of topics on which messages are published before a plant starts: all but its states."""
 
 _TEXT_TYPE = "std_msgs/msg/String"
 _CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
