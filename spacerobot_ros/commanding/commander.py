@@ -422,7 +422,8 @@ class Commander(ABC):
             self._fly_to.advance(self.stamps.now_ns, self._progress)
             self._abort_fly_to()
             self._fly_to.end_dropped_goals(self._active_goal_ids())
-        self.inputs.note_state()
+        if not self.inputs.refusal:
+            self.inputs.note_state()
 
     def take_odom(self, stamp_ns: int, odom: Any) -> None:
         """Process an odom message with a current stamp, and handle its state if complete."""

@@ -211,6 +211,12 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     assert rig.host.statuses[-1].message == ceased
     rig.state(2)
     assert rig.host.states[-1] == "holding"
+    for _ in range(8):
+        rig.wall += 0.3
+        rig.joints(3, n=7)
+        rig.commander.take_accepted_jump()
+    rejected = "whose messages are rejected: joint 'wing' is unknown"
+    assert rig.host.statuses[-1].message == ceased.replace("which have ceased", rejected)
 
 
 def referenced(arm: SpaceRobot, *, busy: bool) -> Rig:
