@@ -210,7 +210,8 @@ def test_joints_stop_at_their_limits() -> None:
     shapes = np.array(loop.shapes)
     assert shapes[:, 1].max() <= 2.8 + 1e-9
     assert shapes[:, 1].max() > 2.75
-    assert any("Joint 'elbow' reaches its limit of 2." in s.message for s in loop.statuses)
+    told = [s.message for s in loop.statuses if "reaches its limit" in s.message]
+    assert [each.split(". ")[0] for each in told] == ["Joint 'elbow' reaches its limit of 2.8"]
     most = np.array([0.6, 0.8]) * TICK
     assert np.all(np.abs(np.diff(np.array(loop.commands), axis=0)) <= most + 1e-9)
 

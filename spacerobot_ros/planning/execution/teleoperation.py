@@ -384,7 +384,8 @@ class TwistFollower:
         if by_stops[nearest] < factor:
             factor = float(by_stops[nearest])
             joint = self._robot.joint_names[nearest]
-            reason = f"Joint '{joint}' reaches its limit of {q[nearest]:.4g}."
+            limit = (limits.upper if rates[nearest] > 0 else limits.lower)[nearest]
+            reason = f"Joint '{joint}' reaches its limit of {limit:.4g}."
         return factor * rates, reason
 
     def _solution(self, q: Array, motion: Array) -> tuple[Array, float]:
