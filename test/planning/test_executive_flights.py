@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from support.planner_loop import HERE, NEAR, TURNED, Loop, StubMethod
+from support.planner_loop import HERE, NEAR, TURNED, Loop, MovingStub, StubMethod
 from support.planner_phases import until
 from support.sentences import assert_one_sentence
 
@@ -16,6 +17,7 @@ from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.method import PlanRequest
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
+from spacerobot_ros.planning.execution.measured_states import PathSensitivity
 from spacerobot_ros.planning.execution.status import Phase, PlannerState, PlanReason
 from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.resources import share_directory
@@ -190,6 +192,19 @@ def wait(loop: Loop, goal_id: str, state: PlannerState = PlannerState.REACHED) -
     while not any((s.goal_id, s.state) == (goal_id, state) for s in loop.statuses[-1:]):
         assert time.monotonic() < end, f"{goal_id} is not {state.value}: {loop.statuses}"
         loop.tick()
+
+
+def test_the_thread_that_plans_derives_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    threads, derive = set[threading.Thread](), PathSensitivity.path_derivatives
+
+    def derived(*given: Any) -> Any:
+        threads.add(threading.current_thread())
+        return derive(*given)
+
+    monkeypatch.setattr(PathSensitivity, "path_derivatives", derived)
+    loop = threaded(MovingStub())
+    wait(loop, loop.propose_goal(NEAR))
+    assert len(threads - {threading.main_thread()}) == len(threads) == 1
 
 
 def test_a_worker_that_is_closed_has_its_search_end_soon() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+from dataclasses import replace
 from threading import Condition
 from typing import Any
 
@@ -49,11 +50,11 @@ class Trip:
         self.shapes = lower + (upper - lower) * (0.5 + 0.3 * swing)
         sensitivity = PathSensitivity(self.robot)
         self.count = sensitivity.count
-        goal = Goal(np.zeros(3), START.as_quat())
-        self.schedule = GaitSchedule(
-            "any", self.robot.joint_names, TICK, self.shapes, self.path(np.zeros(self.count)), goal
-        )
+        goal, path = Goal(np.zeros(3), START.as_quat()), self.path(np.zeros(self.count))
+        self.schedule = GaitSchedule("any", self.robot.joint_names, TICK, self.shapes, path, goal)
         self.derivatives = sensitivity.path_derivatives(self.schedule)
+        path = replace(path, mass_derivatives=self.derivatives)
+        self.schedule = replace(self.schedule, path=path)
         self.masses = MassEstimate(self.count)
 
     def path(self, errors: Array) -> BasePath:
@@ -66,8 +67,7 @@ class Trip:
         return BasePrediction(true, TICK, 0.01).path(state, self.shapes)
 
     def check(self, average: int) -> PathCheck:
-        of_masses = self.derivatives, self.masses
-        return PathCheck(self.robot, self.schedule, 0, PlannerConfig(), average, *of_masses)
+        return PathCheck(self.robot, self.schedule, 0, PlannerConfig(), average, self.masses)
 
     def measure(self, check: PathCheck, k: int, position: Array, quaternion: Array) -> None:
         assert check.due(round(k * TICK * 1e9))

@@ -22,11 +22,16 @@ Notes = dict[str, list[float] | float | str]
 
 @dataclass(frozen=True)
 class BasePath:
-    """Predicted base: ``time`` (K,) from the start, ``position`` (K, 3), ``quaternion`` (K, 4)."""
+    """Predicted base: ``time`` (K,) from the start, ``position`` (K, 3), ``quaternion`` (K, 4).
+
+    ``mass_derivatives`` (K, 6, P) are those of the poses with respect to relative mass and inertia
+    errors; None if these errors are not estimated.
+    """
 
     time: Array
     position: Array
     quaternion: Array
+    mass_derivatives: Array | None = None
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Return positions (N, 3) and quaternions (N, 4) at times (N,), s, interpolated."""

@@ -195,11 +195,9 @@ class PathCheck:
         Planner parameters: tracking error bounds, and the shape deadband.
     average
         Number of poses whose mean deviation is used for plans that begin in motion; 0: none.
-    sensitivity
-        (K, 6, P) derivatives of the path with respect to mass and inertia errors, as returned by
-        :class:`PathSensitivity`; None if these errors are not estimated.
     masses
-        Estimate of these errors, improved by the measurements.
+        Estimate of mass and inertia errors, improved by the measurements if the schedule's path has
+        derivatives with respect to them.
     """
 
     def __init__(
@@ -209,7 +207,6 @@ class PathCheck:
         start_ns: int,
         config: PlannerConfig,
         average: int = 0,
-        sensitivity: Array | None = None,
         masses: MassEstimate | None = None,
     ) -> None:
         # Do not compile in flight.
@@ -225,6 +222,7 @@ class PathCheck:
             config.drift_position > 0 or config.drift_attitude > 0 or average > 0
         )
         self._recent_deviations: deque[tuple[int, Array]] = deque(maxlen=average)
+        sensitivity = schedule.path.mass_derivatives
         if sensitivity is None or masses is None:
             sensitivity, masses = np.zeros((len(schedule.path.time), 6, 0)), MassEstimate(0)
         self._sensitivity, self._masses = sensitivity, masses

@@ -211,8 +211,7 @@ class TrajectoryTracker:
     def use_robot(self, robot: SpaceRobot) -> None:
         """Track subsequent schedules for a robot with the same joints but different masses."""
         self._robot = robot
-        self._sensitivity = PathSensitivity(robot)
-        self._mass_estimate = MassEstimate(self._sensitivity.count)
+        self._mass_estimate = MassEstimate(PathSensitivity(robot).count)
 
     @property
     def is_active(self) -> bool:
@@ -232,11 +231,8 @@ class TrajectoryTracker:
         config, self._has_result = self._config, False
         gain = config.shape_gain if self._commands_plant else 0.0
         self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
-        sensitivity = None
-        if average and config.replanning > 0:
-            sensitivity = self._sensitivity.path_derivatives(schedule)
         self.path_check = PathCheck(
-            self._robot, schedule, stamp_ns, config, average, sensitivity, self._mass_estimate
+            self._robot, schedule, stamp_ns, config, average, self._mass_estimate
         )
         self._stuck_watch.restart()
 

@@ -22,6 +22,7 @@ from spacerobot_ros.planning.core.prediction import BasePrediction
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
+from spacerobot_ros.planning.execution.measured_states import PathSensitivity
 from spacerobot_ros.planning.execution.status import PlanReason
 from spacerobot_ros.planning.execution.tracker import TakeOver
 from spacerobot_ros.planning.methods.registry import METHODS, RemainingJointsGait, build_method
@@ -152,6 +153,7 @@ class PlanningWorker:
             config.method_options,
             self.clearance,
         )
+        self._sensitivity = PathSensitivity(robot)
         self._remaining_joints: tuple[object, GaitMethod] | None = None
         """The stuck joints and required goal components of a task, and the method used for it."""
         self._job: PlanningJob[GaitSchedule] | None = None
@@ -280,7 +282,17 @@ class PlanningWorker:
         PlanningError
             No plan was found; the message says why.
         """
-        method = self._choose_method(task)
+        schedule = self._make_schedule(task, self._choose_method(task), cancellation)
+        if self._config.replanning > 0 and self.starts_in_motion(schedule):
+            # These derivatives take longer than a tick: in flight, the first command would be late.
+            derivatives = self._sensitivity.path_derivatives(schedule)
+            path = replace(schedule.path, mass_derivatives=derivatives)
+            schedule = replace(schedule, path=path)
+        return schedule
+
+    def _make_schedule(
+        self, task: PlanningTask, method: GaitMethod, cancellation: Cancellation
+    ) -> GaitSchedule:
         if task.take_over is not None:
             state = self._predict_motion(task.request.state, task.take_over.shapes)[0]
             motion = task.take_over.motion
