@@ -78,6 +78,9 @@ def main(file: str, seconds: int, arguments: Sequence[str]) -> int:
         # repeat the wrapped one.
         error = getattr(error, "exc", None) or error
         reason = " ".join(str(error).split()) or type(error).__name__
+        if type(error).__name__ == "ArgException":  # Its text is the bare name.
+            option = f"`spacerobot --xacro-arg {reason}:=VALUE COMMAND ...`"
+            reason = f"its argument '{reason}' has no value; give one with {option}"
         print(f"REASON {reason}", file=sys.stderr)
         return 1
     for name in given.keys() - given.used:

@@ -72,9 +72,15 @@ def test_a_xacro_file_takes_its_arguments(
     assert refused.stderr == "The xacro argument 'mass=42' is not of the form NAME:=VALUE.\n"
 
 
-def test_a_xacro_file_that_cannot_be_expanded_is_refused(tmp_path: Path) -> None:
-    path = file_with(tmp_path, urdf(mass="${no_such}", attribute=HEADING), "probe.xacro")
-    with pytest.raises(RobotDescriptionError, match=r"cannot be expanded: .*no_such"):
+@pytest.mark.parametrize(
+    ("mass", "reason"),
+    [("${no_such}", ".*no_such"), ("$(arg kg)", "its argument 'kg' .* --xacro-arg kg:=VALUE ")],
+)
+def test_a_xacro_file_that_cannot_be_expanded_is_refused(
+    tmp_path: Path, mass: str, reason: str
+) -> None:
+    path = file_with(tmp_path, urdf(mass=mass, attribute=HEADING), "probe.xacro")
+    with pytest.raises(RobotDescriptionError, match=rf"cannot be expanded: {reason}"):
         load_robot(path)
 
 
