@@ -31,8 +31,10 @@ _OBSTACLE = "obstacle/"
 _CONTACT_TIME_CONSTANT = 2.0
 """Time constant of contacts, stops and welds, in steps: MuJoCo's recommended minimum."""
 
-_MIN_INERTIA = 1e-12
-"""Smallest principal inertia, kg m^2: MuJoCo does not accept point masses."""
+_MIN_INERTIA = 2e-15
+"""Smallest principal inertia of a robot with point masses, kg m^2: MuJoCo accepts none, and gives
+it to massless links, too.
+"""
 
 
 def import_mujoco() -> Any:
@@ -74,7 +76,8 @@ def robot_spec(mujoco: Any, description: RobotDescription) -> Any:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     except ValueError as error:
         raise _refused(description, error) from error
-    spec.compiler.boundinertia = _MIN_INERTIA
+    if any(np.linalg.eigvalsh(x.inertia.about_com)[0] < _MIN_INERTIA for x in description.bodies):
+        spec.compiler.boundinertia = _MIN_INERTIA
     spec.compiler.fusestatic = False  # Loads also act on massless links.
     spec.worldbody.first_body().add_freejoint()
     return spec
@@ -88,7 +91,11 @@ def joint_addresses(model: Any, description: RobotDescription) -> tuple[list[int
 
 def _refused(description: RobotDescription, error: ValueError) -> RobotDescriptionError:
     reason = str(error).removesuffix(".")
-    return RobotDescriptionError(f"MuJoCo rejects robot '{description.name}': {reason}.")
+    remedy = " `spacerobot new URDF --nearest-inertia` writes a URDF with possible inertias."
+    return RobotDescriptionError(
+        f"MuJoCo rejects robot '{description.name}': {reason}."
+        f"{remedy if 'balanceinertia' in reason else ''}"
+    )
 
 
 def build_model(
