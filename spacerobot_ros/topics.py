@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+from spacerobot_ros.errors import ParameterError
+
 _POSE_MEMBERS = (*(f"position.{x}" for x in "xyz"), *(f"orientation.{x}" for x in "xyzw"))
 _TWIST_MEMBERS = (*(f"linear.{x}" for x in "xyz"), *(f"angular.{x}" for x in "xyz"))
 _WRENCH_MEMBERS = (*(f"force.{x}" for x in "xyz"), *(f"torque.{x}" for x in "xyz"))
@@ -436,6 +438,21 @@ def link_topic(end_effector: str, kind: str) -> str:
     link name converted to a valid topic name.
     """
     return re.sub(r"\W|^(?=\d)", "_", end_effector, flags=re.ASCII) + f"/{kind}"
+
+
+def require_own_topics(end_effectors: Sequence[str]) -> None:
+    """Check that no two of the links share their topics; see :func:`link_topic`.
+
+    Raises
+    ------
+    ParameterError
+        Two of them do.
+    """
+    if len({link_topic(name, "pose") for name in end_effectors}) < len(end_effectors):
+        raise ParameterError(
+            "Parameter 'end_effectors' names links that share the topic NAME/pose: "
+            f"{', '.join(end_effectors)}; name only one of them."
+        )
 
 
 def pose_topic(end_effector: str) -> Topic:

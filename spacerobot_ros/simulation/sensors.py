@@ -19,7 +19,7 @@ from spacerobot_ros.simulation.actuators import PlantWithFaults
 from spacerobot_ros.simulation.capture import CapturePlant
 from spacerobot_ros.simulation.config import PlantConfig, TargetSensorConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS, POSE_AXES, Fault
-from spacerobot_ros.topics import Topic, pose_topic, state_topics
+from spacerobot_ros.topics import Topic, pose_topic, require_own_topics, state_topics
 
 NOISE_PARAMETERS = {
     "position": "position_noise",
@@ -261,11 +261,7 @@ class ReportedState:
             self._end_effector = LinkPlacement(count, [(index, Pose())])
         names = self._end_effectors = config.end_effectors
         named = [(_link_index(robot, name, "'end_effectors' names"), Pose()) for name in names]
-        if len({pose_topic(name).name for name in names}) < len(names):
-            raise ParameterError(
-                "Parameter 'end_effectors' names links that share the topic NAME/pose: "
-                f"{', '.join(names)}; name only one of them."
-            )
+        require_own_topics(names)
         self._named_links = LinkPlacement(count, named) if named else None
         self._link_poses = robot.buffered("link_poses") if named else None
         capturing = plant.capturing

@@ -141,6 +141,7 @@ def test_scenarios_are_listed() -> None:
         (("sliding_masses", "--set", "planner.method=magic"), 2, "magic"),
         (("sliding_masses", "--set", "planner.tick_rate=fast"), 2, "it must be a number"),
         (("sliding_masses", "--set", "planner.optimal.keep_axis=1"), 2, "it must be a list"),
+        (("sliding_masses", "--set", "planner.end_effectors=[左, 右]"), 2, "share the topic"),
         (("sliding_masses", "--set", "plant.nothing=1"), 2, "no parameter 'nothing'"),
         (("sliding_masses", "--set", "planner.robot=x.urdf"), 2, "no such URDF file"),
         ((*SLIDING, "--set", "planner.lie_bracket.t2=1"), 2, "no parameter 'lie_bracket.t2'"),

@@ -14,6 +14,7 @@ from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.methods.optimal import OptimalGait
 from spacerobot_ros.planning.methods.registry import METHODS
+from spacerobot_ros.topics import require_own_topics
 
 _BACKGROUND_REPLAN_PERIOD = 2.0
 """Default ``replan_period`` if planning runs in the background, s."""
@@ -114,6 +115,10 @@ class PlannerConfig(CommanderConfig):
         maximum=1000000.0,
     )
     options: Mapping[str, Any] = registered(METHODS)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_own_topics(tuple(dict.fromkeys(self.end_effectors)))
 
     def described(self, robot: RobotDescription) -> RobotDescription:
         """Return the robot with the pairs disabled in the SRDF, and with the obstacles."""
