@@ -17,6 +17,7 @@ from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
 from spacerobot_ros.model.urdf import describe_inertia_flaw, mesh_file
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.clearance import usual_clearance
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.simulation import InitialState
@@ -196,9 +197,8 @@ def first_problem(
     goal = Goal.checked([0.0, 0.0, 0.0], quaternion_from_rotvec(turn))
     config = PlannerConfig(robot=str(file)).for_robot(robot.description)
     tolerance = min(config.attitude_tolerance, float(f"{angle / _ROTATION_TO_TOLERANCE:.1g}"))
-    config = replace(config, attitude_tolerance=tolerance)
-    if not clear:
-        config = replace(config, clearance=0.0)
+    clearance = usual_clearance(robot.description) if clear else 0.0
+    config = replace(config, attitude_tolerance=tolerance, clearance=clearance)
     return PlanningProblem(name, robot, InitialState(joint_positions=shape), goal, config)
 
 
@@ -241,10 +241,14 @@ def scenario_text(problem: PlanningProblem, method: str, robot_path: str) -> str
     angle = math.degrees(float(np.linalg.norm(turn)))
     axis = ", ".join(f"{each:.3g}" for each in turn / np.linalg.norm(turn) + 0.0)
     name = problem.robot.description.name
-    unclear = (
-        "    clearance: 0.0   # m; contacts are not detected: meshes of <collision> are missing\n"
-    )
-    clearance = "" if config.clearance else unclear
+    clearance = ""
+    if config.clearance < PlannerConfig.clearance:
+        why = (
+            "for a small robot"
+            if config.clearance
+            else "contacts are not detected: meshes of <collision> are missing"
+        )
+        clearance = f"    clearance: {config.clearance!r}   # m; {why}\n"
     start = f"    initial_joint_positions: [{shape}]   # {joints}\n" if problem.robot.n else ""
     return f"""\
 # The first flight of {name}: its joints rotate its base.

@@ -68,6 +68,29 @@ def test_a_new_robot_gets_a_scenario_that_reaches_its_goal(robot: Path) -> None:
     assert scenario.parameters("plant")["robot"] == str(robot)
 
 
+def test_a_robot_of_two_grams_keeps_clear_by_its_size_and_flies_the_same_in_mujoco(
+    robot: Path,
+) -> None:
+    factors = {"mass value": 1e-5, "xyz": 0.01, "size": 0.01}
+
+    def smaller(found: re.Match[str]) -> str:
+        values = factors.get(found[1], 1e-9) * np.array(found[2].split(), dtype=float)
+        return f'{found[1]}="{" ".join(map(str, values))}"'
+
+    text = robot_file("three_joint_arm").read_text("utf-8")
+    text = re.sub(r'(mass value|xyz|size|i[xyz]{2})="([^"]*)"', smaller, text)
+    weld = '<joint name="m" type="fixed"><parent link="base_link"/><child link="mark"/></joint>'
+    robot.write_text(text.replace("</robot>", f'<link name="mark"/>{weld}</robot>'), "utf-8")
+    loops = ("plan", robot.name, "--method", "area_loop", "--goal-rotvec", "0", "0", "0.1")
+    assert "0.0007 m would suit" in spacerobot(*loops, code=1).output
+    new(robot.name)
+    assert load_scenario("mine.yaml").planner.clearance == 0.0007  # Of 13 mm.
+    spacerobot("run", "mine.yaml", "--bag", "tiny.mcap")
+    found = verify_bag(Path("tiny.mcap"), mujoco=True).second_opinion
+    assert found is not None
+    assert found.attitude < 1e-10
+
+
 def test_the_scenario_stands_where_it_is_wanted_and_finds_its_robot(robot: Path) -> None:
     out = robot.parent / "scenarios" / "turn.yaml"
     out.parent.mkdir()

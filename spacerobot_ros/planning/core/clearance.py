@@ -37,6 +37,9 @@ DEFAULT_CLEARANCE = 0.01
 _CLEARANCE_OF_OBSTACLES = 0.01
 """Smallest distance if there are obstacles and none is requested, m."""
 
+_LARGEST_SHARE_OF_SIZE = 0.05
+"""Largest usual ratio of the clearance to the robot's diameter of gyration."""
+
 _DISTANCE_ERROR = 1e-6
 """Numerical error of a computed distance, m."""
 
@@ -46,6 +49,11 @@ _MIN_START_SHARE = 0.5
 """Fraction of the clearance below which a start near an obstacle is rejected, since a flight that
 ended at the clearance may be slightly closer, and fraction of their distance that links keep if
 they are that close: fingers, for instance, are by design."""
+
+
+def usual_clearance(robot: RobotDescription) -> float:
+    """Return the default clearance, or a smaller one if the robot is smaller than 0.2 m, in m."""
+    return float(f"{min(DEFAULT_CLEARANCE, _LARGEST_SHARE_OF_SIZE * robot.size):.1g}")
 
 
 class Clearance:
@@ -235,9 +243,14 @@ class Clearance:
         if control_period is not None:
             when = f" after {approach.tick * control_period:.4g} s,"
         shape = np.round(approach.shape, 3).tolist()
-        return (
-            f"{approach}{when} at the shape {shape}, and {self._parameter} is {self.distance:g} m"
-        )
+        return f"{approach}{when} at the shape {shape}, and {self._setting}"
+
+    @property
+    def _setting(self) -> str:
+        """The value of the parameter, and a better one if it is unusual for the robot's size."""
+        usual = usual_clearance(self._robot)
+        hint = "" if self.distance <= usual else f"; {usual:g} m would suit the robot's size"
+        return f"{self._parameter} is {self.distance:g} m{hint}"
 
     def require_shape(self, shape: Array, required: Array, base: BasePoses | None = None) -> None:
         """Check that links are not too close in the shape (n,) of a goal.
@@ -253,7 +266,6 @@ class Clearance:
         if found:
             subject = "shape" if found[0].place_on_obstacle is None else "pose"
             raise UnreachableError(
-                f"The {subject} of the goal is in collision: {found[0]}; {self._parameter} is "
-                f"{self.distance:g} m.",
+                f"The {subject} of the goal is in collision: {found[0]}; {self._setting}.",
                 Proof.COLLISION,
             )
