@@ -41,8 +41,9 @@ def main() -> None:
 
     schedule = plan(robot, start=q, rotvec=(0.0, 0.0, np.radians(10.0)), answers=1)
     print(f"10 deg about z by the arm alone: {schedule.duration:.2f} s")
-    for time, shape in zip(schedule.path.time[::10], schedule.positions[::10], strict=False):
-        print(f"  {time:6.2f} s  joints at {np.round(shape, 2).tolist()} rad")
+    for tick in range(0, len(schedule.positions), 10):
+        shape = np.round(schedule.positions[tick], 2).tolist()
+        print(f"  {tick * schedule.control_period:6.2f} s  joints at {shape} rad")
 
 
 if __name__ == "__main__":
