@@ -237,8 +237,10 @@ class Flight(FlightData):
     def thrust_impulse(self) -> float:
         """Impulse of the thrusters since the start or the last reset, N s: the sum over all, or of
         the commanded force; 0: none."""
-        thrust = self.signal("thruster_force") or self.wrench.norms([0, 1, 2])
-        first = max([1, *thrust.rows_after(self.resets)])
+        forces = self.signal("thruster_force")
+        thrust = forces or self.wrench.norms([0, 1, 2])
+        # The first forces acted before the first state; the first command acts after it.
+        first = max([int(bool(forces)), *thrust.rows_after(self.resets)])
         return float(thrust.values[first:].sum() * self.control_period)
 
     @cached_property

@@ -217,6 +217,8 @@ def test_thrust_explains_the_momentum_in_a_recording_that_lacks_some(
     moved = np.linalg.norm(flight.momentum[:, :3] - flight.momentum[0, :3], axis=1).max()
     assert moved > 0.1
     assert np.all(found.momentum_drift < 1e-9)
+    pushes = np.linalg.norm(np.diff(flight.momentum[:, :3], axis=0), axis=1)
+    assert found.thrust_impulse == pytest.approx(pushes.sum(), rel=1e-6)
 
 
 @pytest.fixture
