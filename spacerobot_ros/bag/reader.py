@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -73,8 +74,8 @@ def bag_files(path: Path) -> list[Path]:
     Raises
     ------
     RecordingError
-        A folder contains no MCAP file, or several that are not listed in its ``metadata.yaml``, or
-        not all of several that are.
+        A folder contains no MCAP file, or several that are not listed in its ``metadata.yaml``; or
+        a file of several that belong together is missing.
     """
     if path.is_dir():
         listed = _as_found([path / name for name in _listed_files(path)])
@@ -82,10 +83,7 @@ def bag_files(path: Path) -> list[Path]:
         if listed and not missing:
             return listed
         if len(listed) > 1:
-            raise RecordingError(
-                f"The bag {path} lacks {_format_list(missing)}, listed in its metadata.yaml: "
-                "restore what is missing, or name one of the other files to read it alone."
-            )
+            raise _lacks(path, f"{_format_list(missing)}, listed in its metadata.yaml")
         # Files in other formats are rejected individually, with a remedy.
         found = (sorted(path.glob(f"*{suffix}")) for suffix in (".mcap", ".mcap.zst*", ".db3"))
         files = next(filter(None, found), [])
@@ -104,10 +102,24 @@ def bag_files(path: Path) -> list[Path]:
                 "to read all of them."
             )
         return [path]
-    parts: list[Path] = []
-    while (part := path.with_name(f"{path.stem}_{len(parts)}{path.suffix}")).exists():
-        parts.append(part)
-    return _as_found(parts) or [path]
+    name = re.compile(
+        rf"{re.escape(path.stem)}_(0|[1-9]\d*)(-salvaged)?{re.escape(path.suffix)}(\.zstd)?"
+    )
+    matches = (name.fullmatch(file.name) for file in path.parent.glob("*"))
+    numbers = {int(match[1]) for match in matches if match}
+    if 0 not in numbers:
+        return [path]
+    parts = [path.with_name(f"{path.stem}_{n}{path.suffix}") for n in range(len(numbers))]
+    if missing := [part.name for n, part in enumerate(parts) if n not in numbers]:
+        raise _lacks(path, _format_list(missing))
+    return _as_found(parts)
+
+
+def _lacks(bag: Path, missing: str) -> RecordingError:
+    return RecordingError(
+        f"The bag {bag} lacks {missing}: restore what is missing, or name one of the other files "
+        "to read it alone."
+    )
 
 
 def _as_found(files: list[Path]) -> list[Path]:

@@ -229,6 +229,12 @@ def test_the_name_of_a_split_recording_is_all_of_its_files(tmp_path: Path) -> No
     bag = read_bag(tmp_path / "a.mcap")
     assert bag["joint_states"].field("position").tolist() == [[100 + k] for k in range(5)]
     assert bag.metadata["rosbag2"] == read_bag(sorted(tmp_path.iterdir())[-1]).metadata["rosbag2"]
+    (tmp_path / "a_1.mcap").rename(tmp_path / "a_1-salvaged.mcap")
+    assert read_bag(tmp_path / "a.mcap").message_count() == 5
+    (tmp_path / "a_1-salvaged.mcap").unlink()
+    lacks = r"The bag \S+a\.mcap lacks a_1\.mcap: restore what is missing, or name one of the other"
+    with pytest.raises(RecordingError, match=lacks):
+        read_bag(tmp_path / "a.mcap")
 
 
 def test_a_compressed_file_is_read(tmp_path: Path) -> None:
