@@ -429,7 +429,7 @@ def read_flight(bag: FlightBag) -> Flight:
         statuses=tuple(sorted((s for each in statuses.values() for s in each), key=lambda s: s[0])),
         events=tuple(bag.timed_events()),
         outcome=Outcome.INTERRUPTED if decision is None else Outcome(decision.state.value),
-        message=status.message if status is not None else "",
+        message=_last_message(status, decided=decision is not None),
         goal=None if is_unknown else goal_at_end(reports, goals),
         end_effector_goal=tool_goals[-1].goal if tool_goals else None,
         goals=goals,
@@ -442,6 +442,16 @@ def read_flight(bag: FlightBag) -> Flight:
     # A thruster table in a separate file is not read, because a bag may name any file.
     in_urdf = scenario.in_file.get("plant", {}).get("thrusters") == IN_URDF
     return _with_propellant(flight, IN_URDF, bag.names("thrusters")) if in_urdf else flight
+
+
+def _last_message(status: Status | None, decided: bool) -> str:
+    if status is None:
+        return ""
+    if decided or status.state.value not in ("executing", "tracking"):
+        return status.message
+    # The distances after the semicolon are older than the last recorded state.
+    doing = status.message.partition(";")[0].removesuffix(".")
+    return f"{doing}. The recording ends before the outcome is known."
 
 
 def read_flown(bag: FlightBag, scenario: Scenario) -> Flight:

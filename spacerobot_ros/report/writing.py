@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from spacerobot_ros.errors import SpaceRobotError, counted, enumeration, sentence_case
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.files import warn_once, write_output
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.report import figures_over_time as over_time
 from spacerobot_ros.report import figures_space as space
 from spacerobot_ros.report.events import event_style, event_text
@@ -381,8 +382,8 @@ def _outcome_html(flight: FlightReport) -> str:
     last = next(of_goals, statuses[-1])
     tone = "" if isinstance(last, str) else last.state.value
     word, sentence = tone.capitalize(), last if isinstance(last, str) else last.message
-    if tone == "executing":
-        sentence += " The recording ends before the outcome is known."
+    if tone in ("executing", "tracking") and flight.outcome is Outcome.INTERRUPTED:
+        sentence = flight.message
     if tone in ("reached", "reached_partly", "failed", flight.outcome.value):
         word, sentence = verdict.word, verdict.sentence
     if tone.startswith("reached"):
