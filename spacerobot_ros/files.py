@@ -110,33 +110,32 @@ def write_output(path: Path, content: bytes | str) -> None:
 # -- YAML -------------------------------------------------------------------------------------
 
 
-def load_yaml(text: str, loader: Any = None) -> Any:
+def load_yaml(text: str) -> Any:
     """Return the content of an untrusted YAML string, with limits on its size.
 
     Parameters
     ----------
     text
         One document of at most a million characters.
-    loader
-        Class of the loader; None: ``yaml.SafeLoader``.
 
     Raises
     ------
     ValueError
-        The string is not YAML, is too long or too deeply nested, or its aliases expand to too many
-        values: a 1 kB file may expand to a billion values.
+        The string is not YAML, has a key twice, of which YAML would silently keep the last, is too
+        long or too deeply nested, or its aliases expand to too many values: a 1 kB file may expand
+        to a billion values.
     """
     import yaml
 
     if len(text) > _MAX_YAML_CHARACTERS:
         raise ValueError(f"it has more than {_MAX_YAML_CHARACTERS} characters")
     try:
-        reader = (loader or yaml.SafeLoader)(text)
+        reader = yaml.SafeLoader(text)
         try:
             node = reader.get_single_node()
             if node is None:
                 return None
-            _limit_values(node)
+            _check_values(node)
             return reader.construct_document(node)
         finally:
             reader.dispose()
@@ -146,8 +145,8 @@ def load_yaml(text: str, loader: Any = None) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
-def _limit_values(root: Any) -> None:
-    """Refuse a YAML node with too many values below it; keys count as well."""
+def _check_values(root: Any) -> None:
+    """Refuse a YAML node with a key twice or too many values below it; keys count as well."""
     nodes, count = [root], 0
     while nodes:
         count += 1
@@ -155,9 +154,22 @@ def _limit_values(root: Any) -> None:
             raise ValueError(
                 f"it has more than {_MAX_YAML_VALUES} values, including values repeated by aliases"
             )
-        value = nodes.pop().value
-        for child in () if isinstance(value, str) else value:
+        node = nodes.pop()
+        if node.id == "mapping":
+            _refuse_repeated_keys(node)
+        for child in () if isinstance(node.value, str) else node.value:
             nodes.extend(child if isinstance(child, tuple) else (child,))
+
+
+def _refuse_repeated_keys(mapping: Any) -> None:
+    known = set()
+    for key, _ in mapping.value:
+        if not isinstance(key.value, str):
+            continue  # An unhashable key is refused elsewhere with its own message.
+        if key.value in known:
+            line = key.start_mark.line + 1
+            raise ValueError(f"the key '{key.value}' appears twice, the second time in line {line}")
+        known.add(key.value)
 
 
 # -- files of this user -----------------------------------------------------------------------

@@ -17,12 +17,12 @@ import numpy.typing as npt
 from spacerobot_ros.bag import RecorderConfig
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted, reason
-from spacerobot_ros.files import load_yaml
+from spacerobot_ros.files import load_yaml, warn_once
 from spacerobot_ros.model.urdf import load_world
 from spacerobot_ros.parameters import as_numbers, known_values
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal, Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.resources import is_path
+from spacerobot_ros.resources import is_path, suggestion
 from spacerobot_ros.simulation.config import PlantConfig
 from spacerobot_ros.simulation.faults import line_refusal, parse_times
 from spacerobot_ros.viewer.server import ViewerConfig
@@ -156,6 +156,9 @@ def _sections(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any
     for key, section in content.items():
         node = str(key).rpartition("/")[2]
         if node not in (*NODES, "**"):
+            # Sections of other nodes are allowed, but this may be a misspelt name.
+            if node != "scenario" and (meant := suggestion(node, NODES)):
+                warn_once(f"The section '{key}' of {path} is of no node of this package.{meant}")
             continue
         section = {} if section is None else section
         values = section.get("ros__parameters", {}) if isinstance(section, dict) else None
@@ -354,5 +357,7 @@ def _parse_pose(name: str, values: Mapping[str, Any]) -> Goal:
     position = values.get(f"{name}_position", [0.0, 0.0, 0.0])
     orientation = values.get(f"{name}_orientation", [0.0, 0.0, 0.0, 1.0])
     if f"{name}_rotvec" in values:
+        if f"{name}_orientation" in values:
+            raise GoalError(f"{name}_orientation and {name}_rotvec are both given: remove one.")
         orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
     return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from spacerobot_ros.batch.targets import is_device_name
 from spacerobot_ros.campaign.draws import (
@@ -145,22 +144,6 @@ class Campaign:
         return CLEARANCE in self.named_metrics
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """Refuses duplicate keys, of which YAML would silently keep the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        known: set[str] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                continue  # An unhashable key is refused elsewhere with its own message.
-            if key.value in known:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key '{key.value}' appears twice", key.start_mark
-                )
-            known.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
 def load_campaign(path: Path, flights: int | None = None) -> Campaign:
     """Read a campaign file; ``flights`` overrides the number of flights in the file.
 
@@ -170,7 +153,7 @@ def load_campaign(path: Path, flights: int | None = None) -> Campaign:
         The file cannot be read, or contains an invalid value; the message states its location.
     """
     try:
-        content = load_yaml(read_regular(path).decode("utf-8"), _UniqueKeyLoader)
+        content = load_yaml(read_regular(path).decode("utf-8"))
     except (OSError, ValueError) as error:
         raise ParameterError(
             f"The campaign file {path} cannot be read: {reason(error)}."

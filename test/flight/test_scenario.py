@@ -391,7 +391,7 @@ def test_settings_that_are_none(text: str) -> None:
     assert (number_in("1e3"), number_in("a")) == (1000.0, "a")
 
 
-def test_files_without_sections(tmp_path: Path) -> None:
+def test_files_without_sections(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "a.yaml"
     for under in ("[1]", "{ros__parameters: 3}", "{ros__parameters: null}"):
         path.write_text(f"plant: {under}")
@@ -403,6 +403,12 @@ def test_files_without_sections(tmp_path: Path) -> None:
         )
     path.write_text("[1]")
     assert read_sections(path) == {}
+    path.write_text("camera: {}\n/**/recoder: {ros__parameters: {compression: zstd}}")
+    assert read_sections(path) == {}
+    (said,) = caplog.messages
+    assert said.endswith(
+        f"'/**/recoder' of {path} is of no node of this package. Did you mean 'recorder'?"
+    )
     with pytest.raises(ParameterError, match="cannot be read"):
         read_sections(tmp_path / "none.yaml")
 
@@ -413,6 +419,14 @@ def test_files_without_sections(tmp_path: Path) -> None:
         (("goal_positon: [1, 2, 3]",), "has an unknown key 'goal_positon' in its scenario section"),
         (("goal_position: [1, 2]",), "The goal in the scenario file"),
         (("goal_rotvec: [1, 2]",), "The goal in the scenario file"),
+        (
+            ("goal_rotvec: [0, 0, 1]", "goal_orientation: [0, 0, 0, 1]"),
+            "goal_orientation and goal_rotvec are both given: remove one.",
+        ),
+        (
+            ("goal_rotvec: [0, 0, 1]", "goal_rotvec: [0, 0, 2]"),
+            "the key 'goal_rotvec' appears twice",
+        ),
         (
             ("published: {a: 3}",),
             "The section 'published' in the scenario file FILE is not quantity: {printed: "
