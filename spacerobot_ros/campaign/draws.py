@@ -211,7 +211,8 @@ def read_table(text: str, scenario: Scenario) -> list[Dispersion]:
     ParameterError
         A name or a value is invalid.
     """
-    names, *rows = [row for row in csv.reader(text.splitlines(), skipinitialspace=True) if row]
+    lines = csv.reader(text.splitlines(), skipinitialspace=True)
+    names, *rows = [row for row in lines if row] or [[]]
     if not rows:
         raise ParameterError("the table must consist of one line of names and one line per flight.")
     for number, row in enumerate(rows, 1):

@@ -76,6 +76,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"table": "/dev/zero"}, "the table '/dev/zero' cannot be read: it is a device"),
     ({"table": 3}, "'table' must be the name or the content of a CSV file"),
     ({"table": "mass\n"}, "must consist of one line of names and one line per flight"),
+    ({"table": "\n"}, "must consist of one line of names and one line per flight"),
     ({"table": "mass\n1,2\n"}, "table row 1 has 2 values for 1 names"),
     ({"table": "mass.*\n1\n"}, r"'mass.\*' in the table refers to 4 values: name one"),
     ({"table": "mass\nx\n"}, "'mass: table' is 'x'; it must be a finite number"),
