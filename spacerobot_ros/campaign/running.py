@@ -191,8 +191,9 @@ class Rerun:
             f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
             for name, value in row.draw.values.items()
         )
+        passed = "passed" if row.passed else "not passed"
         lines = [
-            f"flight {row.draw.number}: {row.outcome}. {row.reason}",
+            f"flight {row.draw.number}: {row.outcome}, {passed}. {row.reason}",
             f"drawn       {drawn or 'nothing'}; seed {row.draw.seed}",
             f"bag         {self.bag}",
         ]

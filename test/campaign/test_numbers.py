@@ -273,7 +273,7 @@ def test_what_is_said_of_a_rerun(given: dict[str, Any], agrees: bool, last: str)
     found = rerun(**given)
     assert found.agrees is agrees
     assert found.report_lines[:3] == [
-        "flight 7: reached. There.",
+        "flight 7: reached, not passed. There.",
         "drawn       mass 1.23457, planner.method optimal; seed 123",
         "bag         b.mcap",
     ]
