@@ -58,7 +58,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
         The bag does not exist, is not in MCAP format, is truncated or is damaged.
     """
     given, files = Path(path), bag_files(Path(path))
-    return Bag(given if given.is_dir() and len(files) > 1 else files[0], files)
+    return Bag(given if len(files) > 1 else files[0], files)
 
 
 def salvaged_copy(path: Path) -> Path:

@@ -31,8 +31,12 @@ def _numbered_names(path: Path) -> Iterator[Path]:
 
 
 def free_name(path: Path) -> Path:
-    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ... that does not exist yet."""
-    return next(name for name in _numbered_names(path) if not os.path.lexists(name))
+    """Return a path, or the first of ``NAME-1``, ``NAME-2``, ..., that is no bag yet: neither a
+    file, nor the name of a split one."""
+    names = (
+        (name, name.with_name(f"{name.stem}_0{name.suffix}")) for name in _numbered_names(path)
+    )
+    return next(each[0] for each in names if not any(map(os.path.lexists, each)))
 
 
 class BagWriter(AbstractContextManager["BagWriter"]):
@@ -249,7 +253,7 @@ class BagWriter(AbstractContextManager["BagWriter"]):
         names = _numbered_names(self._unsplit_path)
         while True:
             self._unsplit_path = whole = next(names)
-            numbered = re.compile(rf"{re.escape(whole.stem)}_\d+{re.escape(whole.suffix)}")
+            numbered = re.compile(rf"{re.escape(whole.stem)}(_\d+)?{re.escape(whole.suffix)}")
             others: list[str] = []
             if any(self._limits) and not self._overwrite:
                 with suppress(OSError):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -109,21 +108,23 @@ def run_command(
     chosen = chosen.with_settings(settings)
     chosen.require_goal()
     from spacerobot_ros.bag import free_name
+    from spacerobot_ros.bag.reader import bag_files
     from spacerobot_ros.session.run import run_scenario
 
     if view and realtime is None:
         raise click.UsageError("--view needs --realtime: a lockstep flight ends too soon.")
     usual = bag or Path("out") / f"{chosen.name}.mcap"
-    taken, path = os.path.lexists(usual), bag or free_name(usual)
+    free = free_name(usual)
     page = viewer_if_requested(view, chosen.parameters("viewer"), settings=settings)
     with page, display(chosen.name) as shown:
         by_nodes = nodes or realtime is not None
-        result = run_scenario(chosen, path, shown.fly, nodes=by_nodes, longest=longest)
+        result = run_scenario(chosen, bag or free, shown.fly, nodes=by_nodes, longest=longest)
     path = Path(result.summary["bag"])
     refused = result.summary["state"] == "refused" and not result.summary["ticks"]
     if refused and bag is None and report is None:
         # No one has requested a recording of a robot that did not move.
-        path.unlink(missing_ok=True)
+        for file in bag_files(path):
+            file.unlink(missing_ok=True)
         result.summary["bag"] = None
     if json_file is not None:
         write_json(json_file, result.summary)
@@ -135,7 +136,7 @@ def run_command(
     published = _published_lines(chosen, result.summary)
     for line in (verdict, *_fault_lines(chosen, result.summary), *lines, *published):
         say(line)
-    if taken and path != usual:
+    if usual not in (free, path):
         say(f"            {usual} contains an earlier flight and is kept")
     words = ["spacerobot", "report", str(path)]
     if report is None:

@@ -96,5 +96,5 @@ def run_scenario(
                 raise
             raise SpaceRobotError(message) from error
         write_flight(flown, writer)
-    recorded = {"messages_recorded": writer.messages_written, "bag": str(writer.path)}
+    recorded = {"messages_recorded": writer.messages_written, "bag": str(bag)}
     return RunResult({**flown.summary(), **recorded})

@@ -15,6 +15,7 @@ import click
 import pytest
 import yaml
 from click.shell_completion import ShellComplete
+from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from support.altered_bags import altered
 from support.command_line import CliRunner, spacerobot
@@ -378,6 +379,21 @@ def test_a_refused_goal_has_its_report_if_asked(words: tuple[str, ...], tmp_path
     # The base and the end-effector each have a reason.
     reason = "computed_torque" if "computed_torque" in words else escape(result.stderr.strip())
     assert reason in outcome[1]
+
+
+def test_a_flight_in_several_files_is_one_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("run", "planar_chain", "--set", "recorder.max_duration=3.0")
+    spacerobot(*words)
+    html, bag = tmp_path / "a.html", Path("out/planar_chain-1.mcap")
+    said = spacerobot(*words, "--report", html).stdout
+    assert f"bag         {bag} (" in said
+    assert "out/planar_chain.mcap contains an earlier flight and is kept" in said
+    with AnyReader(sorted(Path("out").glob("planar_chain-1_*.mcap"))) as reader:
+        ticks = sum(each.msgcount for each in reader.connections if each.topic == "/odom") - 1
+    assert f">{ticks} ticks<" in html.read_text("utf-8")
 
 
 # -- the commands about bags, as people call them: output and exit codes -------------------------
