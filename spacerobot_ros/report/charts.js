@@ -6,6 +6,13 @@
   const root = document.documentElement;
   const whole = given.end > 1e-9 ? [0, given.end] : [-0.5, 0.5];
   const charts = [];
+  // Lines of each flight, and the borders of their markers in the legend.
+  const looks = [
+    { dash: [], border: "solid" },
+    { dash: [9, 3, 2, 3], border: "dashed" },
+    { dash: [2, 3], border: "dotted" },
+    { dash: [12, 3, 2, 3, 2, 3], border: "double" },
+  ];
   let span = whole;
   let now = 0;
 
@@ -156,11 +163,12 @@
     reset.type = "button";
     reset.hidden = true;
     reset.onclick = () => zoom(...whole);
+    const look = (k) => looks[Math.floor(k / chart.own) % looks.length];
     const series = chart.names.map((name, k) => ({
       label: name,
       stroke: () => tint(chart.colours[k]),
       width: 1.4,
-      dash: [[], [9, 3, 2, 3], [2, 3]][Math.min(Math.floor(k / chart.own), 2)],
+      dash: look(k).dash,
       spanGaps: false,
       points: { show: chart.time.length < 3 },
       value: (plot, value) =>
@@ -211,7 +219,7 @@
         cursor: { sync: { key: "flight" }, drag: { x: true, y: false, setScale: false }, y: false },
         legend: {
           live: true,
-          markers: { dash: (self, k) => (self.series[k].dash?.length ? "dotted" : "solid") },
+          markers: { dash: (_, k) => look(Math.max(k - 1, 0)).border },
         },
         hooks: {
           drawAxes: [draw(chart)],

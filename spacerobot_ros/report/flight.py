@@ -460,11 +460,13 @@ def read_report(path: Path, namespace: str | None = None) -> FlightReport:
 
 
 def labels_of(flights: Sequence[FlightReport]) -> list[str]:
-    """Return a name for each of several flights: the method, or the file name if methods recur."""
-    methods = [each.flown_method for each in flights]
+    """Return a name for each of several flights: the method, or the file name if methods recur or
+    scenarios differ."""
+    scenarios = {each.bag.metadata.get("scenario", {}).get("name", "") for each in flights}
+    methods = [each.flown_method for each in flights] if len(scenarios) == 1 else []
     paths = [each.bag.path for each in flights]
     for names in (methods, [path.stem for path in paths]):
-        if all(names) and len(set(names)) == len(names):
+        if all(names) and len(set(names)) == len(flights):
             return names
     return [f"{path.parent.name}/{path.stem}" for path in paths]
 

@@ -163,6 +163,18 @@ def test_charts_have_the_traces_of_a_flight_beside(
 
 
 @with_browser
+def test_the_legend_tells_flights_apart(bag: Path, tmp_path: Path) -> None:
+    html, marks = tmp_path / "all.html", "[...document.querySelectorAll('.u-legend .u-marker')]"
+    others = [tell(tmp_path / f"{k}.mcap", Story(np.zeros((5, 3)))) for k in range(3)]
+    spacerobot("report", bag, *others, "--out", html)
+    with browser(tmp_path / "profile") as opened:
+        opened.open(html, 1280, 900)
+        opened.wait_for("window.flightCharts !== undefined")
+        found = opened.evaluate(f"{marks}.slice(0, 13).map(e => getComputedStyle(e).borderStyle)")
+    assert found[-12:] == np.repeat(["solid", "dashed", "dotted", "double"], 3).tolist()
+
+
+@with_browser
 @pytest.mark.parametrize("width", [1280, 420])
 def test_labels_of_events_stay_in_their_strip_and_apart(tmp_path: Path, width: int) -> None:
     plans = [
