@@ -112,12 +112,33 @@ def test_a_bag_is_not_replaced(tmp_path: Path) -> None:
     write_output(bag, b"x")
 
 
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("a" * 1_000_001, "it has more than 1000000 characters"),
+        ("[" * 10_000, "it is nested too deeply"),
+        ("&a [*a]", "it has more than 100000 values"),
+        (f"[&a [{'1, ' * 1000}], {'*a, ' * 100}]", "it has more than 100000 values"),
+        ("a: [", "while parsing a flow node"),
+        ("b: {a: 1,\n  a: 1}", "the key 'a' appears twice, the second time in line 2"),
+        ("? [1, 2]\n: 3", "while constructing a mapping"),
+    ],
+)
+def test_yaml_of_unknown_origin_is_limited(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=r"\w") as refused:
+        load_yaml(text)
+    assert str(refused.value).startswith(reason)
+    assert "\n" not in str(refused.value)
+
+
 def test_yaml_up_to_its_limits_is_read() -> None:
     assert load_yaml("a" * 1_000_000) == "a" * 1_000_000
     assert len(load_yaml(f"[&a [{'1, ' * 1000}], {'*a, ' * 98}]")) == 99
     assert load_yaml("") is None
     assert load_yaml("[&a [1, 2], *a]") == [[1, 2], [1, 2]]
     assert load_yaml("{a: 1, 2: b}") == {"a": 1, 2: "b"}
+    # A value beside a merge replaces what it merges: that is no key twice.
+    assert load_yaml("[&a {b: 1, c: 2}, {<<: *a, b: 3}]")[1] == {"b": 3, "c": 2}
 
 
 def test_a_private_file_is_of_this_user_alone(

@@ -207,25 +207,6 @@ def test_numbers_without_a_dot_may_be_chosen() -> None:
     assert made.dispersions[0].distribution.choices == (0.9, 1.0)
 
 
-def test_a_key_that_is_there_twice_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "twice.yaml"
-    text = yaml.safe_dump({"campaign": section(disperse={"mass": NORM})})
-    file.write_text(text)
-    assert load_campaign(file).names == ("mass",)
-    file.write_text(text.replace("disperse:\n", "disperse:\n    mass: {norm: {}}\n"))
-    with pytest.raises(ParameterError, match=r"the key 'mass' appears twice.*line 4"):
-        load_campaign(file)
-    file.write_text("campaign:\n  ? [1, 2]\n  : 3\n")
-    with pytest.raises(ParameterError, match=r"found unhashable key.*line 2"):
-        load_campaign(file)
-    # A value beside a merge replaces what it merges: that is no key twice.
-    shared = "shared: &shared {flights: 3, seed: 4}\n"
-    merged = text.replace("campaign:\n", "campaign:\n  <<: *shared\n  flights: 5\n")
-    file.write_text(shared + merged)
-    made = load_campaign(file)
-    assert (made.flights, made.seed) == (5, 4)
-
-
 def test_a_campaign_is_not_read_from_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "campaign.yaml")
     with pytest.raises(ParameterError, match=r"campaign\.yaml cannot be read: it is a pipe"):

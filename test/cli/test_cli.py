@@ -15,7 +15,6 @@ import click
 import pytest
 import yaml
 from click.shell_completion import ShellComplete
-from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 from support.altered_bags import altered
 from support.command_line import CliRunner, spacerobot
@@ -381,9 +380,7 @@ def test_a_refused_goal_has_its_report_if_asked(words: tuple[str, ...], tmp_path
     assert reason in outcome[1]
 
 
-def test_a_flight_in_several_files_is_one_bag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_split_flight_is_one_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     words = ("run", "planar_chain", "--set", "recorder.max_duration=3.0")
     spacerobot(*words)
@@ -391,8 +388,7 @@ def test_a_flight_in_several_files_is_one_bag(
     said = spacerobot(*words, "--report", html).stdout
     assert f"bag         {bag} (" in said
     assert "out/planar_chain.mcap contains an earlier flight and is kept" in said
-    with AnyReader(sorted(Path("out").glob("planar_chain-1_*.mcap"))) as reader:
-        ticks = sum(each.msgcount for each in reader.connections if each.topic == "/odom") - 1
+    (ticks,) = re.findall(r"flight +(\d+) ticks in", said)
     assert f">{ticks} ticks<" in html.read_text("utf-8")
 
 

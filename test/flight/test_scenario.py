@@ -406,9 +406,7 @@ def test_files_without_sections(tmp_path: Path, caplog: pytest.LogCaptureFixture
     path.write_text("camera: {}\n/**/recoder: {ros__parameters: {compression: zstd}}")
     assert read_sections(path) == {}
     (said,) = caplog.messages
-    assert said.endswith(
-        f"'/**/recoder' of {path} is of no node of this package. Did you mean 'recorder'?"
-    )
+    assert said.endswith(" Did you mean 'recorder'?")
     with pytest.raises(ParameterError, match="cannot be read"):
         read_sections(tmp_path / "none.yaml")
 
@@ -419,14 +417,8 @@ def test_files_without_sections(tmp_path: Path, caplog: pytest.LogCaptureFixture
         (("goal_positon: [1, 2, 3]",), "has an unknown key 'goal_positon' in its scenario section"),
         (("goal_position: [1, 2]",), "The goal in the scenario file"),
         (("goal_rotvec: [1, 2]",), "The goal in the scenario file"),
-        (
-            ("goal_rotvec: [0, 0, 1]", "goal_orientation: [0, 0, 0, 1]"),
-            "goal_orientation and goal_rotvec are both given: remove one.",
-        ),
-        (
-            ("goal_rotvec: [0, 0, 1]", "goal_rotvec: [0, 0, 2]"),
-            "the key 'goal_rotvec' appears twice",
-        ),
+        (("goal_rotvec: [0, 0, 1]", "goal_orientation: [0, 0, 0, 1]"), "both given: remove one."),
+        (("goal_rotvec: [0, 0, 1]", "goal_rotvec: [0, 0, 2]"), "'goal_rotvec' appears twice"),
         (
             ("published: {a: 3}",),
             "The section 'published' in the scenario file FILE is not quantity: {printed: "
