@@ -217,7 +217,9 @@ def _percentiles_section(results: Results) -> str:
     for name in results.distributed_metrics:
         values = results.columns[name]
         there = values[np.isfinite(values)]
-        numbers = [there.min(), *percentiles(values), there.max(), there.mean(), there.std()]
+        # As an estimate from a sample: the campaign's flights are drawn from all possible ones.
+        spread = there.std(ddof=min(1, len(there) - 1))
+        numbers = [there.min(), *percentiles(values), there.max(), there.mean(), spread]
         rows.append([metric_label(name, free), *(f"{x:.4g}" for x in numbers)])
     head = ["metric", "minimum", *(f"{p:g} %" for p in PERCENTILES), "maximum", "mean", "std"]
     return table("percentiles", head, rows)
