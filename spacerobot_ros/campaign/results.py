@@ -45,7 +45,9 @@ order."""
 _ROW_COLUMNS = ("flight", "passed", "outcome", "reason", "engine", "fallback", "wall_time_s")
 
 _MAIN_METRICS = (
-    *("position_error_m", "attitude_error_rad", "manoeuvre_time_s", "propellant_kg"),
+    *("position_error_m", "attitude_error_rad"),
+    *("end_effector_position_error_m", "end_effector_attitude_error_rad"),
+    *("manoeuvre_time_s", "propellant_kg"),
     *("capture_time_s", "capture_distance_m", "capture_impulse_Ns"),
     *("detumbling_time_s", "detumbling_bound_s"),
 )

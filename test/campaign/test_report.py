@@ -110,7 +110,7 @@ def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
     folder, rows = tmp_path / "dataset", []
     for draw in Draws(made):
         captured = float(draw.number >= 10)
-        metrics = {"position_error_m": 0.01, "captured": captured, "placed": 0.0}
+        metrics = {"end_effector_position_error_m": 0.01, "captured": captured, "placed": 0.0}
         metrics |= {"capture_impulse_Ns": 0.1 * draw.number if captured else math.nan}
         ok = passes_criteria(made.criteria, "reached", metrics)
         rows.append(Row(draw, "reached", "Reached.", metrics, ok, "flights"))
@@ -122,7 +122,7 @@ def test_shares_of_captures_have_their_intervals(tmp_path: Path) -> None:
     exact = stats.binomtest(30, 40).proportion_ci(0.95, "exact")
     assert found.exact_interval == pytest.approx((exact.low, exact.high))
     assert results.sampler_shares["placed"].count == 0
-    assert results.distributed_metrics == ["position_error_m", "capture_impulse_Ns"]
+    assert results.distributed_metrics == ["end_effector_position_error_m", "capture_impulse_Ns"]
     assert results.shown_metrics[0] == "captured"
     lines = write_campaign_report(folder, tmp_path / "report.html")
     assert lines[1].startswith("captured    75 % (30 of 40; 95 % interval ")
