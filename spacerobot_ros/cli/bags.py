@@ -224,7 +224,7 @@ def report_command(
 def salvage_command(bag: Path, out: Path | None) -> None:
     """Recover a complete bag from a truncated or damaged BAG.
 
-    The damaged BAG is not changed.
+    The damaged BAG is not changed. Exit code 1: it has no readable messages.
     """
     from spacerobot_ros.bag.salvage import salvage_bag
 
@@ -236,6 +236,8 @@ def salvage_command(bag: Path, out: Path | None) -> None:
         + (f"; the first: {saved.loss_reason}" if saved.loss_reason else "")
     )
     say(f"bag         {saved.path}")
+    if not saved.messages:
+        fail(f"No messages in {bag} can be read.")
 
 
 @click.command("verify")

@@ -583,6 +583,8 @@ def test_the_lines_of_a_salvage(monkeypatch: pytest.MonkeyPatch) -> None:
         "bag         b.mcap\n"
     )
     assert given == [Path("a.mcap"), None]
+    monkeypatch.setattr(salvage, "salvage_bag", lambda *_: Salvaged(Path("b.mcap"), 0, 0.0, 6, 0))
+    assert spacerobot("salvage", "a.mcap", code=1).stderr == "No messages in a.mcap can be read.\n"
 
 
 # -- goals ------------------------------------------------------------------------------------
