@@ -43,6 +43,7 @@ from spacerobot_ros.messages.readers import (
     MessageDecoder,
     MessageTemplate,
     UnreadableError,
+    joint_template,
     read_text,
 )
 from spacerobot_ros.model import SpaceRobot
@@ -52,7 +53,7 @@ from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
 from spacerobot_ros.simulation.commands import CommandValidator, Reason
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.times import LATEST_NS
+from spacerobot_ros.times import LATEST_NS, stamp_bytes
 
 JOINTS = ("slider_1", "elbow", "slider_3")
 numbers = st.floats(allow_nan=True)
@@ -471,6 +472,16 @@ def test_single_texts_are_read_and_broken_ones_refused() -> None:
     assert read_text(raw, "std_msgs/msg/String", "data") == "a robot ü"
     with pytest.raises(UnreadableError, match=r"^its bytes are not a String$"):
         read_text(raw[:-4], "std_msgs/msg/String", "data")
+
+
+def test_a_template_of_joints_has_all_their_quantities() -> None:
+    template = joint_template(["a", "bc"])
+    for number, name in enumerate(("position", "velocity", "effort")):
+        template.feed(name, np.array([number + 0.5, number + 0.25]))
+    found = JointReader(["a", "bc"], ["position", "velocity", "effort"])
+    assert found.accept(template.serialised(stamp_bytes(2 * S + 5))) == 2 * S + 5
+    assert [values.tolist() for values in found.values.values()] == [
+        [0.5, 0.25], [1.5, 1.25], [2.5, 2.25]]  # fmt: skip
 
 
 # -- lists and columns --------------------------------------------------------------------------
