@@ -131,10 +131,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"plant.linear_momentum": NORM}}, "name an element of the list"),
     ({"disperse": {"plant.tick_rate[0]": NORM}}, "it is not a list"),
     ({"disperse": {"plant.initial_orientation[0]": NORM}}, "disperse initial.rotvec"),
-    (
-        {"disperse": {"initial.joints.slider": NORM}},
-        "is not one of.*Did you mean 'initial.joints.slider_",
-    ),
     ({"disperse": {"goal.position.u": NORM}}, "is not one of goal.position.x"),
     ({"disperse": {"goal.*": NORM}}, r"'goal.\*' stands for .* different units \(m, rad\)"),
     ({"disperse": {"end_effector_goal.position.x": NORM}}, "no goal for the end-effector"),

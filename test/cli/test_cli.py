@@ -129,6 +129,9 @@ def test_scenarios_are_listed() -> None:
     [
         (("nowhere",), 2, "There is no scenario 'nowhere'."),
         (("servicng",), 2, "'servicng'. Did you mean 'servicing'? There are: "),
+        (("servicr",), 2, "Did you mean 'servicer'?"),
+        (("stuck_elbow",), 2, "Did you mean 'faults/stuck_elbow'?"),
+        (("planar_chains.urdf",), 2, "Did you mean 'planar_chain'?"),
         ((*SLIDING, "--goal", *"9000001"), 1, "beyond the stroke"),
         ((*SLIDING, "--goal", *"0000000"), 2, "zero quaternion"),
         ((*SLIDING, "--goal", "nan", *"000001"), 2, "is not finite"),

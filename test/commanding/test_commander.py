@@ -327,6 +327,20 @@ def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
     assert (len(server.sent), server.cancelled) == (1, [1])
 
 
+def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
+    planner: Rig,
+) -> None:
+    first, second = Client(), Client()
+    for goal_id, client in (("a", first), ("b", second)):
+        planner.commander.receive_fly_to(goal_id, lambda: FlyTo(GOAL), client)
+    decided = [(each.state.value, each.goal_id) for each in planner.host.statuses if each.goal_id]
+    assert decided == [("aborted", "a")]
+    ended = [each.goal_id for each in planner.host.events if each.kind is EventKind.GOAL_ABORTED]
+    assert ended == ["a"]
+    assert first.end_of[0] == "aborted"
+    assert not second.results
+
+
 def test_goals_that_are_pursued_together_are_aborted_together(controller: Rig) -> None:
     rig = controller
     rig.state(1)

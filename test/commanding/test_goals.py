@@ -203,6 +203,16 @@ def test_the_status_that_decides_a_goal_is_its_result(state: str) -> None:
     assert rig.aborted == []
 
 
+def test_a_goal_that_is_refused_at_once_has_no_errors() -> None:
+    rig, client = Rig(), Client()
+    rig.goals.begin("a", client, None)
+    rig.advance(5)
+    rig.goals.update(status("refused", "a", "It is in frame 'moon'."))
+    assert client.end_of == ("refused", "It is in frame 'moon'.")
+    assert math.isnan(client.results[0][1].position)
+    assert client.told == []
+
+
 def test_goals_that_are_pursued_no_more_are_aborted_by_the_later_one() -> None:
     rig = Rig()
     first, second = rig.send("a"), rig.send("b")

@@ -288,20 +288,6 @@ def test_degrees_are_roll_pitch_and_yaw_about_fixed_axes() -> None:
     assert np.allclose(Rotation.from_quat(goal.quaternion).as_matrix(), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("name", "suggested"),
-    [
-        ("servicr", "servicer"),
-        ("stuck_elbow", "faults/stuck_elbow"),
-        ("planar_chains.urdf", "planar_chain"),
-    ],
-)
-def test_a_misspelt_name_gets_a_suggestion(name: str, suggested: str) -> None:
-    with pytest.raises(ParameterError) as refusal:
-        scenario_or_robot(name)
-    assert f"Did you mean '{suggested}'?" in str(refusal.value)
-
-
 def test_parameters_that_differ_between_scenarios() -> None:
     first = load_scenario("sliding_masses")
     second = first.with_overrides("planner", {"position_tolerance": 0.125, "max_corrections": 7})
@@ -426,7 +412,6 @@ def test_files_without_sections(tmp_path: Path, caplog: pytest.LogCaptureFixture
         ),
         (("kills: 3",), "'kills' in the file FILE is 3, not a list of lines NODE at SECONDS."),
         (("world: none.urdf",), "The world in the scenario file FILE is invalid: "),
-        (("end_effector_goals: 3",), "The goal in the scenario file FILE is invalid: "),
         (
             (),
             "The scenario file FILE has no 'scenario: ros__parameters:' section with a goal.",

@@ -17,6 +17,7 @@ from support.planner_loop import (
     TURNED,
     Loop,
     MovingStub,
+    PlantState,
     StubMethod,
     goal_at,
     robot_of,
@@ -27,7 +28,7 @@ from spacerobot_ros.events import EventKind
 from spacerobot_ros.planning import BasePath, GaitSchedule, Goal, RobotState
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, GoalFile
-from spacerobot_ros.planning.execution.measured_states import PathCheck
+from spacerobot_ros.planning.execution.measured_states import BaseMeasurement, PathCheck
 from spacerobot_ros.planning.execution.status import Phase, PlannerState
 from spacerobot_ros.planning.execution.tracker import TrajectoryTracker
 from spacerobot_ros.times import SECOND
@@ -349,6 +350,35 @@ def test_noise_is_averaged_over_the_last_measurements() -> None:
         pose = check.average_pose(RobotState(np.array([x, 0.0, 0.0]), turned, np.zeros(3)))
     np.testing.assert_allclose(pose.position, [0.25, 0.0, 0.0])
     np.testing.assert_allclose(Rotation.from_quat(pose.quaternion).as_rotvec(), [0.0, 0.0, 0.02])
+
+
+class ShakenState(PlantState):
+    """The measured state, whose base is seen 1 cm to one side and to the other in turn."""
+
+    @property
+    def base(self) -> BaseMeasurement | None:
+        side = (-1) ** (self.stamp_ns // TICK_NS)
+        pose = self._plant.pose + 0.01 * side * np.eye(7)[0]
+        return BaseMeasurement(pose, self._plant.twist, self._plant.qdot)
+
+
+@pytest.mark.parametrize(
+    ("averaging", "replanning", "off"),
+    [(1, 0.0, 0.01), (4, 0.0, 0.01), (1, 2.0, 0.01), (4, 2.0, 0.0)],
+)
+def test_a_plan_in_motion_begins_where_measured_poses_say(
+    averaging: int, replanning: float, off: float
+) -> None:
+    """Poses are collected on the way where a replanning needs them."""
+    loop = flying(averaging=averaging, replan_period=replanning)
+    shaken = ShakenState(loop.plant)
+    shaken.stamp_ns, loop.measured = loop.measured.stamp_ns, shaken
+    loop.tick(6)
+    loop.propose_goal(OTHER)
+    loop.tick(AHEAD + 1)
+    begin = loop.poses[loop.starts[-1].stamp_ns // TICK_NS]
+    error = np.linalg.norm(stub_of(loop).requests[-1].state.position - begin[:3])
+    assert error == pytest.approx(off, abs=1e-3)
 
 
 def test_a_base_that_is_off_as_its_joints_lag_is_on_its_way_to_the_end() -> None:

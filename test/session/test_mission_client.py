@@ -399,14 +399,6 @@ def test_the_hands_end_at_their_goals(name: str, tmp_path: Path) -> None:
     assert flight.error is None
 
 
-def test_a_scenario_is_written_with_its_end_effectors(tmp_path: Path) -> None:
-    file = tmp_path / "again.yaml"
-    file.write_text(scenario_text(load_scenario("two_hands")), "utf-8")
-    again = load_scenario(str(file))
-    assert again.goal.equals(load_scenario("two_hands").goal)
-    assert again.planner.end_effectors == ("left_link_7", "right_link_7")
-
-
 def test_a_scenario_may_have_paths_of_end_effectors(tmp_path: Path) -> None:
     """A list of positions or poses: as it is written, and in the records of a bag."""
     way = [[0.4, 0.1, 0.8], [0.5, -0.1, 0.7]]
@@ -418,6 +410,7 @@ def test_a_scenario_may_have_paths_of_end_effectors(tmp_path: Path) -> None:
     file.write_text(scenario_text(scenario), "utf-8")
     for again in (scenario, load_scenario(str(file))):
         assert again.goal.links_with_paths == {"link_5"}
+        assert again.planner.end_effectors == ("link_7", "link_5")
         given = json.loads(again.records(())["scenario"]["end_effector_goals"])
         assert given == {"link_5": way, "link_7": [0.4, 0.1, 1.8]}
 

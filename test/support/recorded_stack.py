@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from mcap.reader import make_reader
 from rcl_interfaces.msg import Log
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.serialization import deserialize_message
+from support.altered_bags import message_class
 from support.planner_flight import PLANNER, goal_at, values_of
 from support.ros_harness import Harness, Probe
 
@@ -39,11 +39,6 @@ def has_parameters(bag: Path, *nodes: str) -> bool:
     """Whether a file that is being written has the parameters of nodes; records are as they are."""
     written = bag.read_bytes()
     return all(f"parameters/{node}".encode() in written for node in nodes)
-
-
-def message_class(type_name: str) -> Any:
-    package, _, name = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 class BagContent:
