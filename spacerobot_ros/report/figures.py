@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -332,12 +333,15 @@ def picture_of(figure: Figure, format: PictureFormat, pixels: int = 1600) -> byt
         PictureFormat.PDF: ("CreationDate", "Creator", "Producer"),
     }
     stream = io.BytesIO()
-    figure.savefig(
-        stream,
-        format=format.value,
-        dpi=pixels / across if format is PictureFormat.PNG else 200,
-        metadata=dict.fromkeys(about[format]),
-    )
+    with warnings.catch_warnings():
+        # Names in a script that the font lacks are drawn as boxes.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure.savefig(
+            stream,
+            format=format.value,
+            dpi=pixels / across if format is PictureFormat.PNG else 200,
+            metadata=dict.fromkeys(about[format]),
+        )
     if format is not PictureFormat.SVG:
         return stream.getvalue()
     # No screen shows less than a hundredth of a point.
