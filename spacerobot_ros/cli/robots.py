@@ -339,7 +339,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     from spacerobot_ros.cli.plan import comparison_lines
     from spacerobot_ros.flight.trials import compare, fastest
     from spacerobot_ros.model import SpaceRobot
-    from spacerobot_ros.model.urdf import nearest_inertias
+    from spacerobot_ros.model.urdf import nearest_inertias, xacro_arguments
     from spacerobot_ros.planning.analysis import analyze
     from spacerobot_ros.resources import is_path, robot_file
     from spacerobot_ros.session.own_robot import (
@@ -368,10 +368,14 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     # A robot file next to its scenario is found from any working directory.
     from_there = os.path.relpath(file.resolve(), target.resolve().parent)
     named = from_there if is_path(robot) else robot
+    # A xacro file is another robot with other arguments.
+    arguments = xacro_arguments() if file.suffix == ".xacro" else []
+    options = [word for each in arguments for word in ("--xacro-arg", each)]
+    fly = f"  {shlex.join(['spacerobot', *options, 'run', str(target)])}"
     if not model.n:
         write_output(target, thruster_scenario_text(model, named))
         say(f"The robot has no joints and uses thrusters. The scenario is {target}:")
-        click.echo(f"  spacerobot run {shlex.quote(str(target))}")
+        click.echo(fly)
         return
     missing = [each.link for each in known.geometry.unread_meshes if each.is_collision_shape]
     problem = first_problem(name, model, file, clear=not missing)
@@ -384,7 +388,7 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
         fail("No method reaches the goal of the first flight; no scenario is written.")
     write_output(target, scenario_text(problem, best.method, named))
     say(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
-    click.echo(f"  spacerobot run {shlex.quote(str(target))}")
+    click.echo(fly)
 
 
 @click.command("robots")

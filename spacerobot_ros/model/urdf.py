@@ -142,6 +142,11 @@ def _read_text(path: Path) -> str:
     return with_mesh_files(text, lambda mesh: mesh_beside(mesh, folder))
 
 
+def xacro_arguments() -> list[str]:
+    """Return the arguments for xacro files in the environment, as NAME:=VALUE."""
+    return shlex.split(os.environ.get(XACRO_ARGUMENTS_VARIABLE, ""))
+
+
 def _expand_xacro(path: Path) -> str:
     by_hand = f"`xacro {path.name} [NAME:=VALUE ...] > {path.name.split('.')[0]}.urdf`"
     if find_spec("xacro") is None:
@@ -149,7 +154,7 @@ def _expand_xacro(path: Path) -> str:
             f"{path} is a xacro file, and the package xacro is not installed: `pip install xacro`, "
             f"or expand it where xacro is installed: {by_hand}."
         )
-    arguments = shlex.split(os.environ.get(XACRO_ARGUMENTS_VARIABLE, ""))
+    arguments = xacro_arguments()
     for each in arguments:
         if not each.partition(":=")[1]:
             raise RobotDescriptionError(

@@ -65,6 +65,8 @@ def test_a_xacro_file_takes_its_arguments(
     assert re.search(r"44 kg", told.stdout)
     (ignored,) = caplog.messages
     assert ignored.endswith("no argument 'title', which is ignored; its arguments are: mass.")
+    told = CliRunner().invoke(main, [*words[:4], "new", str(path), "-o", str(tmp_path / "s.yaml")])
+    assert "  spacerobot --xacro-arg mass:=42 --xacro-arg 'title:=two words' run" in told.stdout
     CliRunner().invoke(main, ["--xacro-arg", "mas:=42", "analyze", str(path)])
     assert caplog.messages[-1].endswith("its arguments are: mass. Did you mean 'mass'?")
     refused = CliRunner().invoke(main, ["--xacro-arg", "mass=42", "analyze", str(path)])
