@@ -311,8 +311,9 @@ def _read_kind(joint: _Part) -> JointKind:
     if kind not in kinds:
         raise RobotDescriptionError(
             f"The type of {joint.where} is '{kind}'; a free-floating tree has "
-            f"{enumeration(kinds)} joints. The base floats "
-            "freely: remove any joint that connects it to a world, and that world's link."
+            f"{enumeration(kinds)} joints. The base floats freely: remove any joint that connects "
+            "it to a world, and that world's link; elsewhere, use several joints in a row, with "
+            "massless links between them."
         )
     return JointKind(kind)
 
