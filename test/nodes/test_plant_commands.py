@@ -111,6 +111,7 @@ def test_a_command_from_before_a_reset_is_forgotten(harness: Harness) -> None:
     harness.settle(rig.probe)
     assert rig.trigger("plant/reset").success
     rig.wait("joint_states", 2)
+    rig.send([0.2, 0.0, 0.0], stamp_ns=0)
     # The answer to the state that is shown now.
     rig.send([0.3, 0.0, 0.0])
     harness.settle(rig.probe)

@@ -555,6 +555,10 @@ class PlantNode(FlightNode):
 
     def _reset(self) -> str:
         self.plant.reset()
+        # The initial state has a later stamp than the state before: commands for that state, which
+        # may be on their way, are stale.
+        self.tick += 1
+        self.plant.start_at(self.tick)
         self.commands.reset(self.time_ns)
         assert self._monitor is not None
         self._monitor.resets += 1

@@ -340,8 +340,6 @@ class RandomFlight:
         situation = self._situation
         situation.may_jump = True
         self._trigger("plant/reset")
-        # An answer to the state before the reset has the stamp of the one after it.
-        self._seen.allow_stop(0.0)
         if situation.lifecycle[PLANT] == "active":
             situation.may_jump = False
             self._compare_start()
