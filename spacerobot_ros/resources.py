@@ -86,7 +86,7 @@ def robot_file(name: str) -> Path:
     nearby = sorted(path.name for path in Path(name).parent.glob("*") if is_path(path.name))
     nearby += resource_names("urdf", ".urdf")
     raise ParameterError(
-        f"There is no robot '{name}': no such URDF file exists."
+        f"There is no robot '{name}': no such URDF file exists in {Path(name).absolute().parent}."
         f"{suggestion(Path(name).name, nearby)}"
     )
 

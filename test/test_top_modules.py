@@ -131,7 +131,8 @@ def test_robots_that_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         ("folder.urdf", "'folder.urdf' is a folder; name the URDF file in it."),
         (
             "robt.urdf",
-            "There is no robot 'robt.urdf': no such URDF file exists. Did you mean 'robot.urdf'?",
+            f"There is no robot 'robt.urdf': no such URDF file exists in {tmp_path}. "
+            "Did you mean 'robot.urdf'?",
         ),
     ):
         with pytest.raises(ParameterError) as refused:
