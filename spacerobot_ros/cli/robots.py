@@ -336,8 +336,8 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
     robot is rejected.
     """
     from spacerobot_ros.bag import free_name
-    from spacerobot_ros.cli.plan import comparison_lines
-    from spacerobot_ros.flight.trials import compare, fastest
+    from spacerobot_ros.errors import PlanningError
+    from spacerobot_ros.flight.trials import try_method
     from spacerobot_ros.model import SpaceRobot
     from spacerobot_ros.model.urdf import nearest_inertias, xacro_arguments
     from spacerobot_ros.planning.analysis import analyze
@@ -379,15 +379,16 @@ def new_command(robot: str, out: Path | None, nearest_inertia: bool) -> None:
         return
     missing = [each.link for each in known.geometry.unread_meshes if each.is_collision_shape]
     problem = first_problem(name, model, file, clear=not missing)
-    with display(name):
-        plans = compare(problem)
-    for line in comparison_lines(plans):
-        say(line)
-    best = fastest(plans)
-    if best is None:
+    try:
+        with display(name):
+            plan = try_method(problem, "auto")
+    except PlanningError as refusal:
+        fail(f"{refusal} No scenario is written.")
+    if not plan.reached:
         fail("No method reaches the goal of the first flight; no scenario is written.")
-    write_output(target, scenario_text(problem, best.method, named))
-    say(f"\n{best.method} is the fastest: {best.duration:.4g} s. The scenario is {target}:")
+    method = plan.pieces[0].method
+    write_output(target, scenario_text(problem, method, named))
+    say(f"\n{method} is the fastest: {plan.duration:.4g} s. The scenario is {target}:")
     click.echo(fly)
 
 
