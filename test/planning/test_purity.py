@@ -111,7 +111,8 @@ def content(schedule: GaitSchedule) -> dict[str, Any]:
     for name in ("goal", "progress", "path"):
         values.pop(name)
     values["positions"] = schedule.positions.tobytes()
-    values |= {f"path {name}": array.tobytes() for name, array in vars(schedule.path).items()}
+    path = vars(schedule.path).items()
+    values |= {f"path {name}": array.tobytes() for name, array in path if array is not None}
     return values
 
 

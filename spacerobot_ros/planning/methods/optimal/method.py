@@ -137,10 +137,9 @@ class OptimalGait(GaitMethod):
 
     A manoeuvre reaches the attitude; the position, if sliders can move the base to any position,
     the goal requests nothing else, or the options request it; and the final shape, if the goal has
-    one. For end-effector goals, it
-    reaches these goals and the requested components of the base pose. The search has a budget of
-    starts and solver steps, so identical requests yield identical schedules on any machine, idle or
-    busy, unless the user also limits its wall time.
+    one. For end-effector goals, it reaches these goals and the requested components of the base
+    pose. The search has a budget of starts and solver steps, so identical requests yield identical
+    schedules on any machine, idle or busy, unless the user also limits its wall time.
     """
 
     name: ClassVar[str] = "optimal"
