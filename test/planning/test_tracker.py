@@ -238,6 +238,19 @@ def test_a_tracker_holds_the_last_shape_of_a_schedule_or_the_measured_one() -> N
     np.testing.assert_array_equal(tracker.setpoint.position, measured)
 
 
+def test_after_a_late_command_a_schedule_ends_well_within_the_tolerance() -> None:
+    config, q = PlannerConfig(tick_rate=1 / PERIOD), RAMP[-1] + np.array([0.03, -0.05, 0.0])
+    tracker, tolerance = TrajectoryTracker(robot_of(), config), Tolerance(2e-3, 1e-3, 3e-3)
+    tracker.start(schedule_of(), START_NS, tolerance=tolerance)
+    tick = 20
+    while not tracker.has_ended(START_NS + tick * PERIOD_NS, q):
+        tracker.track(START_NS + tick * PERIOD_NS, q)
+        q = q + PERIOD * tracker.setpoint.velocity
+        tick += 1
+    assert 2e-5 < np.abs(RAMP[-1] - q).max() <= 5e-5
+    assert tick - 20 == np.ceil(np.log(5e-5 / 0.05) / np.log(1 - config.shape_gain * PERIOD))
+
+
 def test_joints_that_move_while_no_command_is_in_force_are_not_pulled_back() -> None:
     config = replace(PlannerConfig(tick_rate=1 / PERIOD), output="reference")
     tracker = TrajectoryTracker(robot_of(), config)

@@ -733,7 +733,8 @@ class Executive:
         self._replan_ns = begins + round(config.replanning * SECOND)
         averages = (config.replanning > 0 or config.averaging > 1) and config.takeover_time > 0
         averages = averages and self._worker.starts_in_motion(schedule)
-        self._tracker.start(schedule, begins, config.averaging if averages else 0)
+        tolerance = self._tolerance_of(active.identified)
+        self._tracker.start(schedule, begins, config.averaging if averages else 0, tolerance)
         self._commanded_from_ns = self._stamp_ns
         self._change_phase(event, Phase.EXECUTING)
         status = active.status(

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.wheels import ReactionWheels
-from spacerobot_ros.planning.core.goal import RobotState
+from spacerobot_ros.planning.core.goal import RobotState, Tolerance
 from spacerobot_ros.planning.core.method import InitialMotion
 from spacerobot_ros.planning.core.schedule import GaitSchedule, interpolated
 from spacerobot_ros.planning.execution.config import PlannerConfig
@@ -25,7 +25,10 @@ from spacerobot_ros.planning.execution.measured_states import (
 )
 from spacerobot_ros.times import SECOND
 
-_END_TOLERANCE = 1e-6  # m or rad
+_END_TOLERANCE, _END_SHARE = 1e-6, 0.05
+"""Joint errors at which a schedule has ended: m or rad, or a fraction of the goal's tolerance if
+that is more and no controller follows: after a late command, they decay with ``shape_gain``."""
+
 _MAX_SETTLING_TIME = 5.0  # s
 
 
@@ -73,6 +76,8 @@ class ScheduleFollower:
         Feedback gain from shape error to velocity, 1/s.
     deadband
         Shape errors up to this value are treated as noise and not fed back, m or rad.
+    end_error
+        Shape error up to which the final shape counts as reached, m or rad.
     brakes
         Whether the schedule brakes along another one; its end does not wait for the joints.
     """
@@ -84,6 +89,7 @@ class ScheduleFollower:
         shape_gain: float,
         deadband: float = 0.0,
         *,
+        end_error: float = _END_TOLERANCE,
         brakes: bool = False,
     ) -> None:
         self.schedule, self.brakes = schedule, brakes
@@ -102,6 +108,7 @@ class ScheduleFollower:
         velocities = np.vstack([schedule.velocities, self._after])
         self._feedforward = velocities + self.gain * self._positions
         self._velocities, self._deadband = velocities, deadband
+        self._end_error = max(end_error, deadband)
 
     def has_ended(self, stamp_ns: int, q: Array) -> bool:
         """Whether the schedule is over and the shape ``q`` (n,) has reached its final shape."""
@@ -109,7 +116,7 @@ class ScheduleFollower:
         if late < 0:
             return False
         last = self._positions[-1] + late / SECOND * self._after
-        far = np.abs(last - q).max(initial=0.0) > max(_END_TOLERANCE, self._deadband)
+        far = np.abs(last - q).max(initial=0.0) > self._end_error
         return not far or self.brakes or self.is_overdue(stamp_ns)
 
     def is_overdue(self, stamp_ns: int) -> bool:
@@ -223,14 +230,25 @@ class TrajectoryTracker:
         """Whether the joints are braking along the path of a schedule."""
         return self._follower is not None and self._follower.brakes
 
-    def start(self, schedule: GaitSchedule, stamp_ns: int, average: int = 0) -> None:
-        """Track a schedule whose first tick has this stamp.
+    def start(
+        self,
+        schedule: GaitSchedule,
+        stamp_ns: int,
+        average: int = 0,
+        tolerance: Tolerance | None = None,
+    ) -> None:
+        """Track a schedule whose first tick has this stamp, to a goal with a tolerance.
 
         ``average`` measured poses are averaged for plans that begin in motion; 0: none.
         """
         config, self._has_result = self._config, False
-        gain = config.shape_gain if self._commands_plant else 0.0
-        self._follower = ScheduleFollower(schedule, stamp_ns, gain, config.shape_deadband)
+        gain, end_error = config.shape_gain if self._commands_plant else 0.0, _END_TOLERANCE
+        if tolerance is not None and self._commands_plant:
+            least = min(tolerance.position, tolerance.attitude, tolerance.shape)
+            end_error = max(end_error, _END_SHARE * least)
+        self._follower = ScheduleFollower(
+            schedule, stamp_ns, gain, config.shape_deadband, end_error=end_error
+        )
         self.path_check = PathCheck(
             self._robot, schedule, stamp_ns, config, average, self._mass_estimate
         )
