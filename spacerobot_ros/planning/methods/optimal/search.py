@@ -617,7 +617,9 @@ class _Search:
         """
         problem = self._problem
         if problem.boundary.drifts and not (problem.motion is not None and len(self._wheels)):
-            # A drifting robot finds others sooner after braking and coasting.
+            # A drifting robot finds more of them sooner after braking and coasting.
+            solved = len(self._coarse_solutions)
+            yield from ((path, 1.0) for path in self._other_solutions(known, solved))
             return
         brakes = problem.motion is not None and not problem.boundary.drifts
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
