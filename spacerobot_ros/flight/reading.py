@@ -249,7 +249,6 @@ class FlightBag(RecordedRobot):
         odom = next(self.messages("odom"), None)
         world = odom[1].header.frame_id if odom is not None else ""
         goals, shapes = list[SentGoal](), [] if link else self._goal_shapes()
-        poses_W = self.quantity("odom", TOPICS["odom"].state[0])
         for topic, time_ns, goal_id, message in self._goal_messages(link):
             poses = getattr(message, "poses", [message])
             if not poses:
@@ -265,9 +264,9 @@ class FlightBag(RecordedRobot):
             time = time_ns / SECOND - self._zero
             try:
                 goal = Goal.received(position, attitude, shape)
-                if len(poses_W):
-                    row = max(int(np.searchsorted(poses_W.time, time, side="right")) - 1, 0)
-                    goal = goal.kept_at(*np.split(poses_W.values[row], [3]))
+                if goal.asked != POSE and len(self._poses):
+                    row = max(int(np.searchsorted(self._poses.time, time, side="right")) - 1, 0)
+                    goal = goal.kept_at(*np.split(self._poses.values[row], [3]))
                 if topic == "goal_path" and through:
                     goal = replace(goal, waypoints=np.array([x + q for x, q in through]))
             except PlanningError:
@@ -275,6 +274,11 @@ class FlightBag(RecordedRobot):
             if not world or frame in ("", world):
                 goals.append(SentGoal(time, goal, goal_id))
         return tuple(sorted(goals, key=lambda sent: sent.time))
+
+    @cached_property
+    def _poses(self) -> Signal:
+        """Measured base poses (N, 7)."""
+        return self.quantity("odom", TOPICS["odom"].state[0])
 
     def goal_ids(self, links: Iterable[str]) -> set[str]:
         """Return the ids of the goals of the base and of links; a goal may be invalid."""
