@@ -283,7 +283,8 @@ class PlanningWorker:
             No plan was found; the message says why.
         """
         schedule = self._make_schedule(task, self._choose_method(task), cancellation)
-        if self._config.replanning > 0 and self.starts_in_motion(schedule):
+        replans = self._config.replanning > 0 and self._config.takeover_time > 0
+        if replans and self.starts_in_motion(schedule):
             # These derivatives take longer than a tick: in flight, the first command would be late.
             derivatives = self._sensitivity.path_derivatives(schedule)
             path = replace(schedule.path, mass_derivatives=derivatives)
