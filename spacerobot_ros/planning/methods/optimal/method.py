@@ -586,8 +586,10 @@ class OptimalGait(GaitMethod):
         _, omega = self.robot.base_twist(state.quaternion, state.q, rest, *momenta)
         rate = float(np.linalg.norm(omega))
         brief = task.within_time(_MAX_ANGLE_WITHOUT_COASTING / rate)
-        with suppress(NotFoundError):
+        try:
             return self._begin_now(replace(brief, max_failed_starts=_STARTS_BEFORE_COASTING))
+        except NotFoundError as reason:
+            refusal = reason
         last = min(longest, _COASTING_TURNS * 2 * math.pi / rate)
         ticks = math.ceil(last / self.control_period)
         coast = self._prediction.poses(state, np.tile(state.q, (ticks + 1, 1)))
@@ -597,6 +599,8 @@ class OptimalGait(GaitMethod):
                 return self._plan_for_coasting_time(task, coast, end)
             except (PlanningError, UnusableCandidateError):
                 task.cancellation.raise_if_requested()
+        if isinstance(refusal, NoClearPathError):
+            raise refusal  # A search with more time begins with the same manoeuvres.
         return self._begin_now(task.within_time(last))
 
     def _later(self, task: SearchProblem, coast: BasePoses, ticks: int) -> SearchProblem:

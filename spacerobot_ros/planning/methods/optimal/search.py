@@ -616,12 +616,13 @@ class _Search:
         that keep clear, but do not end at the goal.
         """
         problem = self._problem
-        if problem.boundary.drifts and not (problem.motion is not None and len(self._wheels)):
+        moves = problem.motion is not None
+        if problem.boundary.drifts and not (moves and len(self._wheels)):
             # A drifting robot finds more of them sooner after braking and coasting.
-            solved = len(self._coarse_solutions)
+            solved = 0 if moves else len(self._coarse_solutions)
             yield from ((path, 1.0) for path in self._other_solutions(known, solved))
             return
-        brakes = problem.motion is not None and not problem.boundary.drifts
+        brakes = moves and not problem.boundary.drifts
         most = _MAX_CLEAR_STARTS_IN_MOTION if brakes else _MAX_CLEAR_STARTS
         starts = min(problem.options.starts, most)
         guesses = itertools.islice(self._guesses(self._coarse, kept.is_clear), starts)
