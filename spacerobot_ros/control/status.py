@@ -17,7 +17,7 @@ from spacerobot_ros.events import (
     number_format,
 )
 from spacerobot_ros.planning.core.goal import Controlled
-from spacerobot_ros.planning.execution.status import GoalState
+from spacerobot_ros.planning.execution.status import NUMBERS, GoalState
 
 if TYPE_CHECKING:
     from spacerobot_ros.control.controller import CoordinatedController
@@ -128,6 +128,8 @@ class ControllerStatus:
     ends_at_s
         Expected simulated time at which the goal will be reached, including settling, s; 0:
         unknown.
+    goal
+        (7,) pursued base goal, as in :class:`.PlannerStatus`.
     """
 
     state: ControllerState
@@ -136,6 +138,7 @@ class ControllerStatus:
     command: CommandReport | None = None
     task: str = ""
     ends_at_s: float = 0.0
+    goal: tuple[float, ...] = ()
 
     def to_values(self) -> dict[str, str]:
         """Return the status as the key-value pairs of a DiagnosticStatus; numbers have six
@@ -163,6 +166,7 @@ _FORMAT = KeyValueFormat(
     "status of a controller",
     KeyValueField("state", choice_format(ControllerState)),
     KeyValueField("goal_id"),
+    KeyValueField("goal", NUMBERS),
     KeyValueField("task"),
     KeyValueField("ends_at_s", number_format(".9g")),  # Long flights have large times.
 )

@@ -417,7 +417,7 @@ def read_flight(bag: FlightBag) -> Flight:
     if missed and (not sent or missed[-1][0] > sent[-1].time * SECOND):
         goal_id = missed[-1][1].goal_id
     goals = with_reported_goals(goals, missed)
-    # A controller's statuses do not contain the pose of the goal.
+    # Bags from earlier versions lack the poses of a controller's goals.
     is_unknown = goal_id not in {"", *known, *(each.goal_id for each in goals)}
     follower, status = GoalFollower(goal_id, unnamed=True), None
     for status in reports:

@@ -153,9 +153,8 @@ def reported_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
 
 def _reported_base_goal(status: Status, goals: Sequence[SentGoal]) -> Goal | None:
     as_sent = [each.goal for each in goals if status.goal_id and status.goal_id == each.goal_id]
-    named = status.goal if isinstance(status, PlannerStatus) else ()
     try:
-        reported = Goal.checked(named[:3], named[3:])
+        reported = Goal.checked(status.goal[:3], status.goal[3:])
     except PlanningError:
         return as_sent[-1] if as_sent else None
     if as_sent:

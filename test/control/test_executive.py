@@ -116,10 +116,10 @@ def test_the_other_goal_stays_when_one_is_replaced_and_the_status_is_about_the_l
     loop.aim(base=goal_at(AIM, "a"), end_effector=goal_at(TIP + up, "b"))
     if between:
         loop.answer()
-        assert loop.status.goal_id == "b"
+        assert (loop.status.goal_id, loop.status.goal) == ("b", ()), "that of the base is a"
     loop.aim(base=goal_at(-AIM, "c"))
     np.testing.assert_allclose(loop.answer()[0][:3], KP * (up - AIM), atol=1e-12)
-    assert loop.status.goal_id == "c"
+    assert (loop.status.goal_id, loop.status.goal) == ("c", (*-AIM, *UPRIGHT))
 
 
 def test_a_base_without_a_goal_of_the_hand_carries_it() -> None:
@@ -487,6 +487,7 @@ _DECIDED = ("reached", "reached_partly", "failed", "refused", "aborted")
     wheels=st.sampled_from([{}, {"w": -0.25}]),
     task=st.sampled_from(["", "approach"]),
     ends_at=st.sampled_from([0.0, 86_400.125]),
+    goal=st.sampled_from([(), (0.1, -0.25, 1234.5, 0.0, 0.6, 0.0, 0.8)]),
 )
 def test_a_status_survives_its_values(
     state: ControllerState,
@@ -495,12 +496,13 @@ def test_a_status_survives_its_values(
     wheels: dict[str, float],
     task: str,
     ends_at: float,
+    goal: tuple[float, ...],
 ) -> None:
     report, momentum, dumping = None, {"sum": 2.0} if wheels else {}, bool(wheels)
     if errors is not None:
         numbers = (0.01, 0.5, 0.0, 1.5, 2.25)
         report = CommandReport("model_based", True, *numbers, errors, wheels, momentum, dumping)
-    status = ControllerStatus(state, "A sentence.", goal_id, report, task, ends_at)
+    status = ControllerStatus(state, "A sentence.", goal_id, report, task, ends_at, goal)
     values = status.to_values()
     assert all(isinstance(value, str) for value in values.values())
     again = ControllerStatus.from_values(values, "A sentence.")

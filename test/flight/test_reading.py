@@ -166,24 +166,29 @@ def test_reports_of_a_flight_are_those_of_its_last_goal(bag: FlightBag, flight: 
 
 
 @pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize(
+    ("node", "topic", "flies"),
+    [("planner", "planner", "planning"), ("coordinated_control", "controller", "tracking")],
+)
 def test_a_goal_that_the_recorder_missed_is_read_from_statuses(
-    folder: Path, recorded: bool
+    folder: Path, recorded: bool, node: str, topic: str, flies: str
 ) -> None:
     """The attitude that a goal keeps is that in its statuses, else that when the goal arrived."""
     first, last, kept = "0.500000000", "1.200000000", (0.0, 0.6, 0.0, 0.8)
-    with made_bag(folder / f"missed_{recorded}.mcap") as (_, say):
+    file = folder / f"missed_{node}_{recorded}.mcap"
+    with made_bag(file) as (_, say):
         for time, turned in (0.0, (0, 0, 0, 1)), (1.0, TURNED), (2.0, kept):
             say("/odom", odometry(time, time, 0, 0, *turned, *[0] * 6), time)
         say("/goal_pose", pose(0.5, 0.5, 0, 0, 0, 0, 0, 1), 0.5)
         if recorded:
             say("/goal_pose", pose(1.2, 0.2, 0.3, 0.4, *[math.nan] * 4), 1.2)
-        about = [{"state": "reached", "goal_id": first}, {"state": "planning", "goal_id": last}]
+        about = [{"state": "reached", "goal_id": first}, {"state": flies, "goal_id": last}]
         if not recorded:
             named = " ".join(map(str, (0.2, 0.3, 0.4, *kept)))
             about.append({"state": "failed", "goal_id": last, "goal": named})
         for time, values in zip((1.0, 1.5, 2.0), about, strict=False):
-            say("/planner/status", status(values, "", "/planner"), time)
-    flight = read_flight(open_flight_bag(folder / f"missed_{recorded}.mcap"))
+            say(f"/{topic}/status", status(values, "", f"/{node}"), time)
+    flight = read_flight(open_flight_bag(file))
     assert [each.goal_id for each in flight.goals] == [first, last]
     goal = flight.goals[-1].goal
     assert [*goal.position, *goal.quaternion] == [0.2, 0.3, 0.4, *(TURNED if recorded else kept)]

@@ -197,9 +197,10 @@ def _note_from_text(text: str) -> list[float] | float | str:
 
 
 _NUMBER = number_format(".9g")
-_NUMBERS = TextFormat(
+NUMBERS = TextFormat(
     lambda numbers: _format_note(list(numbers)), lambda text: tuple(map(float, text.split()))
 )
+"""Poses and positions, with nine digits."""
 _NOTE = TextFormat(_format_note, _note_from_text)
 _PARTS = TextFormat(
     " ".join,
@@ -212,10 +213,10 @@ _FORMAT = KeyValueFormat(
     KeyValueField("state", choice_format(PlannerState)),
     KeyValueField("corrections", INTEGER, always=True),
     KeyValueField("goal_id"),
-    KeyValueField("goal", _NUMBERS),
+    KeyValueField("goal", NUMBERS),
     KeyValueField("position_error_m", _NUMBER),
     KeyValueField("attitude_error_rad", _NUMBER),
-    KeyValueField("end_effector_goals", _NUMBERS, prefix="goal_of_"),
+    KeyValueField("end_effector_goals", NUMBERS, prefix="goal_of_"),
     KeyValueField("end_effector_waypoints", INTEGER, prefix="waypoints_of_"),
     KeyValueField("end_effector_position_error_m", _NUMBER),
     KeyValueField("end_effector_attitude_error_rad", _NUMBER),
