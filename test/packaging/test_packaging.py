@@ -123,6 +123,16 @@ def test_a_node_has_a_script_that_runs_its_module() -> None:
         assert f'sys.exit(run_module("{module_of(node)}"))\n' in script.read_text()
 
 
+def test_ctrl_c_during_the_first_import_of_a_node_ends_it_quietly(tmp_path: Path) -> None:
+    package = tmp_path / "spacerobot_ros"
+    package.mkdir()
+    (package / "__init__.py").write_text("import signal\n\nsignal.raise_signal(signal.SIGINT)\n")
+    given: Any = {"env": {"PYTHONPATH": str(tmp_path)}, "capture_output": True}
+    for node in NODES:
+        ended = subprocess.run([sys.executable, ROOT / "scripts" / node], check=False, **given)
+        assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"", b"")
+
+
 @pytest.mark.study
 @pytest.mark.parametrize("setuptools", SETUPTOOLS)
 def test_pip_installs_nodes_that_run_outside_an_active_environment(
