@@ -96,9 +96,9 @@ def is_path(name: str) -> bool:
     return Path(name).suffix in _ROBOT_SUFFIXES or len(Path(name).parts) > 1
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, known: Iterable[str], similarity: float = 0.6) -> str:
     """Return `` Did you mean ...?`` with the most similar known name, or an empty string."""
-    found = get_close_matches(name, list(known), n=1)
+    found = get_close_matches(name, list(known), 1, similarity)
     return f" Did you mean '{found[0]}'?" if found else ""
 
 

@@ -19,7 +19,7 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted, reason
 from spacerobot_ros.files import load_yaml, warn_once
 from spacerobot_ros.model.urdf import load_world
-from spacerobot_ros.parameters import as_numbers, known_values
+from spacerobot_ros.parameters import as_numbers, declared, known_values
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal, Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import is_path, suggestion
@@ -169,6 +169,11 @@ def _sections(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any
             )
         chosen = of_all_nodes if node == "**" else by_node.setdefault(node, {})
         chosen.update(_flatten_section(values))
+    known = {each.name for kind in CONFIGS.values() for each in declared(kind)}
+    for name in of_all_nodes.keys() - known:
+        # Parameters of other nodes are allowed, but this may be a misspelt name.
+        if meant := suggestion(name, known, similarity=0.8):
+            warn_once(f"No node of this package has the parameter '{name}' of {path}.{meant}")
     for node, values in by_node.items():
         parameters = by_node[node] = {**known_values(CONFIGS[node], of_all_nodes), **values}
         # Files next to the scenario file get their full paths.

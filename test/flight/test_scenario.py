@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros import fly
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
@@ -391,8 +392,12 @@ def test_files_without_sections(tmp_path: Path, caplog: pytest.LogCaptureFixture
     assert read_sections(path) == {}
     path.write_text("camera: {}\n/**/recoder: {ros__parameters: {compression: zstd}}")
     assert read_sections(path) == {}
-    (said,) = caplog.messages
+    every = "{camera_gain: 2.0, law: model_based, tick_rte: 50.0, use_sim_time: true}"
+    path.write_text(f"/**: {{ros__parameters: {every}}}\nplant: {{}}")
+    assert read_sections(path) == {"plant": {}}
+    said, again = caplog.messages
     assert said.endswith(" Did you mean 'recorder'?")
+    assert_one_sentence(again, "'tick_rte'", "Did you mean 'tick_rate'?")
     with pytest.raises(ParameterError, match="cannot be read"):
         read_sections(tmp_path / "none.yaml")
 
