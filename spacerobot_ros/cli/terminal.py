@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import shutil
+import signal
 import sys
 import textwrap
 import threading
@@ -104,6 +106,10 @@ def sentences() -> Iterator[None]:
         out_of_reach = isinstance(error, PlanningError) and not isinstance(error, GoalError)
         say(str(error), err=True)
         sys.exit(_NOT_REACHED if out_of_reach else _BAD_INPUT)
+    except BrokenPipeError:
+        # The reader, such as `head`, has ended. The interpreter flushes standard output at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
     except OSError as error:
         if error.errno != errno.ENOSPC or error.filename is not None:
             raise

@@ -55,6 +55,16 @@ def command(
                 os.killpg(process.pid, signal.SIGKILL)
 
 
+def test_a_reader_that_has_ended_ends_the_command_quietly() -> None:
+    """As in `spacerobot scenarios | head -1`; a shell reports 128 + SIGPIPE."""
+    end, pipe = os.pipe()
+    os.close(end)
+    with command("scenarios", stdout=pipe, stderr=subprocess.PIPE) as process:
+        os.close(pipe)
+        assert process.communicate(timeout=PATIENCE)[1] == ""
+    assert process.returncode == 128 + signal.SIGPIPE
+
+
 @pytest.mark.parametrize(
     ("number", "line"), [(signal.SIGINT, "Interrupted."), (signal.SIGHUP, "Hung up.")]
 )
