@@ -206,6 +206,7 @@ def figure_of_flights(
                 signal=signals[0],
                 beside=signals[1:],
                 goals=[goal for each in same for goal in each.goals],
+                limits=list(dict.fromkeys(limit for each in same for limit in each.limits)),
                 window=(low.min(), high.max()) if any(each.window for each in same) else None,
                 decades=max(each.decades for each in same),
             )

@@ -28,7 +28,11 @@ from spacerobot_ros.report.figures import (
     letter_panels,
     sheet,
 )
-from spacerobot_ros.report.figures_over_time import figure_of_flights, range_without_peaks
+from spacerobot_ros.report.figures_over_time import (
+    figure_of_flights,
+    range_without_peaks,
+    time_figure,
+)
 from spacerobot_ros.report.flight import read_report
 from spacerobot_ros.report.writing import FIGURES
 
@@ -112,6 +116,19 @@ def test_two_flights_are_drawn_into_the_same_panels(tmp_path: Path) -> None:
         assert axes.get_xlim() == pytest.approx((0.0, 0.05 * 59))
     (legend,) = figure.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
+
+
+def test_tolerances_of_all_flights_are_drawn(bag: Path) -> None:
+    falling = Signal(np.linspace(0.0, 3.0, 60), np.geomspace(1.0, 1e-3, 60)[:, np.newaxis])
+    with drawing():
+        flight = read_report(bag)
+        group = TraceGroup(falling, ["d"], "distance", "m", limit_name="tolerance", decades=4)
+        groups = [replace(group, limits=[(0, most)]) for most in (0.05, 0.05, 0.002)]
+        drawn = [time_figure(flight, "errors", "Errors", "Errors", [each]) for each in groups]
+        figure = figure_of_flights([flight] * 3, drawn)
+    assert isinstance(figure, ReportFigure)
+    heights = [np.unique(line.get_ydata()) for line in figure.figure.axes[0].get_lines()]
+    assert sorted(float(y[0]) for y in heights if len(y) == 1) == [0.002, 0.05]
 
 
 def test_figures_of_several_bags_by_the_command(bag: Path, tmp_path: Path) -> None:
