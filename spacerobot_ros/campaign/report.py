@@ -298,7 +298,7 @@ def _scatter_section(results: Results, found: Sequence[Influence]) -> str:
             panel.plot(x[of], y[of], ".", ms=3, alpha=0.5, color=colour, rasterized=True)
         panel.set_xlabel(each.cause)
         panel.set_ylabel(metric_label(each.metric))
-        panel.locator_params(axis="x", nbins=5)
+        panel.locator_params(axis="x", nbins=4)
     caption = "The strongest correlations. Flights that did not pass are orange."
     return _picture_part(figure, "scatter", caption)
 
@@ -319,6 +319,7 @@ def _success_by_bins_section(results: Results, found: Sequence[Influence]) -> st
         if not isinstance(at[0], str):
             half = np.array([(each.high - each.low) / 2.0 for each in bins])
             at = np.array(at, dtype=float) + half
+            panel.locator_params(axis="x", nbins=4)
         panel.errorbar(at, shares, [shares - low, high - shares], half, ".", color=PALETTE[0])
         panel.set_ylim(-0.03, 1.03)
         panel.margins(x=0.08)
@@ -360,7 +361,7 @@ def _convergence_section(results: Results) -> list[str]:
         values, place = results.columns[name], PERCENTILES.index(95.0)
         line = np.array([percentiles(values[:k])[place] for k in at])
         axes[1].plot(at, line / (line[-1] or 1.0), color=PALETTE[i], label=name)
-    axes[1].set_ylabel("95th percentile, relative to the final value")
+    axes[1].set_ylabel("95th percentile / final value")
     if results.distributed_metrics:
         axes[1].legend(fontsize=7, frameon=False)
     for panel in axes:

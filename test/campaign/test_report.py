@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
+from itertools import pairwise
 from pathlib import Path
 from statistics import stdev
 from typing import Any
@@ -215,6 +217,29 @@ def test_success_is_counted_over_bins_of_what_was_drawn(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     write_campaign_report(tmp_path, page)
     assert "Success rate over the drawn values" in page.read_text("utf-8")
+
+
+_LABEL = re.compile(r"<!-- (−?[0-9.]+) -->\n.*?translate\(([0-9.]+) ([0-9.]+)\) scale\(([0-9.]+) ")
+_GLYPH_WIDTHS = {".": 0.318, "−": 0.838}
+"""In DejaVu Sans, as fractions of the font size; those of digits are 0.636."""
+
+
+def test_labels_of_small_draws_do_not_overlap(tmp_path: Path) -> None:
+    spread = {f"initial.position.{axis}": {"norm": {"scale": 0.0025}} for axis in "xy"}
+    made = campaign(disperse=spread, flights=40, seed=8, criteria=CRITERIA)
+    page = tmp_path / "page.html"
+    write_campaign_report(
+        filled(tmp_path / "made", made, lambda draw: 0.03 + draw.values["initial.position.x"]), page
+    )
+    pictures = dict(re.findall(r'<figure id="(\w+)".*?base64,([^"]*)"', page.read_text("utf-8")))
+    for name in ("scatter", "success"):
+        rows: dict[float, list[tuple[float, float]]] = {}
+        for text, x, y, size in _LABEL.findall(b64decode(pictures[name]).decode()):
+            width = float(size) * 100 * sum(_GLYPH_WIDTHS.get(glyph, 0.636) for glyph in text)
+            rows.setdefault(float(y), []).append((float(x), float(x) + width))
+        ends = [(one[1], other[0]) for row in rows.values() for one, other in pairwise(sorted(row))]
+        assert len(ends) > 3
+        assert all(end + 2.0 < begin for end, begin in ends), name
 
 
 def test_the_worst_flights_that_pass_are_those_next_to_their_bounds(tmp_path: Path) -> None:
