@@ -3,6 +3,7 @@ random goals."""
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -27,12 +28,15 @@ from spacerobot_ros.planning import (
 )
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.goal import Controlled
+from spacerobot_ros.planning.core.progress import PieceProgress, log_progress
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.simulation.velocity_plant import VelocityPlant
+
+_LOG = logging.getLogger(__name__)
 
 _MAX_SCHEDULES = 1000
 
@@ -186,6 +190,11 @@ def try_method(
         for rates in schedule.velocities:
             plant.step(rates)
         pieces.append(schedule)
+        if schedule.partial:
+            planned = sum(piece.duration for piece in pieces)
+            total = planned + schedule.remaining
+            progress = PieceProgress(len(pieces), 0, planned, elapsed_s=plan_time, total_s=total)
+            log_progress(_LOG, progress, progress.message)
         pose = plant.pose
         error = PoseError.between(pose[:3], pose[3:], problem.goal, plant.q, plant.robot)
         reached = tolerance.admits(error, schedule.controls)

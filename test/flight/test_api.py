@@ -34,6 +34,7 @@ from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest
 from spacerobot_ros.planning.api import end_effector_goals
+from spacerobot_ros.planning.core.progress import report_progress
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import InitialState
@@ -328,12 +329,14 @@ class Halves(StubMethod):
     def plan(self, request: PlanRequest, *_: Any) -> GaitSchedule:
         self.partial = True
         self.overshoot = 1.0 if len(self.requests) + 1 >= self.enough else 0.0
-        return super().plan(request)
+        return replace(super().plan(request), remaining=2.5)
 
 
 def test_partial_schedules_follow_each_other_until_the_goal_is_reached() -> None:
-    method = Halves(ticks=20)
-    trial = try_method(problem(), "stub", method)
+    method, seen = Halves(ticks=20), list[str]()
+    with report_progress(lambda progress: seen.append(progress.message)):
+        trial = try_method(problem(), "stub", method)
+    assert seen == [f"piece {n}, {n} of about {n + 2.5} s" for n in range(1, 7)]
     # 0.0616 m halved six times is less than 1 mm.
     assert (len(trial.pieces), trial.reached) == (6, True)
     assert trial.error.distance == pytest.approx(0.03082207 / 32, rel=1e-5)

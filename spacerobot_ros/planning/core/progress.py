@@ -57,6 +57,19 @@ class SearchProgress:
         return f"{self.phase.value}, {starts * counted}{best}"
 
 
+@dataclass(frozen=True)
+class PieceProgress(SearchProgress):
+    """Progress of a manoeuvre that is planned in pieces: ``starts`` pieces so far, which take
+    ``best_s`` of about ``total_s``, s."""
+
+    total_s: float = math.inf
+
+    @property
+    def message(self) -> str:
+        """Progress message without a full stop."""
+        return f"piece {self.starts}, {self.best_s:.4g} of about {self.total_s:.4g} s"
+
+
 _BUDGET_FACTOR_WITHOUT_RESULT = 5.0
 """As ``optimal.time_budget`` is documented."""
 
