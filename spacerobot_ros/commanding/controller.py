@@ -377,4 +377,12 @@ class ControllerCommander(Commander):
             base_reference = PoseReference.with_body_twist(pose[:3], pose[3:], twist[:3], twist[3:])
         if joints is not None:
             joint_reference = self._held_velocities.at_command(*decoder.joint_reference(joints))
+            assert self.executive is not None
+            law = self.executive.controller.law
+            if not law.outputs.selection.joints:
+                self._log_fault(
+                    "reference",
+                    f"'{JOINT_REFERENCE}' is ignored, because the law '{law.name}' does not "
+                    "control the joints: name them in joint_outputs.",
+                )
         return Reference(base=base_reference, joints=joint_reference)

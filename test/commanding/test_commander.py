@@ -219,9 +219,9 @@ def test_a_controller_says_what_it_waits_for(arm: SpaceRobot) -> None:
     assert rig.host.statuses[-1].message == ceased.replace("which have ceased", rejected)
 
 
-def referenced(arm: SpaceRobot, *, busy: bool) -> Rig:
+def referenced(arm: SpaceRobot, *, busy: bool, law: str = "computed_torque") -> Rig:
     """Return a controller with a state, and a planner whose reference is still to come."""
-    settings = config(ControllerConfig, law="computed_torque", reference_timeout=1.0)
+    settings = config(ControllerConfig, law=law, reference_timeout=1.0)
     rig = Rig(ControllerCommander, settings, arm.n, partner_is_busy=lambda: busy)
     rig.use(arm)
     rig.host.publishers.add(JOINT_REFERENCE)
@@ -257,6 +257,17 @@ def test_a_process_that_slept_does_not_count_it_as_silence(arm: SpaceRobot) -> N
     assert rig.host.commands == []
     rig.commander.receive_reference(JOINT_REFERENCE, *rig.stamped(1))
     assert rig.host.commands == [1]
+
+
+@pytest.mark.parametrize("law", ["computed_torque", "model_based"])
+def test_a_reference_of_joints_that_are_not_controlled_is_named(arm: SpaceRobot, law: str) -> None:
+    """By default, a model-based law controls the base and the end-effector."""
+    rig = referenced(arm, busy=False, law=law)
+    rig.commander.receive_reference(JOINT_REFERENCE, *rig.stamped(1))
+    errors = [text for level, text in rig.host.lines if level == "error"]
+    assert len(errors) == (law == "model_based")
+    for text in errors:
+        assert_one_sentence(text, "'joint_reference' is ignored", "joint_outputs")
 
 
 # -- goals ------------------------------------------------------------------------------------
