@@ -224,7 +224,7 @@ def test_tasks_before_a_goal_are_done_once(in_background: bool) -> None:
 
 
 def test_a_goal_is_not_reached_while_its_motion_is_planned_again_after_a_reset() -> None:
-    rig = Follower(plan_in_background=True, settle_time=0.04)
+    rig = Follower(plan_in_background=True, settle_time=0.04, status_period=0.02)
     goal = Goal.from_rotvec([1.3, 0.2, 0.1], [0.2, 0.1, 0.4])
     rig.executive.submit("base", IdentifiedGoal(goal, "first"))
     while rig.executive.state is not ControllerState.TRACKING:
@@ -234,6 +234,8 @@ def test_a_goal_is_not_reached_while_its_motion_is_planned_again_after_a_reset()
     rig.executive.plant_reset()
     assert rig.fly() is ControllerState.REACHED
     np.testing.assert_allclose(rig.reference().position, goal.position, atol=1e-9)
+    for said in (each.goal for each in rig.statuses if each.goal):
+        np.testing.assert_allclose(said, [*goal.position, *goal.quaternion], atol=1e-9)
     assert left > 0.1, "the test is sharp: the robot was on its way"
 
 
