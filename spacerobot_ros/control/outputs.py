@@ -30,7 +30,7 @@ from spacerobot_ros.control.state import (
     Reference,
     TargetNotSetError,
 )
-from spacerobot_ros.errors import AT_JOINTS, ParameterError, quantity
+from spacerobot_ros.errors import AT_JOINTS, ParameterError, RobotDescriptionError, quantity
 from spacerobot_ros.model.description import Array, RobotDescription, plane_normal
 from spacerobot_ros.model.dynamics import solve_positive_definite
 from spacerobot_ros.model.inverse_kinematics import AXES
@@ -41,6 +41,7 @@ from spacerobot_ros.model.symbolic_rotations import (
     quaternion_multiply,
     rotation_error,
 )
+from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.planning.core.goal import Controlled
 
 _PARALLEL_TOLERANCE = 1e-6
@@ -142,7 +143,8 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
 
     * A planar robot (:func:`plane_normal`) whose plane is a coordinate plane of its base: the base
       in that plane (x, y, rz for the plane x-y), and, with two or more joints, the end-effector
-      position in it. The axes are those of W, so the base must move in that plane of W.
+      position in it. The axes are those of W, so the base must move in that plane of W. A robot
+      with thrusters in its URDF that push it out of the plane is not planar.
     * Any other robot: the full base pose, and the end-effector's pose (six or more joints) or
     position (three to five).
     * Without an end-effector, or with fewer joints: the base pose and the joints.
@@ -159,8 +161,9 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
     point: tuple[str, ...] = AXES[:3]
     fewest = 3
     normal = plane_normal(description)
-    if normal is not None and np.max(np.abs(normal)) > 1 - _PARALLEL_TOLERANCE:
-        along = int(np.argmax(np.abs(normal)))
+    along = -1 if normal is None else int(np.argmax(np.abs(normal)))
+    in_plane = normal is not None and abs(normal[along]) > 1 - _PARALLEL_TOLERANCE
+    if in_plane and not _is_pushed_along(description, along):
         point = tuple(axis for i, axis in enumerate(AXES[:3]) if i != along)
         base, fewest = (*point, AXES[3 + along]), 2
     elif len(names) >= 6:
@@ -170,6 +173,15 @@ def default_selection(description: RobotDescription, end_effector_link: str) -> 
     selection = OutputSelection(base, point, (), end_effector_link)
     selection.require_valid(description)
     return selection
+
+
+def _is_pushed_along(description: RobotDescription, axis: int) -> bool:
+    """Whether thrusters in the URDF push the base along an axis of its frame."""
+    try:
+        table = find_thrusters(IN_URDF, description)
+    except RobotDescriptionError:
+        return False
+    return bool(np.abs(table.direction_B[:, axis]).max() > _PARALLEL_TOLERANCE)
 
 
 def controlled_parts(axes: Sequence[str], joints: Sequence[str] = ()) -> frozenset[Controlled]:

@@ -280,6 +280,20 @@ def test_default_outputs() -> None:
     )
 
 
+@pytest.mark.parametrize(("direction", "leaves"), [("1 0 0", False), ("0 0 -1", True)])
+def test_a_planar_arm_on_a_base_that_thrusters_push_out_of_the_plane(
+    direction: str, leaves: bool
+) -> None:
+    plain = load("planar_manipulator").description
+    nozzle = f'<thruster name="jet"><origin xyz="0 0 0"/><axis xyz="{direction}"/>'
+    nozzle += '<thrust force="1" isp="60"/></thruster>'
+    robot = parse_robot(plain.urdf.replace("</robot>", f"{nozzle}</robot>"))
+    expected = default_selection(plain, END_EFFECTOR)
+    if leaves:
+        expected = OutputSelection(AXES, joints=robot.joint_names)
+    assert default_selection(robot, END_EFFECTOR) == expected
+
+
 @pytest.mark.parametrize("joints", range(1, 9))
 def test_default_outputs_never_exceed_the_degrees_of_freedom(joints: int) -> None:
     description = parse_robot(random_chain_urdf(np.random.default_rng(joints), joints))
