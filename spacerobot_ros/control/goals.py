@@ -367,7 +367,10 @@ class GoalWatch:
         if goal.base is not None and self.asked[BASE_GOAL_KEY]:
             aimed = Goal(goal.base.position, goal.base.quaternion, asked=self.asked[BASE_GOAL_KEY])
             error = PoseError.between(state.r_WB, state.quaternion_WB, aimed)
-            missed |= missed_parts(aimed, error, controlled_parts(outputs.base), tolerance)
+            turn = matrix_from_quaternion(state.quaternion_WB) @ error.rotvec
+            left = np.array([axis not in outputs.base for axis in AXES])
+            error = PoseError(error.position * left[:3], turn * left[3:])
+            missed |= missed_parts(aimed, error, frozenset(), tolerance)
         turned = "attitude" in self.asked[END_EFFECTOR] - controlled_parts(outputs.end_effector)
         if goal.end_effector is not None and turned:
             R_BE, _ = law.robot.link_pose(outputs.end_effector_link, state.q)

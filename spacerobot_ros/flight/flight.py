@@ -347,7 +347,8 @@ class Flight(FlightData):
                 f"The measured pose is within tolerance of the goal; the true pose is {errors}."
             )
             return Verdict("Reached according to the measured pose", sentence)
-        controlled = frozenset(controls)
+        # Part of a component may be controlled: a base in a plane.
+        controlled = frozenset(controls) if within else frozenset[Controlled]()
         parts = {} if goal is None else missed_parts(goal, error, controlled, tolerance)
         if not self.turns_end_effector:
             parts |= missed_turn(error.largest_end_effector_angle, tolerance)

@@ -246,6 +246,18 @@ def test_a_part_that_was_asked_for_and_is_not_controlled_is_not_reached(tmp_path
     assert result.summary["verdict"] == result.message
 
 
+def test_an_axis_of_the_base_that_is_not_controlled_counts_for_its_goal(tmp_path: Path) -> None:
+    """The robot flies in a plane, and this goal is beside it."""
+    scenario = load_scenario("coordinated_control")
+    off = 3 * scenario.controller.position_tolerance
+    goal = scenario.with_goal(pose=[0.5, 0.5, off], rotvec=[0.0, 0.0, 0.262])
+    result = run_scenario(goal, tmp_path / "run.mcap")
+    assert (result.summary["state"], result.succeeded) == ("reached_partly", False)
+    assert f"but for its position, which is {off:.3g} m off" in result.message
+    assert f"but for its position, which is {off:.3g}" in result.summary["verdict"]
+    assert read_run(tmp_path / "run.mcap").verdict.sentence == result.summary["verdict"]
+
+
 @pytest.mark.parametrize(
     ("fault", "state", "named"),
     [
