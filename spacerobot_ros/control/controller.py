@@ -188,7 +188,18 @@ class CoordinatedController:
             goal = replace(goal, end_effector=end_effector)
         if joints is not None:
             goal = replace(goal, joints=JointReference.at_rest(joints))
-        return GoalMotion(start, goal, carries, aims.get("waypoints", ()))
+        return GoalMotion(self._in_motion(start, state), goal, carries, aims.get("waypoints", ()))
+
+    def _in_motion(self, start: Reference, state: ControlState) -> Reference:
+        """Return the start of a reference; the first one that is planned while the plant waits
+        begins with the measured velocities."""
+        if self.profile is not None or self.planner is None or self.planner.in_background:
+            return start
+        state = state.copied()
+        pose = state.r_WB, state.quaternion_WB
+        base = PoseReference.with_body_twist(*pose, state.v_WB_B, state.omega_WB_B)
+        joints = JointReference(state.q, state.qdot, np.zeros(len(state.q)))
+        return replace(start, base=base, joints=joints)
 
     def plan_grapple(
         self, time: float, state: ControlState, grapple: Grapple, lead: float
@@ -200,7 +211,7 @@ class CoordinatedController:
         assert planner is not None
         if self.coming_to_rest:
             self.profile, self.coming_to_rest = None, False
-        start = self.reference_at(time + lead, state)
+        start = self._in_motion(self.reference_at(time + lead, state), state)
         later = replace(grapple, motion=grapple.motion.later(lead))
 
         def work(cancellation: Cancellation) -> GrappleReference:

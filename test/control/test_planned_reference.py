@@ -86,6 +86,21 @@ def test_a_planned_docking_takes_less_propellant_in_the_same_time() -> None:
         assert flight.clearance.nearest.distance == pytest.approx(0.69 - edges.max(), abs=2e-3)
 
 
+def test_a_robot_that_drifts_and_turns_is_planned_from_its_motion() -> None:
+    """The bound on the distance from the plan is 2 % of the drift during the flight."""
+    drift, plan = [1.6, -0.8, 0.8], {"plan.intervals": 15, "plan.duration": 0.0}
+    moving = {"linear_momentum": drift, "angular_momentum": [0.02, -0.03, 0.04]}
+    scenario = load_scenario("free_flyer").with_overrides("coordinated_control", plan)
+    goal = Goal.from_rotvec([0.5, -0.6, 0.2], [0.0, 0.2, 0.6])
+    flight = fly_scenario(scenario.with_overrides("plant", moving).with_other_goal(goal))
+    assert flight.outcome is Outcome.REACHED, flight.message
+    ((_, path),) = flight.paths
+    place, _ = path.at(flight.time[: len(flight.pose)])
+    bound = 0.02 * np.linalg.norm(drift) / 16.0 * flight.time[-1]
+    assert np.linalg.norm(place - flight.pose[:, :3], axis=1).max() < bound
+    assert flight.planned_propellant == pytest.approx(flight.propellant, rel=0.3)
+
+
 @pytest.mark.slow
 def test_a_goal_behind_a_panel_is_reached_round_it() -> None:
     planned, straight = docked(BEHIND), docked(BEHIND, **STRAIGHT)
