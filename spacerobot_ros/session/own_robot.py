@@ -15,6 +15,7 @@ from spacerobot_ros.flight.trials import PlanningProblem
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.description import Array, Joint
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
+from spacerobot_ros.model.thrusters import IN_URDF, find_thrusters
 from spacerobot_ros.model.urdf import describe_inertia_flaw, mesh_file
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.clearance import usual_clearance
@@ -45,6 +46,11 @@ _LEAST_USUAL_SPEED, _LARGEST_USUAL_SPEED = 1e-3, 50.0
 """Usual joint speeds, m/s or rad/s."""
 
 
+def has_thrusters(robot: RobotDescription) -> bool:
+    """Whether the URDF has ``<thruster>`` elements."""
+    return fromstring(robot.urdf).find("thruster") is not None
+
+
 def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
     """Yield notes on unusual values in a URDF, each with a remedy.
 
@@ -69,6 +75,8 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
             f"The base '{robot.base_link}' is a point mass: give it an <inertia> (for a box "
             "with sides a, b and c: ixx = m (b^2 + c^2) / 12, and so on)."
         )
+    if has_thrusters(robot) and (missing := find_thrusters(IN_URDF, robot).missing()):
+        yield f"The thrusters cannot produce {missing}."
     found: dict[int, list[str]] = {}
     for joint in robot.movable_joints:
         for kind, remark in _joint_remarks(joint, is_wheel=joint.name in robot.wheel_names):
@@ -91,11 +99,11 @@ def urdf_remarks(robot: RobotDescription) -> Iterator[str]:
         if shape.kind == "mesh" and link.collisions
     }
     solid = {shape.resource for link in robot.links for shape in link.collisions or link.shapes}
-    missing = [each for each in pictures if each not in solid and mesh_file(each) is None]
-    if missing:
-        more = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
+    absent = [each for each in pictures if each not in solid and mesh_file(each) is None]
+    if absent:
+        more = f" (and {len(absent) - 1} more)" if len(absent) > 1 else ""
         yield (
-            f"The mesh '{missing[0]}' was not found{more}: give a path relative to the URDF, or "
+            f"The mesh '{absent[0]}' was not found{more}: give a path relative to the URDF, or "
             "source the workspace of its package. Only pictures need it."
         )
     coloured = [
@@ -279,7 +287,17 @@ def thruster_scenario_text(robot: SpaceRobot, robot_path: str) -> str:
     """Return a parameter file for a flight in which thrusters move and rotate a robot without
     joints.
     """
-    name = robot.description.name
+    name, thrusters = robot.description.name, ""
+    limits = """\
+    max_force: 0.0    # N, of the thrusters; 0: no limit
+    max_torque: 0.0   # N m
+"""
+    if has_thrusters(robot.description):
+        thrusters = "    thrusters: urdf\n"
+        # Pulses leave larger errors than the default tolerances.
+        limits = "    position_tolerance: 0.005   # m\n    attitude_tolerance: 0.01    # rad\n"
+        if not find_thrusters(IN_URDF, robot.description).missing():
+            limits += "    profile: planned\n    plan.thrusters: urdf\n"
     return f"""\
 # The first flight of {name}, which has no joints: thrusters move and rotate it.
 
@@ -294,11 +312,9 @@ scenario:
     robot: {robot_path}
     tick_rate: 50.0
     actuation: effort
-
+{thrusters}
 /**/coordinated_control:
   ros__parameters:
     robot: {robot_path}
     tick_rate: 50.0
-    max_force: 0.0    # N, of the thrusters; 0: no limit
-    max_torque: 0.0   # N m
-"""
+{limits}"""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import resource
@@ -97,6 +98,18 @@ def test_the_scenario_stands_where_it_is_wanted_and_finds_its_robot(robot: Path)
     new(robot.name, "--out", str(out))
     assert load_scenario(str(out)).parameters("plant")["robot"] == str(robot)
     assert not (robot.parent / "mine.yaml").exists()
+
+
+@pytest.mark.parametrize("lacking", ["", "plus_z"])
+def test_a_robot_with_thrusters_flies_with_them(robot: Path, lacking: str) -> None:
+    text = robot_file("jet_cube").read_text("utf-8")
+    kept = [line for line in text.splitlines() if not lacking or lacking not in line]
+    robot.write_text("\n".join(kept), "utf-8")
+    printed = new(robot.name)
+    assert ("The thrusters cannot produce force along z." in printed) is bool(lacking)
+    flown = spacerobot("run", "mine.yaml", "--json", "run.json").output
+    assert ("planned" in flown.partition("propellant")[2].splitlines()[0]) is not bool(lacking)
+    assert json.loads(Path("run.json").read_text("utf-8"))["propellant_kg"] > 0.0
 
 
 def test_no_scenario_is_overwritten(robot: Path) -> None:
