@@ -236,6 +236,7 @@ class ReferencePlanner:
                 "profile to quintic."
             )
         self._outputs, self.in_background = outputs, config.plan_in_background
+        self._time_limit = config.time_limit
         self._planner = ThrustPlanner(
             robot, config.plan, outputs.end_effector_link, limits.force, limits.torque
         )
@@ -294,7 +295,14 @@ class ReferencePlanner:
                 name = f"waypoint {len(legs) + 1}" if end is not ends[-1] else "the last pose"
                 raise PlanningError(f"On the way to {name}: {error}") from error
             begin = RobotMotion.at_rest(end.base, q)
-        return PlannedReference(start, goal, *legs, carries=carries)
+        planned = PlannedReference(start, goal, *legs, carries=carries)
+        if 0.0 < self._time_limit <= planned.duration:
+            raise PlanningError(
+                f"The motion takes {planned.duration:.4g} s, but time_limit is "
+                f"{self._time_limit:.4g} s: increase it, or reduce plan.duration or "
+                "plan.time_factor."
+            )
+        return planned
 
     def plan_grapple(
         self,

@@ -143,6 +143,7 @@ def test_a_goal_without_a_plan_is_refused_and_the_robot_holds() -> None:
     for goal, settings, words in (
         (inside, {}, "in collision"),
         (BEHIND, {"plan.duration": 3.0}, " s, but plan.duration is 3 s"),
+        (BEHIND, {"time_limit": 20.0}, " s, but time_limit is 20 s"),
     ):
         flight = docked(goal, **settings)
         states = [each for _, each in flight.statuses if isinstance(each, ControllerStatus)]
