@@ -18,6 +18,7 @@ from spacerobot_ros.control.goals import (
     goal_parts,
     goals_to_save,
     require_controlled_axes,
+    tolerance_of,
     with_later_goals,
 )
 from spacerobot_ros.control.limits import Saturated
@@ -731,7 +732,8 @@ class ControlExecutive:
                 return f"Flying to the goal; {away} from the reference{later}."
             case ControllerState.STALLED:
                 away = self.controller.distance_from_reference()
-                return f"Stalled {away} from the reference: {self._watch.stall.cause}."
+                limits = tolerance_of(away, self._goal_config)
+                return f"Stalled {away} from the reference ({limits}): {self._watch.stall.cause}."
             case (
                 ControllerState.REACHED
                 | ControllerState.REACHED_PARTLY

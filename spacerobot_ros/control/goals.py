@@ -408,8 +408,7 @@ def decided_message(
     components of a partly reached goal; ``touched`` is the contact that made the goal fail.
     """
     limits = list(zip(distance, config.tolerances, strict=True))
-    tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
-    away = f"{distance} from it (tolerance {tolerance})"
+    away = f"{distance} from it ({tolerance_of(distance, config)})"
     if state is not ControllerState.FAILED:
         return reached_message(away, missed or {})
     if touched:
@@ -418,6 +417,13 @@ def decided_message(
     if not any(off > most for off, most in limits):
         away += f", within tolerance for less than the settling time of {config.settle_time:g} s"
     return f"The goal is {late}: {away}."
+
+
+def tolerance_of(distance: OutputDistance, config: ControllerConfig) -> str:
+    """Return the tolerances of the kinds of outputs in a distance."""
+    limits = zip(distance, config.tolerances, strict=True)
+    tolerance = OutputDistance(*(math.nan if math.isnan(off) else most for off, most in limits))
+    return f"tolerance {tolerance}"
 
 
 # -- planned references ----------------------------------------------------------------------------

@@ -361,7 +361,8 @@ def test_a_robot_that_does_not_move_is_stalled_until_it_moves() -> None:
     loop = aimed()
     assert wait_for_stall(loop) < 25.0
     message = loop.status.message
-    assert_one_sentence(message, "Stalled 0.559 m, 0 rad from the reference: its errors no longer")
+    where = "Stalled 0.559 m, 0 rad from the reference (tolerance 1 mm, 1 mrad): its errors no"
+    assert_one_sentence(message, where)
     assert loop.status.goal_id == "7"
     assert loop.executive.unfinished_goals == {"7"}
     assert [event.kind.value for event in loop.events] == ["goal_accepted"], "it is no decision"
