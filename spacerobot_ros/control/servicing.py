@@ -448,8 +448,9 @@ class DetumblingTask:
             return TaskProgress(
                 TaskState.FAILED,
                 f"The robot is not at rest after {limit:g} s: it still rotates at "
-                f"{quantity(self._fastest, 'rad/s')}, and its centre of mass moves at "
-                f"{quantity(speed, 'm/s')}.",
+                f"{quantity(self._fastest, 'rad/s')} (detumble.rate: "
+                f"{quantity(options.rate, 'rad/s')}), and its centre of mass moves at "
+                f"{quantity(speed, 'm/s')} (detumble.speed: {quantity(options.speed, 'm/s')}).",
             )
         return _ACTIVE
 

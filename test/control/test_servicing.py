@@ -362,7 +362,8 @@ def test_detumbling_that_lasts_too_long_is_given_up() -> None:
     assert loop.state == "tracking"
     loop.answer()
     assert loop.state == "aborted"
-    assert_one_sentence(loop.status.message, "not at rest after 0.05 s", "0.3 rad/s")
+    words = "not at rest after 0.05 s", "0.3 rad/s (detumble.rate: 2 mrad/s)", "speed: 2 mm/s"
+    assert_one_sentence(loop.status.message, *words)
 
 
 def test_a_task_alone_is_reached_and_an_abort_ends_it() -> None:
