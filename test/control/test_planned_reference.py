@@ -12,6 +12,7 @@ from control.flights import Reporting, refusals
 from scipy.spatial.transform import Rotation
 from support.sentences import assert_one_sentence
 
+from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive
 from spacerobot_ros.control.state import ControlState, PoseReference
@@ -22,8 +23,9 @@ from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
-from spacerobot_ros.model.urdf import parse_world
+from spacerobot_ros.model.urdf import load_robot, parse_world
 from spacerobot_ros.planning import Goal
+from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.scenario import load_scenario
@@ -336,6 +338,14 @@ def test_a_motion_is_blocked_when_it_first_comes_too_near() -> None:
     earliest, latest = (times[np.argmax(np.array(away) < r + 0.11)] for r in (0.26, 0.15))
     assert latest - earliest < 0.1 * profile.duration
     assert earliest - 0.1 < controller.time_until_blocked(began) < latest + 0.1
+
+
+def test_a_collision_of_a_cube_without_joints_is_at_no_shape() -> None:
+    cube = replace(load_robot(robot_file("jet_cube")), world=ball(PLACE))
+    clearance = Clearance(cube, 0.01, "plan.clearance")
+    inside = BasePoses(PLACE[None], np.array([[0.0, 0.0, 0.0, 1.0]]))
+    (found,) = clearance.approaches(np.zeros((1, 0)), np.full(1, 0.01), inside)
+    assert "shape" not in clearance.clause(found, None)
 
 
 WAYPOINTS = np.array(

@@ -243,7 +243,9 @@ class Clearance:
         if control_period is not None:
             when = f" after {approach.tick * control_period:.4g} s,"
         shape = np.round(approach.shape, 3).tolist()
-        return f"{approach}{when} at the shape {shape}, and {self._setting}"
+        # A robot without joints has no shape.
+        where = f" at the shape {shape}" if shape else ""
+        return f"{approach}{when}{where}, and {self._setting}"
 
     @property
     def _setting(self) -> str:
