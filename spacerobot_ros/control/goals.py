@@ -516,7 +516,7 @@ class GoalPlanning:
         motion = controller.motion_to(max(begins, time), seen, **aims)
 
         def work(cancellation: Cancellation) -> PlannedReference:
-            return planner.plan(motion, seen, cancellation)
+            return planner.plan_motion(motion, seen, cancellation)
 
         last, self._job = self._job, PlanningJob(work, begins)
         # Set before the work begins, so that it can be cancelled.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from dataclasses import replace
+from functools import lru_cache
 from typing import ClassVar, NamedTuple, TypedDict
 
 import numpy as np
@@ -22,7 +23,7 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.errors import ParameterError, PlanningError
-from spacerobot_ros.model.description import Array, RobotDescription
+from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.space_robot import SpaceRobot
@@ -65,26 +66,23 @@ class PlannedReference(ReferenceProfile):
     ) -> None:
         super().__init__(start, goal, carries=carries)
         self._legs = legs
-        self._ends = np.cumsum([leg.duration for leg in legs]).tolist()
-        """Times since the start at which the legs end, s."""
-        self.duration = self._ends[-1]
-        self._latest: tuple[float, Reference] | None = None
-        """Latest reference, which is read twice per state, and its time since the start, s."""
+        *self._begins, self.duration = np.cumsum([0.0, *(leg.duration for leg in legs)]).tolist()
+        # The latest reference is read twice per state.
+        self._latest = lru_cache(maxsize=1)(self._sampled)
 
     def _leg_at(self, time: float) -> tuple[ThrustMotion, float]:
-        """Return the leg at a time since the start, s, and its beginning."""
+        """Return the leg at a time since the start, s, and the time since its beginning."""
         k = self.waypoints_passed(time)
-        return self._legs[k], self._ends[k] - self._legs[k].duration
+        return self._legs[k], time - self._begins[k]
 
     def waypoints_passed(self, time: float) -> int:
         """Return the number of waypoints reached ``time`` s after the start."""
-        return bisect_right(self._ends[:-1], time)
+        return bisect_right(self._begins[1:], time)
 
     def configurations(self) -> Samples:
         """Return samples of the plan."""
         paths = [leg.path() for leg in self._legs]
-        begins = np.subtract(self._ends, [leg.duration for leg in self._legs])
-        times = [begin + path.times for begin, path in zip(begins, paths, strict=True)]
+        times = [begin + path.times for begin, path in zip(self._begins, paths, strict=True)]
         base = zip(*(path.base for path in paths), strict=True)
         shapes = np.vstack([path.shapes for path in paths])
         return Samples(shapes, BasePoses(*map(np.vstack, base)), np.concatenate(times))
@@ -107,15 +105,11 @@ class PlannedReference(ReferenceProfile):
 
     def at(self, time: float) -> Reference:
         """Return the reference at ``time`` s after the start."""
-        if time >= self.duration:
-            return self.goal
-        if self._latest is None or self._latest[0] != time:
-            self._latest = time, self._sampled(time)
-        return self._latest[1]
+        return self.goal if time >= self.duration else self._latest(time)
 
     def _sampled(self, time: float) -> Reference:
-        leg, begins = self._leg_at(time)
-        sample = leg.at(time - begins)
+        leg, since = self._leg_at(time)
+        sample = leg.at(since)
         base, hand = PoseReference(*sample.base), PoseReference(*sample.end_effector)
         return Reference(
             base,
@@ -139,13 +133,13 @@ class PlannedReference(ReferenceProfile):
             Joint friction added by the law and compensated for in the efforts, N m s/rad.
         """
         ends = min(time + period, self.duration)
-        leg, begins = self._leg_at(time)
-        knot = begins + leg.step * (math.floor((time - begins) / leg.step) + 1)
+        leg, since = self._leg_at(time)
+        knot = time - since + leg.step * (math.floor(since / leg.step) + 1)
         wrench, tau = np.zeros(6), np.zeros(leg.joints)
         for begin, end in ((time, min(knot, ends)), (knot, ends)):
             if 0.0 <= begin < end:
-                leg, begins = self._leg_at((begin + end) / 2)
-                sample, share = leg.at((begin + end) / 2 - begins), (end - begin) / period
+                leg, since = self._leg_at((begin + end) / 2)
+                sample, share = leg.at(since), (end - begin) / period
                 wrench += share * sample.wrench_B
                 tau += share * (sample.tau + joint_damping * sample.qdot)
         return Actuation(wrench, tau)
@@ -212,7 +206,7 @@ class GoalMotion(NamedTuple):
     waypoints: tuple[Array, ...] = ()
 
 
-class ReferencePlanner:
+class ReferencePlanner(ThrustPlanner):
     """Plans references for one controller, whose law controls the robot and the outputs.
 
     The robot has no wheels, as plans do not use wheel torque.
@@ -235,32 +229,24 @@ class ReferencePlanner:
                 "The profile 'planned' requires a controlled base pose: set base_outputs, or set "
                 "profile to quintic."
             )
+        link, force, torque = outputs.end_effector_link, limits.force, limits.torque
+        super().__init__(robot, config.plan, link, force, torque)
         self._outputs, self.in_background = outputs, config.plan_in_background
         self._time_limit = config.time_limit
-        self._planner = ThrustPlanner(
-            robot, config.plan, outputs.end_effector_link, limits.force, limits.torque
-        )
-
-    def use_obstacles(self, world: RobotDescription | None) -> None:
-        """Use other obstacles from the next plan on; None: no obstacles."""
-        self._planner.use_obstacles(world)
 
     def time_until_blocked(self, profile: PlannedReference, time: float) -> float:
         """Return the time, s, for which a reference stays clear of obstacles, from a given time
         after the start; infinite: until the end of the reference.
         """
-        clearance = self._planner.clearance
-        if clearance is None or not clearance.has_obstacles or time >= profile.duration:
+        clearance, (shapes, base, times) = self.clearance, profile.configurations()
+        if clearance is None or not clearance.has_obstacles:
             return math.inf
-        shapes, base, times = profile.configurations()
-        ahead = slice(max(bisect_right(times, time) - 1, 0), None)
         geometry = clearance.geometry
         required = np.where(geometry.with_obstacles, clearance.distance, -np.inf)
-        beyond, _ = geometry.nearest_along(shapes[ahead], base.rows(ahead), required)
-        blocked = np.flatnonzero(beyond < 0)
-        return float(times[ahead][blocked[0]] - times[ahead][0]) if len(blocked) else math.inf
+        beyond, _ = geometry.nearest_along(shapes, base, required)
+        return float(times[(beyond < 0) & (times >= time)].min(initial=math.inf)) - time
 
-    def plan(
+    def plan_motion(
         self, motion: GoalMotion, state: ControlState, cancellation: Cancellation
     ) -> PlannedReference:
         """Return the planned reference for a motion; ``state`` provides the positions of joints
@@ -288,7 +274,7 @@ class ReferencePlanner:
         legs = []
         for end in ends:
             try:
-                legs.append(self._planner.plan(begin, end, cancellation))
+                legs.append(self.plan(begin, end, cancellation))
             except PlanningError as error:
                 if not waypoints or isinstance(error, PlanningCancelled):
                     raise
@@ -318,7 +304,7 @@ class ReferencePlanner:
         PlanningError
             No motion is found.
         """
-        motion = self._planner.plan(self._begin(start, state), grapple, cancellation)
+        motion = self.plan(self._begin(start, state), grapple, cancellation)
         return GrappleReference(start, motion, grapple)
 
     def _begin(self, start: Reference, state: ControlState) -> RobotMotion:
