@@ -11,6 +11,7 @@ import pytest
 from control.flights import Reporting, refusals
 from scipy.spatial.transform import Rotation
 from support.sentences import assert_one_sentence
+from support.thrust_flights import obstacles
 
 from spacerobot_ros.collision import BasePoses
 from spacerobot_ros.control.controller import build_controller
@@ -23,7 +24,7 @@ from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import RobotDescription
-from spacerobot_ros.model.urdf import load_robot, parse_world
+from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.execution.goal_file import IdentifiedGoal
@@ -40,6 +41,10 @@ STRAIGHT: dict[str, Any] = {
 BEHIND = Goal.from_rotvec([1.6, 1.3, 0.2], [0.3, -0.4, 1.2])
 """Behind the panel of 1.8 x 0.02 x 0.8 m round (1.5, 0.7, 0) m."""
 
+TOUCHED = (
+    "The goal is not reached without contact, as link 'base_link' and obstacle 'panel' touched at "
+    "{:.4g} s: "
+)
 PLACE = np.array([0.3, -0.2, 0.1])
 
 
@@ -53,12 +58,10 @@ def distance_from_panel(flight: Flight) -> float:
     """Return the smallest distance of the cube from the panel in a flight by coal, m."""
     cube, panel = coal.Box(0.3, 0.3, 0.3), coal.Box(1.8, 0.02, 0.8)
     place = coal.Transform3s(np.eye(3), np.array([1.5, 0.7, 0.0]))
-    distances = []
-    for pose in flight.pose[::5]:
-        at = coal.Transform3s(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
-        asked = coal.DistanceRequest(), coal.DistanceResult()
-        distances.append(coal.distance(cube, at, panel, place, *asked))
-    return float(min(distances))
+    poses, asked = flight.pose[::5], (coal.DistanceRequest(), coal.DistanceResult())
+    turns = Rotation.from_quat(poses[:, 3:]).as_matrix()
+    bodies = [coal.Transform3s(R, r) for R, r in zip(turns, poses[:, :3], strict=True)]
+    return min(float(coal.distance(cube, at, panel, place, *asked)) for at in bodies)
 
 
 def test_a_planned_docking_takes_less_propellant_in_the_same_time() -> None:
@@ -116,10 +119,7 @@ def test_a_goal_behind_a_panel_is_reached_round_it() -> None:
     # It ends at the goal, and has touched something.
     assert straight.outcome is Outcome.FAILED
     contact = next(each for each in straight.events if each.kind is EventKind.CONTACT)
-    told = (
-        "The goal is not reached without contact, as link 'base_link' and obstacle 'panel' touched "
-        f"at {contact.time_s:.4g} s: "
-    )
+    told = TOUCHED.format(contact.time_s)
     assert straight.message.startswith(told)
     assert straight.verdict.sentence.startswith(told)
     assert "settling" not in straight.verdict.sentence
@@ -132,10 +132,7 @@ def test_a_robot_that_touches_a_panel_from_the_start_fails_on_its_way() -> None:
     flight = fly_scenario(scenario.with_overrides("plant", at_panel).with_other_goal(goal))
     assert np.linalg.norm(flight.pose[-1, :3] - goal.position) < 5e-3
     assert flight.outcome is Outcome.FAILED
-    told = (
-        "The goal is not reached without contact, as link 'base_link' and obstacle 'panel' touched "
-        "at 0 s: "
-    )
+    told = TOUCHED.format(0.0)
     assert flight.message.startswith(told)
     assert flight.verdict.sentence.startswith(told)
 
@@ -188,6 +185,11 @@ class Follower(Reporting):
     def pursue(self, goal: Goal, name: str = "") -> None:
         self.executive.submit("base", IdentifiedGoal(goal, name))
         self.answer()
+
+    def await_plan(self, goal: Goal) -> None:
+        self.pursue(goal, "first")
+        while self.executive.state is not ControllerState.TRACKING:
+            self.answer()
 
     def fly(self, until: float = np.inf) -> ControllerState:
         """Answer states until the goal is decided, or a time; return the controller's state."""
@@ -244,9 +246,7 @@ def test_tasks_before_a_goal_are_done_once(in_background: bool) -> None:
 def test_a_goal_is_not_reached_while_its_motion_is_planned_again_after_a_reset() -> None:
     rig = Follower(plan_in_background=True, settle_time=0.04, status_period=0.02)
     goal = Goal.from_rotvec([1.3, 0.2, 0.1], [0.2, 0.1, 0.4])
-    rig.executive.submit("base", IdentifiedGoal(goal, "first"))
-    while rig.executive.state is not ControllerState.TRACKING:
-        rig.answer()
+    rig.await_plan(goal)
     rig.fly(until=rig.time + 4.0)
     left = float(np.linalg.norm(rig.reference().position - goal.position))
     rig.executive.plant_reset()
@@ -288,9 +288,7 @@ def test_motions_are_planned_anew_around_obstacles_that_come_in_flight() -> None
 def test_a_status_in_flight_says_for_what_another_motion_is_planned() -> None:
     rig = Follower(plan_in_background=True, status_period=0.02)
     goal, other = (Goal.from_rotvec(x, [0.0] * 3) for x in ([1.3, 0.2, 0.1], [0.5, -0.9, 0.4]))
-    rig.executive.submit("base", IdentifiedGoal(goal, "first"))
-    while rig.executive.state is not ControllerState.TRACKING:
-        rig.answer()
+    rig.await_plan(goal)
     between = ball((PLACE + goal.position) / 2)
     for event, words in (
         ("", "the reference."),
@@ -311,12 +309,7 @@ def test_a_status_in_flight_says_for_what_another_motion_is_planned() -> None:
 
 
 def ball(place: np.ndarray) -> RobotDescription:
-    return parse_world(
-        '<robot name="w"><link name="w"/><link name="ball"><collision><geometry><sphere '
-        'radius="0.1"/></geometry></collision></link><joint name="j" type="fixed"><parent '
-        f'link="w"/><child link="ball"/><origin xyz="{place[0]} {place[1]} {place[2]}"/></joint>'
-        "</robot>"
-    )
+    return obstacles(ball=('<sphere radius="0.1"/>', place, np.zeros(3)))
 
 
 def test_a_motion_is_blocked_when_it_first_comes_too_near() -> None:

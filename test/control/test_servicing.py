@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,8 @@ from support.executive_loop import (
     goal_at,
     planar_manipulator,
 )
+from support.oracles.integrated import tumbled_body
 from support.sentences import assert_one_sentence
-from support.thrust_flights import tumbled
 
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.servicing import MeasuredTarget, Task
@@ -448,11 +447,8 @@ def test_a_noisy_target_is_predicted_from_the_average_of_its_momenta() -> None:
     omega = np.array([0.03, -0.01, 0.04])
     free = BodyMotion(np.eye(3), NEAR, np.array([0.002, -0.001, 0.003]), omega)
     times = np.linspace(0.0, 32.0, 3201)
-    X, r = tumbled(root, free, times)
-    rates = [
-        (Rotation.from_quat(a).inv() * Rotation.from_quat(b)).as_rotvec() / 0.01
-        for a, b in pairwise(X)
-    ]
+    R, r, _ = tumbled_body(root.bodies[0].inertia, free, times)
+    X, rates = R.as_quat(), (R[:-1].inv() * R[1:]).as_rotvec() / 0.01
     rng, target, late = np.random.default_rng(3), MeasuredTarget(), []
     target.describe(root, "handle")
     for k in range(200):

@@ -8,11 +8,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
+from support.oracles.integrated import tumbled_body
 from support.sentences import assert_one_sentence
-from support.thrust_flights import FOLDED, configuration, distance_from_target, tumbled
+from support.thrust_flights import FOLDED, distance_from_target, pinocchio
 
 from spacerobot_ros import fly
 from spacerobot_ros.errors import PlanningError
@@ -38,6 +38,7 @@ SLAB = f"""<robot name="slab"><link name="slab"><inertial><origin xyz="0.02 0.01
 <mass value="30"/>{INERTIA.format(2.0, 1.4, 1.1)}<collision><geometry><box size="0.6 1.0 0.8"/>
 </geometry></collision></link><link name="grapple"/><joint name="mount" type="fixed">
 <parent link="slab"/><child link="grapple"/><origin xyz="-0.32 0.1 0"/></joint></robot>"""
+TARGET = parse_robot(SLAB)
 SATELLITE = share_directory() / "config" / "targets" / "satellite.urdf"
 HERE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 REST, FOLDED_REST = (RobotMotion.at_rest(HERE, q) for q in (np.zeros(1), FOLDED))
@@ -55,17 +56,15 @@ def slab(place: tuple[float, ...], v: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Bo
 
 
 def meeting(free: BodyMotion, clearance: float = 0.02) -> Grapple:
-    target = parse_robot(SLAB)
-    return Grapple(TorqueFreeMotion(TargetBody.of(target, "grapple"), free), target, clearance)
+    return Grapple(TorqueFreeMotion(TargetBody.of(TARGET, "grapple"), free), TARGET, clearance)
 
 
 def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> None:
     planner, free = boomed(), slab((2.5, 0.2, -0.1), (0.004, -0.003, 0.0))
-    target = parse_robot(SLAB)
     motion = planner.plan(REST, meeting(free))
     T, dt = motion.duration, 1e-3
-    X, r = tumbled(target, free, np.array([0.0, T - dt, T, T + dt]))
-    R, hand = Rotation.from_quat(X), motion.at(T).end_effector
+    R, r, _ = tumbled_body(TARGET.bodies[0].inertia, free, np.array([0.0, T - dt, T, T + dt]))
+    hand = motion.at(T).end_effector
     fixture = r + R.apply([-0.32, 0.1, 0.0])
     assert hand.position == pytest.approx(fixture[2], abs=1e-4)
     assert (R[2].inv() * Rotation.from_quat(hand.quaternion)).magnitude() < 1e-4
@@ -73,14 +72,13 @@ def test_a_fixture_is_met_with_its_pose_and_velocities_round_the_target() -> Non
     turned = (R[3] * R[1].inv()).as_rotvec() / (2 * dt)
     assert hand.angular_velocity == pytest.approx(turned, abs=1e-4)
     robot = planner.robot.description
-    assert distance_from_target(robot, target, motion, free) > 0.0199
+    assert distance_from_target(robot, TARGET, motion, free) > 0.0199
     careless = planner.plan(REST, meeting(free, 0.0))
-    assert distance_from_target(robot, target, careless, free) < 0
+    assert distance_from_target(robot, TARGET, careless, free) < 0
 
 
 def test_an_approach_stays_in_its_corridor_or_is_refused() -> None:
     planner, free, angle = boomed(), slab((2.5, 0.2, -0.1), (0.004, -0.003, 0.0)), 0.25
-    target = parse_robot(SLAB)
     clear = replace(meeting(free), standoff=(-0.4, 0.0, 0.0))
     outside = []
     for length in (0.0, 0.6):
@@ -88,8 +86,8 @@ def test_an_approach_stays_in_its_corridor_or_is_refused() -> None:
         motion = planner.plan(REST, asked)
         times = np.linspace(0, motion.duration, 8000)
         hand = np.array([motion.at(time).end_effector.position for time in times])
-        X, r = tumbled(target, free, times)
-        p = Rotation.from_quat(X).inv().apply(hand - r) - [-0.32, 0.1, 0.0]
+        R, r, _ = tumbled_body(TARGET.bodies[0].inertia, free, times)
+        p = R.inv().apply(hand - r) - [-0.32, 0.1, 0.0]
         beyond = np.hypot(p[:, 1], p[:, 2]) - (0.02 - p[:, 0] * np.tan(angle))
         outside.append(beyond[np.linalg.norm(p, axis=1) < 0.6].max())
     assert outside[0] > 0.1, "the test is sharp"
@@ -165,25 +163,22 @@ def test_a_grasp_leaves_no_angular_momentum_if_that_is_asked_for() -> None:
     for detumbles in (False, True):
         asked = replace(grapple, detumbles=detumbles)
         motion = planner.plan(FOLDED_REST, asked)
-        model = pin.buildModelFromXML(planner.robot.description.urdf, pin.JointModelFreeFlyer())
-        data, last = model.createData(), motion.at(motion.duration)
-        pose, v = np.concatenate(last.base[:2]), np.zeros(model.nv)
-        q = configuration(model, planner.robot, pose, last.q)
-        v[:6] = Rotation.from_quat(pose[3:]).inv().apply(last.base[2:4]).ravel()
-        for name, rate in zip(planner.robot.joint_names, last.qdot, strict=True):
-            v[model.joints[model.getJointId(name)].idx_v] = rate
-        h = pin.computeCentroidalMomentum(model, data, q, v)
-        X, r = tumbled(target, free, np.array([0.0, motion.duration]))
-        inertia, m = body.inertia, data.mass[0]
+        oracle, last = pinocchio(planner.robot), motion.at(motion.duration)
+        oracle.set_configuration(last.q, last.base.quaternion, last.base.position)
+        twist = Rotation.from_quat(last.base.quaternion).inv().apply(last.base[2:4]).ravel()
+        oracle.move(oracle.base_velocities(twist) + oracle.joint_velocities(last.qdot))
+        (p, L, _), m = oracle.momentum_W(), oracle.data.mass[0]
+        turned, r, _ = tumbled_body(body.inertia, free, np.array([0.0, motion.duration]))
+        inertia = body.inertia
         spin = R @ inertia.about_com @ R.T @ omega
         of_target = free.v + np.cross(omega, R @ inertia.com)
-        apart = r[1] + Rotation.from_quat(X[1]).apply(inertia.com) - data.com[0]
+        apart = r[1] + turned[1].apply(inertia.com) - oracle.center_of_mass_W()
         reduced = m * inertia.mass / (m + inertia.mass)
-        orbit = reduced * np.cross(apart, of_target - h.linear / m)
-        totals.append(np.linalg.norm(h.angular + spin + orbit) / np.linalg.norm(spin))
+        orbit = reduced * np.cross(apart, of_target - p / m)
+        totals.append(np.linalg.norm(L + spin + orbit) / np.linalg.norm(spin))
         durations.append(motion.duration)
         planned = motion.joined_momentum(grapple.motion)
-        assert planned == pytest.approx(h.angular + spin + orbit, abs=1e-3)
+        assert planned == pytest.approx(L + spin + orbit, abs=1e-3)
     assert totals[0] > 1
     assert totals[1] < 0.01
     assert durations[1] < 1.2 * durations[0]
@@ -228,14 +223,12 @@ def test_the_plant_has_what_a_planned_grasp_leaves(
     assert least <= float(began.about["planned_momentum_Nms"]) < most
     assert capture["captured"]
     robot = SpaceRobot.from_file(robot_file(flight.scenario.plant.robot))
-    model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
-    data, q, spins = model.createData(), pin.neutral(model), np.zeros(model.nv)
     at = int(np.searchsorted(flight.time, capture["time_s"]))
-    q[3:7] = flight.pose[at, 3:]
-    for name, rate in zip(robot.joint_names, capture["joint_rates_radps"], strict=True):
-        if "wheel" in name:
-            spins[model.joints[model.getJointId(name)].idx_v] = rate
-    stored = (pin.ccrba(model, data, q, np.zeros(model.nv)) @ spins)[3:]
+    spins = capture["joint_rates_radps"] * np.array(["wheel" in x for x in robot.joint_names])
+    oracle = pinocchio(robot)
+    oracle.set_configuration(np.zeros(robot.n), flight.pose[at, 3:])
+    oracle.move(oracle.joint_velocities(spins))
+    _, stored, _ = oracle.momentum_W()
     assert detumble == "after" or np.linalg.norm(stored) > 0.1, "the test is sharp"
     left = np.linalg.norm(capture["angular_momentum_Nms"] - stored)
     assert least <= left < most

@@ -10,13 +10,12 @@ import coal
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.thrust_flights import FOLDED, beyond, flown_by_pinocchio
+from support.thrust_flights import FOLDED, beyond, box, flown_by_pinocchio, obstacles
 
 from spacerobot_ros.errors import NotFoundError, ParameterError, PlanningError, UnreachableError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.grasp import RobotMotion
 from spacerobot_ros.model.thrusters import ThrusterTable, find_thrusters
-from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.planning.methods.thrust.problem import (
     Propulsion,
     ThrustGoal,
@@ -32,6 +31,7 @@ CUBE = f"""<robot name="cube"><link name="base_link"><inertial><mass value="{MAS
 </inertial><collision><geometry><box size="0.4 0.3 0.2"/></geometry></collision></link></robot>"""
 
 START = np.array([0.4, -1.3, 0.7, *Rotation.from_rotvec([0.5, -0.3, 1.1]).as_quat()])
+GOAL = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
 REST = RobotMotion.at_rest(START, np.zeros(0))
 
 
@@ -47,11 +47,6 @@ def servicer() -> ThrustPlanner:
     return ThrustPlanner(robot, ThrustOptions(thrusters="urdf"), "end_effector")
 
 
-def coasting(time: float, distance: float, acceleration: float) -> float:
-    """Return for how long one accelerates, and brakes, over a distance in a given time, s."""
-    return (time - np.sqrt(time**2 - 4 * distance / acceleration)) / 2
-
-
 @pytest.mark.parametrize("rotates", [False, True])
 def test_shortest_times_and_least_impulses_are_those_of_closed_forms(rotates: bool) -> None:
     way, turn = np.array([0.0, 1.2, 0.0]), np.array([0.0, 0.0, 1.1])
@@ -62,8 +57,10 @@ def test_shortest_times_and_least_impulses_are_those_of_closed_forms(rotates: bo
     shortest = 2 * np.sqrt(distance * inertia / limit)
     assert fastest.duration == pytest.approx(shortest, rel=1e-3)
     cheapest = cube_planner(time_factor=1.5).plan(REST, goal)
-    burn = coasting(1.5 * shortest, distance, limit / inertia)
-    assert cheapest.duration == pytest.approx(1.5 * shortest, rel=1e-3)
+    # One accelerates, coasts, and brakes for as long as one has accelerated.
+    time = 1.5 * shortest
+    burn = (time - np.sqrt(time**2 - 4 * distance * inertia / limit)) / 2
+    assert cheapest.duration == pytest.approx(time, rel=1e-3)
     assert cheapest.spent == pytest.approx(2 * limit * burn, rel=5e-3)
 
 
@@ -75,9 +72,9 @@ def test_a_cube_turns_on_the_way_where_that_lets_more_thrusters_push() -> None:
     straight = 2 * np.sqrt(1.2 * robot.total_mass / along)
     options = ThrustOptions(time_factor=1.0, clearance=0.0, reserve=0.0, thrusters="urdf")
     planner = ThrustPlanner(robot, options)
-    upright = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    goal = ThrustGoal(upright + np.eye(7)[0] * 1.2)
-    motion = planner.plan(RobotMotion.at_rest(upright, np.zeros(0)), goal)
+    upright, along_x = np.eye(7)[6], 1.2 * np.eye(7)[0]
+    start = RobotMotion.at_rest(upright, np.zeros(0))
+    motion = planner.plan(start, ThrustGoal(upright + along_x))
     assert motion.duration < 0.947 * straight
     turned = Rotation.from_quat(motion.at(motion.duration / 2).base.quaternion)
     assert turned.magnitude() > 0.2
@@ -86,8 +83,7 @@ def test_a_cube_turns_on_the_way_where_that_lets_more_thrusters_push() -> None:
 def test_pinocchio_ends_at_the_goal_under_the_wrenches_and_efforts_of_a_plan() -> None:
     planner = servicer()
     start = RobotMotion.at_rest(START, FOLDED)
-    goal = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
-    shape = FOLDED + np.array([0.3, 0.2, -0.4, 0.5, -0.3, 0.6])
+    goal, shape = GOAL, FOLDED + np.array([0.3, 0.2, -0.4, 0.5, -0.3, 0.6])
     motion = planner.plan(start, ThrustGoal(base=goal, shape=shape))
     ended = flown_by_pinocchio(planner.robot, motion, start)
     assert ended[:3] == pytest.approx(goal[:3], abs=1e-3)
@@ -115,17 +111,16 @@ def test_a_joint_that_is_limited_to_no_effort_is_named() -> None:
 
 def test_an_arm_that_is_to_keep_its_shape_keeps_it_all_the_way() -> None:
     planner, start = servicer(), RobotMotion.at_rest(START, FOLDED)
-    goal = beyond(START, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
-    motion = planner.plan(start, ThrustGoal(base=goal, shape=FOLDED, keeps_shape=True))
+    motion = planner.plan(start, ThrustGoal(GOAL, shape=FOLDED, keeps_shape=True))
     assert np.abs(motion.path()[0] - FOLDED).max() < 1e-9
     ended = flown_by_pinocchio(planner.robot, motion, start)
-    assert ended[:3] == pytest.approx(goal[:3], abs=1e-3)
+    assert ended[:3] == pytest.approx(GOAL[:3], abs=1e-3)
 
 
 def test_hand_and_base_reach_their_poses_together() -> None:
     planner = servicer()
-    pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    base = np.array([1.0, 0.4, -0.2, *Rotation.from_rotvec([0.1, -0.2, 0.5]).as_quat()])
+    pose = np.eye(7)[6]
+    base = beyond(pose, np.array([1.0, 0.4, -0.2]), np.array([0.1, -0.2, 0.5]))
     hand = np.array([2.28, 1.85, 0.79, *Rotation.from_rotvec([-0.56, 0.95, 1.05]).as_quat()])
     motion = planner.plan(RobotMotion.at_rest(pose, FOLDED), ThrustGoal(base, hand))
     last = motion.at(motion.duration)
@@ -152,18 +147,11 @@ def test_accelerations_are_the_derivatives_of_velocities() -> None:
 def test_a_box_in_the_way_is_passed_clear_of_it() -> None:
     goal = beyond(START, np.array([2.5, 0.3, -0.2]), np.array([0.3, 0.8, -0.5]))
     middle, size = (START[:3] + goal[:3]) / 2, np.array([0.5, 0.4, 0.3])
-    rpy = np.array([0.3, -0.2, 0.6])
-    numbers = [" ".join(map(str, each)) for each in (size, middle, rpy)]
-    world = parse_world(
-        f'<robot name="w"><link name="world"/><link name="box"><collision><geometry><box size='
-        f'"{numbers[0]}"/></geometry></collision></link><joint name="j" type="fixed"><parent '
-        f'link="world"/><child link="box"/><origin xyz="{numbers[1]}" rpy="{numbers[2]}"/></joint>'
-        "</robot>"
-    )
-    robot = SpaceRobot(with_world(SpaceRobot.from_urdf(CUBE).description, world))
-    motion = cube_planner(robot).plan(REST, ThrustGoal(goal))
-    free = cube_planner().plan(REST, ThrustGoal(goal))
-    body, box = coal.Box(0.4, 0.3, 0.2), coal.Box(*size)
+    rpy, planner = np.array([0.3, -0.2, 0.6]), cube_planner()
+    free = planner.plan(REST, ThrustGoal(goal))
+    planner.use_obstacles(obstacles(box=(box(size), middle, rpy)))
+    motion = planner.plan(REST, ThrustGoal(goal))
+    body, obstacle = coal.Box(0.4, 0.3, 0.2), coal.Box(*size)
     placed = coal.Transform3s(Rotation.from_euler("xyz", rpy).as_matrix(), middle)
     asked = coal.DistanceRequest(), coal.DistanceResult()
 
@@ -171,7 +159,7 @@ def test_a_box_in_the_way_is_passed_clear_of_it() -> None:
         frames = [flight.at(time).base for time in np.linspace(0, flight.duration, 400)]
         turns = Rotation.from_quat([each.quaternion for each in frames]).as_matrix()
         places = [coal.Transform3s(R, x.position) for R, x in zip(turns, frames, strict=True)]
-        return float(min(coal.distance(body, at, box, placed, *asked) for at in places))
+        return float(min(coal.distance(body, at, obstacle, placed, *asked) for at in places))
 
     assert nearest(motion) >= 0.01 - 1e-6
     assert nearest(free) < 0

@@ -9,11 +9,13 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from support.oracles.integrated import tumbled_body
+from support.oracles.pinocchio_oracle import PinocchioOracle
 
 from spacerobot_ros.collision import BasePoses, CollisionGeometry
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion
+from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.planning.methods.thrust.problem import ThrustMotion
 
 FOLDED = np.array([0.0, -1.2, 2.0, 0.0, 0.8, 0.0])
@@ -27,41 +29,39 @@ def beyond(start: Array, displacement: Array, rotvec: Array) -> Array:
     return np.concatenate([start[:3] + R.apply(displacement), turned.as_quat()])
 
 
-def configuration(model: pin.Model, robot: SpaceRobot, pose: Array, q: Array) -> Array:
-    """Return the configuration of a model at a base pose (7,) and a shape (n,)."""
-    found = pin.neutral(model)
-    found[:7] = pose
-    for name, value in zip(robot.joint_names, q, strict=True):
-        joint = model.joints[model.getJointId(name)]
-        found[joint.idx_q : joint.idx_q + joint.nq] = (
-            [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
+def obstacles(**solids: tuple[str, Array, Array]) -> RobotDescription:
+    """Return bodies at rest by name: elements of their shapes, positions and rpy angles."""
+    elements = '<link name="w"/>'
+    for name, (shape, place, rpy) in solids.items():
+        xyz, angles = (" ".join(map(str, each)) for each in (place, rpy))
+        elements += (
+            f'<link name="{name}"><collision><geometry>{shape}</geometry></collision></link>'
+            f'<joint name="to_{name}" type="fixed"><parent link="w"/><child link="{name}"/>'
+            f'<origin xyz="{xyz}" rpy="{angles}"/></joint>'
         )
-    return np.asarray(found)
+    return parse_world(f'<robot name="w">{elements}</robot>')
+
+
+def box(size: Array) -> str:
+    return '<box size="{} {} {}"/>'.format(*size)
 
 
 def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: RobotMotion) -> Array:
     """Return where Pinocchio ends under the wrenches and efforts of a motion: q of its model."""
-    model = pin.buildModelFromXML(robot.description.urdf, pin.JointModelFreeFlyer())
-    model.gravity = pin.Motion.Zero()
-    data = model.createData()
-    places = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names]
-    q0 = configuration(model, robot, start.pose, start.q)
+    oracle = pinocchio(robot)
+    oracle.set_configuration(start.q, start.pose[3:], start.pose[:3])
+    model = oracle.model
 
     def rate(time: float, y: Array) -> Array:
         # On the tangent space of the start: its displacement moves with the velocity.
-        q, v = y[: model.nq], y[model.nq :]
-        q = pin.normalize(model, q)
-        sample = motion.at(time)
-        efforts = np.zeros(model.nv)
-        efforts[places] = sample.tau
-        external = [pin.Force.Zero() for _ in range(model.njoints)]
-        external[1] = pin.Force(sample.wrench_B[:3], sample.wrench_B[3:])
-        a = pin.aba(model, data, q, v, efforts, external)
-        step = 1e-7
+        q, v = pin.normalize(model, y[: model.nq]), y[model.nq :]
+        oracle.q, oracle.u = q, v
+        sample, step = motion.at(time), 1e-7
+        a = oracle.own_acceleration(sample.wrench_B, sample.tau)
         qdot = (pin.integrate(model, q, v * step) - pin.integrate(model, q, -v * step)) / (2 * step)
         return np.concatenate([qdot, a])
 
-    y = np.concatenate([q0, np.zeros(model.nv)])
+    y = np.concatenate([oracle.q, np.zeros(model.nv)])
     for k in range(len(motion.levels)):
         # Wrenches and accelerations jump between intervals.
         ends = k * motion.step + 1e-12, (k + 1) * motion.step - 1e-12
@@ -69,10 +69,8 @@ def flown_by_pinocchio(robot: SpaceRobot, motion: ThrustMotion, start: RobotMoti
     return np.asarray(y[: model.nq])
 
 
-def tumbled(target: RobotDescription, motion: BodyMotion, times: Array) -> tuple[Array, Array]:
-    """Return quaternions (K, 4) and positions (K, 3) of a free body's frame, by scipy."""
-    R, r, _ = tumbled_body(target.bodies[0].inertia, motion, times)
-    return np.asarray(R.as_quat()), r
+def pinocchio(robot: SpaceRobot) -> PinocchioOracle:
+    return PinocchioOracle(robot.description.urdf, robot.joint_names)
 
 
 def distance_from_target(
@@ -83,8 +81,8 @@ def distance_from_target(
     """
     times = np.linspace(0.0, motion.duration, 400)
     samples = [motion.at(time) for time in times]
-    X, r = tumbled(target, free, times)
-    back = Rotation.from_quat(X).inv()
+    R, r, _ = tumbled_body(target.bodies[0].inertia, free, times)
+    back = R.inv()
     base = BasePoses(
         back.apply(np.array([each.base.position for each in samples]) - r),
         (back * Rotation.from_quat([each.base.quaternion for each in samples])).as_quat(),
