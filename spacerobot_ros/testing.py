@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any, NamedTuple
 
@@ -43,8 +43,8 @@ class Arrival(NamedTuple):
 class Stack:
     """Context manager for nodes in one executor, in lockstep, in a separate ROS domain.
 
-    The plant starts at the first goal, once all nodes are connected. Simulated time advances while
-    the nodes spin.
+    The plant starts at the first goal, or with :meth:`start`, once all nodes are connected.
+    Simulated time advances while the nodes spin.
 
     Parameters
     ----------
@@ -135,6 +135,12 @@ class Stack:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def start(self) -> None:
+        """Activate the nodes without a goal, for nodes of your own that send goals."""
+        self._connect(self.nodes.values())
+        for node in self._inactive:
+            node.require_transition(node.trigger_activate)
+
     def fly_to(
         self,
         goal: Goal | None = None,
@@ -167,12 +173,10 @@ class Stack:
             context=self.context,
         )
         self.executor.add_node(client.node)
-        everyone = [*self.nodes.values(), client.node]
 
         def launch() -> None:
             """Send the goal, once; nodes that are not active are activated, the plant after it."""
-            asleep = [node for node in self._flight_nodes if not node.is_active]
-            for node in sorted(asleep, key=lambda node: node.get_name() == "plant"):
+            for node in self._inactive:
                 if node.get_name() == "plant":
                     client.send(goal)
                 node.require_transition(node.trigger_activate)
@@ -180,13 +184,7 @@ class Stack:
                 client.send(goal)
 
         try:
-            self.spin_until(
-                lambda: (
-                    not topics_without_all_matches(
-                        [end for node in everyone for end in endpoints_of(node)]
-                    )
-                )
-            )
+            self._connect([*self.nodes.values(), client.node])
             # Messages published by one callback are delivered in order: the goal comes first.
             clock = Clock(clock_type=ClockType.STEADY_TIME)
             timer = client.node.create_timer(1e-3, launch, clock=clock)
@@ -221,6 +219,22 @@ class Stack:
                     f"{pending()}This took more than {self._timeout:g} s of wall time."
                 )
             self.executor.spin_once(timeout_sec=0.05)
+
+    def _connect(self, nodes: Collection[Node]) -> None:
+        def apart() -> str:
+            ends = [end for node in nodes for end in endpoints_of(node)]
+            return ", ".join(sorted(topics_without_all_matches(ends)))
+
+        self.spin_until(
+            lambda: not apart(),
+            lambda: f"Publishers and subscriptions differ in their quality of service: {apart()}. ",
+        )
+
+    @property
+    def _inactive(self) -> list[FlightNode]:
+        """The nodes of this package that are not active, the plant last."""
+        inactive = [node for node in self._flight_nodes if not node.is_active]
+        return sorted(inactive, key=lambda node: node.get_name() == "plant")
 
     @property
     def _flight_nodes(self) -> list[FlightNode]:

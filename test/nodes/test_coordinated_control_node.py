@@ -278,11 +278,8 @@ def test_a_goal_in_flight_is_flown_from_where_the_robot_is_without_a_stop() -> N
             10,
         )
         goals = node.create_publisher(PoseStamped, "goal_pose", 10)
-        for name in ("coordinated_control", "plant"):
-            flown = stack.nodes[name]
-            assert isinstance(flown, FlightNode)
-            flown.require_transition(flown.trigger_activate)
-        stack.spin_until(lambda: bool(states) and goals.get_subscription_count() > 0)
+        stack.start()
+        stack.spin_until(lambda: bool(states))
         goals.publish(goal_at(FIRST))
         stack.spin_until(lambda: states[-1].pose.pose.position.x > 0.4)
         flying = len(states)

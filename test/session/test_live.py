@@ -22,6 +22,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from rosgraph_msgs.msg import Clock
@@ -610,6 +611,29 @@ def test_a_goal_is_reached_by_the_same_states_every_time_and_another_one_refused
 def test_a_controller_flies_without_a_planner() -> None:
     with Stack("planar_manipulator", ["plant", "coordinated_control"]) as stack:
         assert stack.fly_to(x=0.1, y=0.1).reached
+
+
+def test_a_started_stack_flies_to_the_goals_of_other_nodes() -> None:
+    reached: list[DiagnosticStatus] = []
+    with Stack("sliding_masses", ["plant", "planner", Recorder], QUICK) as stack:
+        own = stack.nodes["positions"]
+        own.create_subscription(DiagnosticStatus, "planner/status", reached.append, LATCHED)
+        goals = own.create_publisher(PoseStamped, "goal_pose", 10)
+        stack.start()
+        goal = PoseStamped()
+        goal.pose.position.x = 0.03
+        goal.pose.orientation.w = 1.0
+        goals.publish(goal)
+        stack.spin_until(lambda: any("is reached" in each.message for each in reached))
+        assert own.found[-1] == pytest.approx(0.03, abs=0.02)
+
+
+def test_endpoints_of_a_stack_that_cannot_meet_are_named() -> None:
+    with Stack("sliding_masses", ["plant", "planner", Recorder], timeout=3.0) as stack:
+        best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        stack.nodes["positions"].create_publisher(PoseStamped, "goal_pose", best_effort)
+        with pytest.raises(SpaceRobotError, match=r"quality of service: /goal_pose\."):
+            stack.start()
 
 
 def test_what_does_not_happen_in_time_is_an_error() -> None:
