@@ -325,7 +325,12 @@ class Commander(ABC):
             self._report_waiting_goal(goal, "The goal waits for a robot on robot_description.")
         else:
             self._submit_goal(key, goal)
-        self._fly_to.end_dropped_goals(self._active_goal_ids())
+        if self._fly_to.end_dropped_goals(self._active_goal_ids()):
+            # The last published status is about a goal that has ended.
+            present, missing = self._last_status, self._reported_missing[0]
+            self._reported_missing = "", ""
+            if present is not None and present.goal_id in self._active_goal_ids() and not missing:
+                self.host.publish_status(present)
 
     def _refuse_goal(self, message: str, goal_id: str) -> None:
         self._publish_decision(self._make_status("refused", message, goal_id))

@@ -279,8 +279,9 @@ class FlyToGoals:
         if status.state.decided:
             self._end(status.goal_id, status)
 
-    def end_dropped_goals(self, pursued: Collection[str], why: str = "") -> None:
-        """End the goals that are no longer pursued and have no final status.
+    def end_dropped_goals(self, pursued: Collection[str], why: str = "") -> bool:
+        """End the goals that are no longer pursued and have no final status; return whether there
+        are any.
 
         Parameters
         ----------
@@ -289,11 +290,13 @@ class FlyToGoals:
         why
             The reason, for goals not replaced by a later goal.
         """
-        for goal_id in [each for each in self._served if each not in pursued]:
+        dropped = [each for each in self._served if each not in pursued]
+        for goal_id in dropped:
             message = why or "The goal is no longer pursued."
             if not why and self._accepted[-1:] != [goal_id]:
                 message = f"Aborted: replaced by goal {self._accepted[-1]}."
             self._end(goal_id, self._report_aborted(goal_id, message))
+        return bool(dropped)
 
     def _end(self, goal_id: str, status: Status) -> None:
         served = self._served.pop(goal_id, None)

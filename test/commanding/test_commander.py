@@ -352,6 +352,25 @@ def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     assert not second.results
 
 
+def test_after_the_end_of_a_waiting_goal_the_last_status_is_about_the_present_one(
+    planner: Rig,
+) -> None:
+    planner.goal(sec=7)
+    for tick in range(1, 4):
+        planner.state(tick)
+    planner.goal(sec=8)
+    planner.goal(sec=9)  # before a state from which goal 8 could be planned
+    told = [(each.state.value, each.goal_id[:1]) for each in planner.host.statuses]
+    assert told[-3:] == [("executing", "7"), ("aborted", "8"), ("executing", "7")]
+    planner.commander.receive_plant_status(PlantStatus(PlantState.PAUSED, "Time stands still."))
+    for _ in range(20):
+        planner.wall += 0.1
+        planner.commander.take_accepted_jump()
+    planner.goal(sec=10)
+    planner.commander.take_accepted_jump()
+    assert planner.host.states[-3:] == ["waiting", "aborted", "waiting"]
+
+
 def test_goals_that_are_pursued_together_are_aborted_together(controller: Rig) -> None:
     rig = controller
     rig.state(1)
