@@ -647,7 +647,7 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
     if urdf is None:
         raise RecordingError(f"The bag {bag.path} contains no robot description.")
     robot = scenario.plant.assumed_robot(parse_robot(urdf.decode(errors="replace")))
-    flight = replace(read_flown(bag, scenario), robot=robot)
+    flight = _with_flown_goal(replace(read_flown(bag, scenario), robot=robot))
     if len(flight.pose) != len(flight.q):
         raise RecordingError(
             f"The bag {bag.path} has {len(flight.pose)} base poses and {len(flight.q)} "
@@ -656,3 +656,19 @@ def read_run(path: str | os.PathLike[str]) -> Flight:
     if not flight.goals and not scenario.goal.end_effectors:
         raise RecordingError(f"The bag {bag.path} contains no goal pose.")
     return flight
+
+
+def _with_flown_goal(flight: Flight) -> Flight:
+    """Return a flight with the goal pursued at its end, unless that is the goal of its scenario:
+    other goals are sent to a stack that ``spacerobot up`` keeps running."""
+    own, flown = flight.goal, goal_at_end([each for _, each in flight.statuses], flight.goals)
+    if own is None or flown is None:
+        return flight
+    aims = {each.link: each.position for each in flown.end_effectors}
+    pairs = [(aims.get(each.link, each.position), each.position) for each in own.end_effectors]
+    if flown.base >= own.base:
+        pairs += [(flown.position, own.position)] if "position" in own.asked else []
+        pairs += [(flown.quaternion, own.quaternion)] if "attitude" in own.asked else []
+    if pairs and all(np.allclose(*pair, rtol=1e-6, atol=1e-6) for pair in pairs):
+        return flight
+    return replace(flight, goal=flown, scenario=flight.scenario.with_other_goal(flown))

@@ -303,6 +303,19 @@ def test_a_run_has_the_goal_with_all_digits_as_it_was_sent(tmp_path: Path) -> No
     assert flight.outcome is Outcome.INTERRUPTED
 
 
+def test_a_run_to_another_goal_than_that_of_its_scenario_has_the_goal_that_was_flown(
+    tmp_path: Path,
+) -> None:
+    """As in a bag of a stack that was kept running; its base ends at (1, 0, 0)."""
+    about = list(records(goal_position="4 5 6", goal_asked="attitude position"))
+    flight = read_run(run_bag(tmp_path / "a.mcap", about))
+    assert flight.goal is not None
+    assert flight.goal.position.tolist() == [0.1, 0.2, 0.3]
+    assert flight.error is not None
+    assert flight.error.distance == pytest.approx(math.sqrt(0.9**2 + 0.2**2 + 0.3**2))
+    assert flight.scenario.published == ()
+
+
 def test_goals_of_named_end_effectors_leave_the_base_free_unless_it_has_one(
     tmp_path: Path,
 ) -> None:

@@ -24,6 +24,7 @@ from support.slow import some_fast
 from spacerobot_ros import fly, read_run
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.reading import open_flight_bag, read_flight
+from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import Outcome, metrics_of_each
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.planning import Goal
@@ -303,6 +304,19 @@ def test_a_goal_that_only_the_measured_pose_reaches_is_not_called_reached(tmp_pa
     # With sensors that do not err the same goal is reached.
     believed = fly(load_scenario("faults/biased_pose").with_overrides("plant", {"faults": [""]}))
     assert (believed.verdict.word, believed.verdict.complete) == ("Reached", True)
+
+
+def test_a_robot_that_is_moved_after_its_goal_is_elsewhere() -> None:
+    """As by a reset: the last state is the first one again."""
+    flight = read_run(BAGS / "sliding_masses.mcap")
+    assert flight.goal is not None
+    pose, goal = flight.signal("pose"), [*flight.goal.position, *flight.goal.quaternion]
+    back = Signal(np.append(pose.time, pose.time[-1] + 1), np.vstack([pose.values, pose.values[0]]))
+    moved = replace(flight, series={**flight.series, "pose": back}).verdict.sentence
+    reached, elsewhere = moved.split(" At the end of the flight, the robot is elsewhere: ")
+    assert reached == flight.message
+    distance, _ = apart(pose.values[0], np.array(goal))
+    assert shown(elsewhere, "# m and") == pytest.approx(distance, rel=6e-3)
 
 
 DRAWS = """
