@@ -177,8 +177,8 @@ def send_goal(
 ) -> Outcome:
     """Send one goal pose, show its statuses, and return its outcome.
 
-    ``timeout`` is a wall time in s; 0 means no limit. The search for a commander ends after
-    ``timeout``, or after ten seconds if that is sooner.
+    ``timeout`` is a wall time in s, also for the search for a commander; 0 means no limit, and ten
+    seconds for the search.
 
     Raises
     ------
@@ -215,9 +215,7 @@ def send_goal(
         try:
             for each in clients:
                 executor.add_node(each.node)
-            client = _find_goal_commander(
-                clients, executor, min(timeout or _LONGEST_DISCOVERY, _LONGEST_DISCOVERY), show
-            )
+            client = _find_goal_commander(clients, executor, timeout or _LONGEST_DISCOVERY, show)
             with graceful_shutdown() as stopped:
                 client.on_message = _StatusPrinter(show)
                 client.send(goal)
@@ -290,8 +288,8 @@ def _find_goal_commander(
     show: Callable[[str], None],
 ) -> MissionClient:
     """Return the client that listens to the planner, or to the controller if there is none."""
-    aims = clients[0].goal_topics
-    topics = " and ".join(f"'{topic}'" for topic in aims)
+    aims, resolved = clients[0].goal_topics, clients[0].node.resolve_topic_name
+    topics = " and ".join(f"'{resolved(topic)}'" for topic in aims)
     began = time.monotonic()
     deadline, silent = began + patience, True
     while (now := time.monotonic()) < deadline:

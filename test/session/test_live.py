@@ -264,15 +264,24 @@ def test_a_run_whose_goal_another_one_replaces_says_so_and_has_not_reached_it(
     assert (result["state"], result["succeeded"]) == ("aborted", False)
 
 
-def test_a_goal_that_nobody_takes_is_one_sentence(spacerobot: Command) -> None:
-    for seconds, told in (("0.5", ""), ("1.5", "Waiting for a planner or a controller on")):
-        run = spacerobot("goal", "0", "0", "0", "--timeout", seconds)
-        assert run.returncode == 2
-        assert run.stdout.startswith(told)
-        assert run.stdout.count("\n") == bool(told)
-        assert run.stderr.count("\n") == 1
-        assert f"within {seconds} s" in run.stderr
-        assert "spacerobot up" in run.stderr
+@pytest.mark.parametrize(
+    ("seconds", "told"),
+    [
+        ("0.5", ""),
+        ("1.5", "Waiting for a planner or a controller on '/robot_1/goal_pose'"),
+        pytest.param("10.5", "Waiting for a planner", marks=pytest.mark.slow),
+    ],
+)
+def test_a_goal_that_nobody_takes_is_one_sentence(
+    spacerobot: Command, seconds: str, told: str
+) -> None:
+    run = spacerobot("goal", "0", "0", "0", "--timeout", seconds, "--namespace", "robot_1")
+    assert run.returncode == 2
+    assert run.stdout.startswith(told)
+    assert run.stdout.count("\n") == bool(told)
+    assert run.stderr.count("\n") == 1
+    assert f"within {seconds} s" in run.stderr
+    assert "spacerobot up" in run.stderr
 
 
 @dataclass
