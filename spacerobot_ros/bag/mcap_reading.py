@@ -15,14 +15,14 @@ import struct
 import tempfile
 import weakref
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import BytesIO
+from operator import itemgetter
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, TypeVar, cast
 
 import lz4.frame
-import numpy as np
 import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -41,7 +41,6 @@ from mcap.records import (
 from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
-from numpy.typing import NDArray
 
 from spacerobot_ros.errors import RecordingError, reason
 from spacerobot_ros.files import irregular_kind
@@ -388,24 +387,14 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
 
 # -- messages ---------------------------------------------------------------------------------
 
-MessageBlock = tuple[NDArray[np.intp], NDArray[np.uint64], list[bytes]]
-"""N recorded messages: topic indices (N,), log times (N,) in ns, and serialised bytes."""
+Message = tuple[str, int, bytes]
+"""A recorded message: its topic, log time (ns) and serialised bytes."""
 
-_MESSAGE_HEADS = np.dtype(
-    [
-        ("opcode", "<u1"),
-        ("length", "<u8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""Message header: opcode, length, channel, sequence, log time and publish time."""
+
 LATEST_TIME_NS = 2**63 - 1
 """Latest time that int64 nanoseconds can represent: the year 2262."""
-
-_MOST_CHANNELS = 65_536
-_NOT_WANTED = -1
 
 
 class _Section(NamedTuple):
@@ -420,51 +409,46 @@ class _Section(NamedTuple):
 
 def blocks_in_time_order(
     files: Sequence[BagFile],
-    topics: Sequence[str],
+    topics: Iterable[str],
     start_ns: int = 0,
     end_ns: int = LATEST_TIME_NS,
-) -> Iterator[MessageBlock]:
+) -> Iterator[list[Message]]:
     """Iterate over the messages in a bag in log time order, and in write order for equal log times.
 
     Only messages on the given topics with log times in the given span (ns) are returned. A block
     contains the messages of chunks that overlap in time; only these chunks are in memory together.
     Errors: see :meth:`BagFile.open`.
     """
-    start_ns, end_ns = min(start_ns, LATEST_TIME_NS), min(end_ns, LATEST_TIME_NS)
-    places = {topic: number for number, topic in enumerate(topics)}
-    numbers = np.full((len(files), _MOST_CHANNELS), _NOT_WANTED, np.intp)
+    wanted, end_ns = set(topics), min(end_ns, LATEST_TIME_NS)
     sections: list[_Section] = []
-    unpackers = [ChunkUnpacker(file.size) for file in files]
-    for n, (file, of_channel) in enumerate(zip(files, numbers, strict=True)):
-        for channel in file.summary.channels.values():
-            of_channel[channel.id] = places.get(channel.topic, _NOT_WANTED)
+    channels = [
+        {each.id: each.topic for each in file.summary.channels.values() if each.topic in wanted}
+        for file in files
+    ]
+    for n, (file, topic_of) in enumerate(zip(files, channels, strict=True)):
         for index in file.summary.chunk_indexes:
             span = index.message_start_time, index.message_end_time
-            channels = list(index.message_index_offsets)
             if span[0] > end_ns or span[1] < start_ns:
                 continue
-            if not channels or (of_channel[channels] != _NOT_WANTED).any():
-                place = n, index.chunk_start_offset
-                sections.append(_Section(span[0], place, span[1], index))
+            inside = index.message_index_offsets.keys()
+            if not inside or inside & topic_of.keys():
+                sections.append(_Section(span[0], (n, index.chunk_start_offset), span[1], index))
         if not file.summary.chunk_indexes:
             sections.append(_Section(0, (n, 0), LATEST_TIME_NS, None))
+    unpackers = [ChunkUnpacker(file.size) for file in files]
     for cluster in _overlapping(sections):
-        blocks: list[MessageBlock] = []
+        block: list[Message] = []
         for section in sorted(cluster, key=lambda each: each.written):
             n = section.written[0]
+            unpack = unpackers[n].unpack_message
             with files[n].open() as opened:
-                for place_in_file, data in _unpacked(opened, section.chunk):
-                    block = _messages_in(data, place_in_file, numbers[n], start_ns, end_ns)
-                    unpack = unpackers[n].unpack_message
-                    whole = [unpack(message, place_in_file) for message in block[2]]
-                    blocks.append((*block[:2], whole))
-        nothing: MessageBlock = np.zeros(0, np.intp), np.zeros(0, np.uint64), []
-        topics_of, log_times, parts = zip(nothing, *blocks, strict=True)
-        times = np.concatenate(log_times)
-        order = np.argsort(times, kind="stable")
-        messages = [message for part in parts for message in part]
-        in_order = [messages[k] for k in order.tolist()]
-        yield np.concatenate(topics_of)[order], times[order], in_order
+                for place, data in _unpacked(opened, section.chunk):
+                    block += (
+                        (topic, time_ns, unpack(message, place))
+                        for topic, time_ns, message in _messages_in(data, place, channels[n])
+                        if start_ns <= time_ns <= end_ns
+                    )
+        yield sorted(block, key=itemgetter(1))
 
 
 def _overlapping(sections: Iterable[_Section]) -> Iterator[list[_Section]]:
@@ -502,22 +486,14 @@ def _unpacked(opened: BinaryIO, index: ChunkIndex | None) -> Iterator[tuple[int,
             return
 
 
-def _messages_in(
-    data: bytes, place: int, numbers: NDArray[np.intp], start_ns: int, end_ns: int
-) -> MessageBlock:
-    """Return the requested messages in the chunk at ``place``, in record order.
-
-    ``numbers`` are the topic indices of all channels.
-    """
-    found = [a for a, _ in records_in_chunk(data, place) if data[a] == Opcode.MESSAGE]
-    begins, size = np.array(found, np.int64), _MESSAGE_HEADS.itemsize
-    within = begins[:, np.newaxis] + np.arange(size)
-    heads = np.frombuffer(data, np.uint8).take(within, mode="clip").view(_MESSAGE_HEADS)[:, 0]
-    if (heads["length"] < size - _RECORD_HEAD.size).any():
-        raise ValueError(f"a message of the chunk at byte {place} is shorter than its header")
-    topics, times = numbers[heads["channel"]], heads["log_time"]
-    rows = np.flatnonzero((topics != _NOT_WANTED) & (times >= start_ns) & (times <= end_ns))
-    begins = begins[rows]
-    ends = begins + _RECORD_HEAD.size + heads["length"][rows].astype(np.int64)
-    spans = zip((begins + size).tolist(), ends.tolist(), strict=True)
-    return topics[rows], times[rows], [data[a:b] for a, b in spans]
+def _messages_in(data: bytes, place: int, topic_of: Mapping[int, str]) -> Iterator[Message]:
+    """Yield the messages in the chunk at ``place`` whose channels have topics, in record order."""
+    for begin, end in records_in_chunk(data, place):
+        if data[begin] == Opcode.MESSAGE:
+            if end - begin < _MESSAGE_HEAD.size:
+                raise ValueError(
+                    f"a message of the chunk at byte {place} is shorter than its header"
+                )
+            _, _, channel, _, time_ns, _ = _MESSAGE_HEAD.unpack_from(data, begin)
+            if channel in topic_of:
+                yield topic_of[channel], time_ns, data[begin + _MESSAGE_HEAD.size : end]

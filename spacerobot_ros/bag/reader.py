@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
+from itertools import chain
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, overload
 
@@ -278,12 +279,7 @@ class Bag(Mapping[str, TopicSeries]):
         ------
         Topic, log time in nanoseconds, serialised message.
         """
-        blocks = blocks_in_time_order(self._files, topics, start_ns, end_ns)
-        for numbers, log_times, messages in blocks:
-            for number, time_ns, data in zip(
-                numbers.tolist(), log_times.tolist(), messages, strict=True
-            ):
-                yield topics[number], time_ns, data
+        return chain.from_iterable(blocks_in_time_order(self._files, topics, start_ns, end_ns))
 
     def qos(self, topic: str) -> list[QosProfile]:
         """Return the recorded QoS of a topic's publishers."""
@@ -441,21 +437,15 @@ class Bag(Mapping[str, TopicSeries]):
             ) from error
 
     def _read_together(self, types: Mapping[str, MessageType]) -> None:
-        topics = list(types)
-        times: list[list[NDArray[np.uint64]]] = [[np.zeros(0, np.uint64)] for _ in topics]
-        data: list[list[bytes]] = [[] for _ in topics]
-        for numbers, log_times, messages in blocks_in_time_order(self._files, topics):
-            for number in range(len(topics)):
-                rows = np.flatnonzero(numbers == number)
-                times[number].append(log_times[rows])
-                data[number] += [messages[row] for row in rows.tolist()]
-        for number, (topic, kind) in enumerate(types.items()):
+        times: dict[str, list[int]] = {topic: [] for topic in types}
+        messages: dict[str, list[bytes]] = {topic: [] for topic in types}
+        for topic, time_ns, data in self.raw_messages(list(types)):
+            times[topic].append(time_ns)
+            messages[topic].append(data)
+        for topic, kind in types.items():
+            time = np.array(times[topic], np.int64)
             self._series_by_topic[topic] = TopicSeries(
-                topic,
-                kind,
-                np.concatenate(times[number]).astype(np.int64),
-                data[number],
-                self._max_decoded_bytes,
+                topic, kind, time, messages[topic], self._max_decoded_bytes
             )
 
 
