@@ -104,15 +104,13 @@ method, but no plan depends on another plan."""
 def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
     """Return the gait method of a planner; an equal planner reuses the last flight's method."""
     global _last_planner_method
-    if _last_planner_method is not None and _last_planner_method[0] is robot:
-        known, method = _last_planner_method[1:]
-        if known is config or known == config:
-            return method
-    times = config.control_period, config.integration_step
-    clearance = Clearance.wanted(robot.description, config.clearance)
-    method = build_method(config.method, robot, *times, config.method_options, clearance)
-    _last_planner_method = robot, config, method
-    return method
+    last = _last_planner_method
+    if last is None or last[0] is not robot or last[1] != config:
+        times = config.control_period, config.integration_step
+        clearance = Clearance.wanted(robot.description, config.clearance)
+        method = build_method(config.method, robot, *times, config.method_options, clearance)
+        last = _last_planner_method = robot, config, method
+    return last[2]
 
 
 def plant_robot(flight: DrawnFlight) -> SpaceRobot:

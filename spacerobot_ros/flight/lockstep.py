@@ -385,16 +385,11 @@ class LockstepFlight:
             commander.take_joints(now, state)
             period_ns = commander.config.diagnostics_period * SECOND
             if period_ns and now - self._diagnosed_ns.get(name, 0) >= period_ns:
-                self._report_commander(name, now)
-
-    def _report_commander(self, name: str, now: int) -> None:
-        """Report how a commander answers states; it misses no state."""
-        robot = self._commanders[name].robot
-        assert robot is not None
-        last, ignored = self._statuses.get(name), {"ignored": 0}
-        records = state_diagnostics(f"/{name}", robot.description.name, ignored, last)
-        self.log.diagnostics.append((now, tuple(records)))
-        self._diagnosed_ns[name] = now
+                assert commander.robot is not None
+                robot, last = commander.robot.description.name, self._statuses.get(name)
+                records = state_diagnostics(f"/{name}", robot, {"ignored": 0}, last)
+                self.log.diagnostics.append((now, tuple(records)))
+                self._diagnosed_ns[name] = now
 
     def _send_setpoint(self, stamp_ns: int) -> None:
         """Offer the setpoint of a planner that commands the joints itself."""

@@ -117,12 +117,12 @@ def animation(flight: FlightData, seconds: float, frames: int) -> Animation:
     if not (isinstance(seconds, int | float) and 0 < seconds < math.inf):
         raise ParameterError(f"An animation must last more than 0 s, not {seconds!r}.")
     rows = np.unique(np.linspace(0, len(flight.time) - 1, frames).round().astype(int))
-    skeleton = _Skeleton(flight.required_robot())
-    shapes = skeleton.points(flight.pose[rows], flight.q[rows])
+    robot = flight.required_robot()
+    shapes, links = _skeleton(robot, flight.pose[rows], flight.q[rows])
     ghost = np.zeros((0, 3))
     if flight.goal is not None and flight.goal.base:
         goal = np.concatenate([flight.goal.position, flight.goal.quaternion])
-        ghost = skeleton.points(goal[None], flight.q[-1:])[0]
+        ghost = _skeleton(robot, goal[None], flight.q[-1:])[0][0]
     made = Figure(figsize=(5.6, 5.0), dpi=72)
     FigureCanvasAgg(made)
     axes = made.add_subplot(projection="3d")
@@ -131,15 +131,15 @@ def animation(flight: FlightData, seconds: float, frames: int) -> Animation:
     half = max(float(np.ptp(everything, axis=0).max()) / 2, 0.1)
     for name, at in zip("xyz", middle, strict=True):
         axes.set(**{f"{name}lim": (at - half, at + half), f"{name}label": f"{name}, m"})
-    for a, b in skeleton.links if len(ghost) else ():
+    for a, b in links if len(ghost) else ():
         axes.plot(*ghost[[a, b]].T, color=_GOAL_COLOUR, alpha=0.35, linewidth=3)
     axes.plot(*flight.pose[:, :3].T, color="#8a919c", linewidth=0.8)
-    lines = [axes.plot([], [], [], color=_ROBOT_COLOUR, linewidth=2.5)[0] for _ in skeleton.links]
+    lines = [axes.plot([], [], [], color=_ROBOT_COLOUR, linewidth=2.5)[0] for _ in links]
     (dots,) = axes.plot([], [], [], "o", color=_COLOURS[0], markersize=4)
 
     def draw(k: int) -> list[Any]:
         points = shapes[k]
-        for line, (a, b) in zip(lines, skeleton.links, strict=True):
+        for line, (a, b) in zip(lines, links, strict=True):
             line.set_data_3d(*points[[a, b]].T)
         dots.set_data_3d(*points.T)
         axes.set_title(f"{flight.time[rows[k]]:.2f} s", fontsize=10)
@@ -171,21 +171,16 @@ def _without_remote_icons(html: str) -> str:
     )
 
 
-class _Skeleton:
-    """The links of a robot as points: the origins of their frames, and their centres of mass."""
-
-    def __init__(self, robot: RobotDescription) -> None:
-        self._kinematics = ForwardKinematics(robot)
-        coms = {link.name: link.inertia.com for link in robot.links}
-        names, count = self._kinematics.links, len(self._kinematics.links)
-        self._com = np.array([coms[name] for name in names])
-        # From a link's frame to its centre of mass, and from its parent's centre of mass to it.
-        self.links = [(i, count + i) for i in range(count)]
-        self.links += [(count + names.index(j.parent), names.index(j.child)) for j in robot.joints]
-
-    def points(self, poses: Array, q: Array) -> Array:
-        """Return the points (K, 2 L, 3) in the world, m: the origins of the frames, then the
-        centres of mass."""
-        R_WL, r_WL = self._kinematics.poses_in_world(poses, q)
-        centers = r_WL + np.einsum("klij,lj->kli", R_WL, self._com)
-        return np.concatenate([r_WL, centers], axis=1)
+def _skeleton(
+    robot: RobotDescription, poses: Array, q: Array
+) -> tuple[Array, list[tuple[int, int]]]:
+    """Return the origins of the link frames, then the centres of mass, (K, 2 L, 3) in the world,
+    m, and the pairs that the drawn links connect."""
+    kinematics, coms = ForwardKinematics(robot), {x.name: x.inertia.com for x in robot.links}
+    names, count = kinematics.links, len(kinematics.links)
+    # From a link's frame to its centre of mass, and from its parent's centre of mass to it.
+    links = [(i, count + i) for i in range(count)]
+    links += [(count + names.index(j.parent), names.index(j.child)) for j in robot.joints]
+    R_WL, r_WL = kinematics.poses_in_world(poses, q)
+    centers = r_WL + np.einsum("klij,lj->kli", R_WL, np.array([coms[name] for name in names]))
+    return np.concatenate([r_WL, centers], axis=1), links

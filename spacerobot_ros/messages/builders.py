@@ -328,7 +328,9 @@ _LINE_WIDTH, _LINE_COLOR = 0.005, (0.95, 0.6, 0.1, 1.0)
 """Width (m) and color of path lines."""
 
 
-_NO_TURN = {"orientation": {"w": 1.0}}
+def _marker(frame: str, namespace: str, number: int, **fields: Any) -> dict[str, Any]:
+    own = {"header": {"frame_id": frame}, "ns": namespace, "id": number}
+    return {**own, "pose": {"orientation": {"w": 1.0}}, **fields}
 
 
 def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> dict[str, Any]:
@@ -344,35 +346,23 @@ def shape_marker(shape: Shape, frame: str, namespace: str, number: int) -> dict[
         size, mesh = (1.0, 1.0, 1.0), solid_mesh(replace(shape, pose=Pose()))
         corners = mesh.vertices[mesh.faces].reshape(-1, 3).tolist()
         points = [dict(zip("xyz", corner, strict=True)) for corner in corners]
-    return {
-        "header": {"frame_id": frame},
-        "ns": namespace,
-        "id": number,
-        "type": _TYPES[shape.kind],
-        "pose": _NO_TURN,
-        "scale": dict(zip("xyz", size, strict=True)),
-        "color": dict(zip("rgba", shape.rgba, strict=True)),
-        "points": points,
-        "mesh_resource": shape.resource,
-    }
-
-
-def _erased(namespace: str, number: int) -> dict[str, Any]:
-    return {"ns": namespace, "id": number, "action": _DELETE, "pose": _NO_TURN}
+    return _marker(
+        frame,
+        namespace,
+        number,
+        type=_TYPES[shape.kind],
+        scale=dict(zip("xyz", size, strict=True)),
+        color=dict(zip("rgba", shape.rgba, strict=True)),
+        points=points,
+        mesh_resource=shape.resource,
+    )
 
 
 def _line(namespace: str, number: int, places: Array, frame: str) -> dict[str, Any]:
     """Return the marker fields of a line through points (K, 3)."""
-    return {
-        "header": {"frame_id": frame},
-        "ns": namespace,
-        "id": number,
-        "type": _LINE_STRIP,
-        "pose": _NO_TURN,
-        "scale": {"x": _LINE_WIDTH},
-        "color": dict(zip("rgba", _LINE_COLOR, strict=True)),
-        "points": [dict(zip("xyz", place, strict=True)) for place in places.tolist()],
-    }
+    points = [dict(zip("xyz", place, strict=True)) for place in places.tolist()]
+    look = {"scale": {"x": _LINE_WIDTH}, "color": dict(zip("rgba", _LINE_COLOR, strict=True))}
+    return _marker(frame, namespace, number, type=_LINE_STRIP, points=points, **look)
 
 
 def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str) -> bytes:
@@ -397,7 +387,7 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
     if given:
         markers.append(_line("given_path", 0, given[0][:, :3], frame))
     else:  # The path of an earlier goal is deleted.
-        markers.append(_erased("given_path", 0))
+        markers.append(_marker("", "given_path", 0, action=_DELETE))
     return encode(MARKER_ARRAY, {"markers": markers})
 
 
@@ -441,7 +431,7 @@ class RobotMarkers:
                 at = world.frames[link.name][1] @ shape.pose
                 markers.append({**marker, "pose": _pose_fields(at.r, quaternion_from_matrix(at.R))})
         present = {(marker["ns"], marker["id"]) for marker in markers}
-        markers += [_erased(*each) for each in sorted(self._drawn - present)]
+        markers += [_marker("", *each, action=_DELETE) for each in sorted(self._drawn - present)]
         self._drawn |= present
         self.draws_anything = bool(markers)
         """Whether there are any markers; the robot, the target and the obstacles may all lack

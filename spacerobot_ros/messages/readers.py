@@ -146,7 +146,7 @@ class TemplateReader:
         """The accepted message."""
         # Matches no message.
         self._fixed_spans: list[tuple[slice, bytes]] = [(slice(0, 2), b"")]
-        self._layout: Layout | None = None
+        self._layout: Layout
 
     def accept(self, raw: bytes) -> bool:
         """Use ``raw`` as the current message; return whether its layout or strings have changed.
@@ -179,25 +179,20 @@ class TemplateReader:
     def floats(self, path: str, count: int | None = None) -> Array:
         """Return a read-only view of the ``count`` float64 values beginning at ``path``; by default
         those of the array at ``path``, which must not be empty."""
-        assert self._layout is not None
-        leaf = self._layout.leaves[path]
-        number = leaf.shape[0] if count is None else count
-        return np.frombuffer(self.raw, np.float64, number, leaf.offset)
+        number = self.value_count(path) if count is None else count
+        return np.frombuffer(self.raw, np.float64, number, self._layout.leaves[path].offset)
 
     def value_count(self, path: str) -> int:
         """Return the number of values of the array at ``path`` in messages with this layout."""
-        assert self._layout is not None
         return self._layout.leaves[path].shape[0]
 
     def text(self, path: str) -> str:
         """Return a string in messages with this layout."""
-        assert self._layout is not None
         leaf = self._layout.leaves[path]
         return self.raw[leaf.offset : leaf.offset + leaf.size].decode(errors="replace")
 
     def texts(self, path: str) -> list[str]:
         """Return a list of strings in messages with this layout."""
-        assert self._layout is not None
         return [self.text(f"{path}[{i}]") for i in range(self._layout.counts[path])]
 
     @property

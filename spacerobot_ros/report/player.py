@@ -255,7 +255,7 @@ def _set_object(path: str, points: Array, material: Command, kind: str, index: A
 
 def _lines(path: str, points: Array, color: str, opacity: float = 1.0) -> Command:
     """Draw a line through points (k, 3), or separate segments with ends (k, 2, 3)."""
-    look = {"type": "LineBasicMaterial", "color": _color_number(color), **_see_through(opacity)}
+    look = {"type": "LineBasicMaterial", "color": int(color[1:], 16), **_see_through(opacity)}
     kind = "Line" if points.ndim == 2 else "LineSegments"
     return _set_object(path, points.reshape(-1, 3), look, kind)
 
@@ -273,7 +273,7 @@ def _solid(path: str, visual: Visual, color: str, opacity: float = 1.0) -> list[
     ghost = opacity < 1.0
     # Keep edges and ghosts visible on the surface of a solid.
     offset = {"polygonOffset": True, "polygonOffsetFactor": -1 if ghost else 1}
-    look = {"type": "MeshPhongMaterial", "color": _color_number(color), "shininess": 15}
+    look = {"type": "MeshPhongMaterial", "color": int(color[1:], 16), "shininess": 15}
     # Both sides are drawn, because mesh files differ in which side is the outside.
     look |= {"flatShading": True, "side": 2, **offset, "polygonOffsetUnits": -1 if ghost else 1}
     look |= _see_through(opacity) | ({"depthWrite": False} if ghost else {})
@@ -302,10 +302,6 @@ def _clip(path: str, time: Array, poses: Array) -> Command:
 
 def _rounded(values: Array) -> list[float]:
     return np.round(values.ravel(), 5).tolist()
-
-
-def _color_number(color: str) -> int:
-    return int(color[1:], 16)
 
 
 # -- the view of a flight -----------------------------------------------------------------------

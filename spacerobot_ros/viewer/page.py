@@ -739,7 +739,9 @@ class Page:
                 self.faults.show_menu(visible=not replays)
             if self._drawing is not None and state.measured is not None:
                 self._take(state, state.measured)
-            shown = self._shown(state)
+            # The current state, or the earlier one that a user looks back at.
+            at = self._look_back.time_s
+            shown = state if at is None or self._past.span is None else self._past.at(at)
             if self._drawing is not None and shown.measured is not None:
                 self._draw_robot(shown, shown.measured)
             if self._target_drawing is not None and shown.target is not None:
@@ -757,11 +759,6 @@ class Page:
                 self._plots.draw(self.tolerance, self._look_back.time_s)
         actions, self._actions = self._actions, []
         return actions
-
-    def _shown(self, state: StackState) -> StackState:
-        """Return the current state, or the earlier state that a user looks back at."""
-        at = self._look_back.time_s
-        return state if at is None or self._past.span is None else self._past.at(at)
 
     def _take(self, state: StackState, measured: Measured) -> None:
         """Add a new state to plots, paths and history, and inform the editor about goals."""
