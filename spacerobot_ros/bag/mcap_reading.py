@@ -379,7 +379,7 @@ def _read_summary(path: Path, file: BinaryIO) -> tuple[Summary, Statistics]:
                 break
     if summary.statistics is None:
         raise RecordingError(
-            f"The bag {path} has no summary: 'spacerobot salvage {shlex.quote(str(path))}'  "
+            f"The bag {path} has no summary: 'spacerobot salvage {shlex.quote(str(path))}' "
             "creates one."
         )
     return summary, summary.statistics

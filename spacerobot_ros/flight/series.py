@@ -13,6 +13,7 @@ import numpy.typing as npt
 from spacerobot_ros.commanding.goal_follower import Status
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.rotations import rotvecs_from_quaternions
 from spacerobot_ros.planning import Goal, PoseError
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
 from spacerobot_ros.planning.execution.status import PlannerStatus
@@ -126,6 +127,30 @@ class SentGoal:
     time: float
     goal: Goal
     goal_id: str
+
+
+def rotvecs(quaternions: Array) -> Array:
+    """Return attitudes (N, 4) as rotation vectors (N, 3), continuous beyond half revolutions.
+
+    The first vector has a length of at most pi; each later vector is the equivalent vector nearest
+    to the previous vector.
+    """
+    wrapped = rotvecs_from_quaternions(quaternions)
+    lengths = np.linalg.norm(wrapped, axis=1)
+    # The axis flips at half revolutions and at zero, where the angle about it changes sign.
+    turned_over = np.einsum("ij,ij->i", wrapped[1:], wrapped[:-1]) < 0
+    signs = np.append(1, np.cumprod(1 - 2 * turned_over))[: len(wrapped)]
+    added = signs * np.unwrap(signs * lengths) - lengths
+    return wrapped + added[:, np.newaxis] * wrapped / np.maximum(lengths, 1e-12)[:, np.newaxis]
+
+
+def nearest_rotvec(rotvec: Array, near: Array) -> Array:
+    """Return the rotation vector (3,) of the same attitude that is nearest to ``near`` (3,)."""
+    length = float(np.linalg.norm(rotvec))
+    if length < 1e-12:
+        return rotvec
+    turns = round((float(near @ rotvec) / length - length) / (2 * np.pi))
+    return rotvec * (1 + 2 * np.pi * turns / length)
 
 
 def pose_error(poses: Signal, goal: Goal | None) -> PoseError | None:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.files import write_output
 from spacerobot_ros.flight.data import FlightData
+from spacerobot_ros.flight.series import nearest_rotvec, rotvecs
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import rotvec_from_quaternion
@@ -73,10 +74,10 @@ def figure(flight: FlightData) -> Picture:
     FigureCanvasAgg(made)
     panels = made.subplots(rows, 1, sharex=True)
     time, goal = flight.time, flight.goal
-    attitude = np.unwrap([rotvec_from_quaternion(o) for o in flight.pose[:, 3:]], axis=0)
-    place = target = None
+    attitude, place, target = rotvecs(flight.pose[:, 3:]), None, None
     if goal is not None and goal.base:
-        place, target = goal.position, rotvec_from_quaternion(goal.quaternion)
+        place = goal.position
+        target = nearest_rotvec(rotvec_from_quaternion(goal.quaternion), attitude[-1])
     _plot_lines(panels[0], time, flight.pose[:, :3], "xyz", "position, m", place)
     _plot_lines(panels[1], time, attitude, "xyz", "rotation vector, rad", target)
     names = flight.joint_names

@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Wedge
 
 from spacerobot_ros.errors import shortened
-from spacerobot_ros.flight.series import Signal
+from spacerobot_ros.flight.series import Signal, nearest_rotvec, rotvecs
 from spacerobot_ros.flight.trials import PlanEvaluation, PlanningProblem
 from spacerobot_ros.model.description import Array, JointKind
-from spacerobot_ros.model.rotations import rotvec_from_quaternion, rotvecs_from_quaternions
+from spacerobot_ros.model.rotations import rotvec_from_quaternion
 from spacerobot_ros.planning.analysis import Analysis, Workspaces
 from spacerobot_ros.planning.core.controllability import curvature_matrices, curvatures
 from spacerobot_ros.planning.methods.nominal_shape import JOINT_PLANES
@@ -309,10 +309,11 @@ def _plan_figure(problem: PlanningProblem, trial: PlanEvaluation) -> Figure:
         TraceGroup(Signal(ticks, trial.positions), names, "joints", ", ".join(units)),
         TraceGroup(held, names, "held velocities", speeds),
     ]
-    turned, wanted = rotvecs_from_quaternions(path.quaternion), rotvec_from_quaternion
+    turned = rotvecs(path.quaternion)
+    wanted = nearest_rotvec(rotvec_from_quaternion(goal.quaternion), turned[-1])
     for part, label, unit, values, aim in (
         ("position", "base position", "m", path.position, goal.position),
-        ("attitude", "rotation vector", "rad", turned, wanted(goal.quaternion)),
+        ("attitude", "rotation vector", "rad", turned, wanted),
     ):
         goals = [(0.0, float(path.time[-1]), k, x) for k, x in enumerate(aim) if part in goal.base]
         signal = Signal(path.time, values)

@@ -195,13 +195,17 @@ def test_a_figure_has_a_panel_for_each_quantity(name: str, pushed: bool) -> None
 
 
 def test_attitudes_are_drawn_without_jumps_and_a_flight_without_a_goal_without_levels() -> None:
-    turns = Rotation.from_rotvec(np.outer([2.9, 3.1, 3.3], [0.0, 0.0, 1.0])).as_quat()
+    vectors = np.outer([2.9, 3.1, 3.3], [0.6, 0.0, -0.8])
+    turns = Rotation.from_rotvec(vectors).as_quat()
     poses = Signal(FLIGHT.time, np.hstack([FLIGHT.pose[:, :3], turns]))
-    panels = (
-        made_flight(goal=None, series={**FLIGHT.series, "pose": poses}, commands={}).plot().axes
-    )
-    assert panels[1].get_lines()[2].get_ydata() == pytest.approx([2.9, 3.1, 3.3])
-    assert len(panels[0].get_lines()) == 3
+    for goal in (None, Goal.checked(GOAL.position, turns[2])):
+        flight = made_flight(goal=goal, series={**FLIGHT.series, "pose": poses}, commands={})
+        lines = [line.get_ydata() for line in flight.plot().axes[1].get_lines()]
+        drawn = [line for line in lines if len(line) == 3]
+        np.testing.assert_allclose(np.transpose(drawn), vectors, atol=1e-12)
+        # The goal is where the attitude ends.
+        levels = [line[0] for line in lines if len(line) == 2]
+        assert levels == pytest.approx([] if goal is None else vectors[2])
 
 
 class Film:

@@ -21,7 +21,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.collision.distances import obstacle_visuals
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.flight.series import SentGoal, Signal, goal_at_end, reported_goal
+from spacerobot_ros.flight.series import SentGoal, Signal, goal_at_end, reported_goal, rotvecs
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
@@ -36,7 +36,7 @@ from spacerobot_ros.report.figures_space import (
     loops_figure,
     path_figure,
 )
-from spacerobot_ros.report.flight import Cycles, FlightReport, find_cycles, read_report, rotvecs
+from spacerobot_ros.report.flight import Cycles, FlightReport, find_cycles, read_report
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.player import WORLD, view_of_flight
 from spacerobot_ros.report.scene import (
