@@ -9,6 +9,7 @@ works in place.
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -72,7 +73,7 @@ class SpaceRobot:
         else:
             self._build = build
             self._model, self._p = build.model(self.inertial)
-        self._buffers: dict[str, BufferedFunction] = {}
+        self._buffers: dict[tuple[str, int], BufferedFunction] = {}
         self._compiles = True
         self._require_positive_inertia()
 
@@ -392,9 +393,10 @@ class SpaceRobot:
     # -- helpers ------------------------------------------------------------------------------
 
     def _call_function(self, name: str, *arguments: npt.ArrayLike) -> tuple[Array, ...]:
-        if name not in self._buffers:
-            self._buffers[name] = self.buffered(name)
-        return self._buffers[name](*(np.asarray(a, dtype=float) for a in arguments))
+        key = name, threading.get_ident()  # Buffers are overwritten by the next call.
+        if key not in self._buffers:
+            self._buffers[key] = self.buffered(name)
+        return self._buffers[key](*(np.asarray(a, dtype=float) for a in arguments))
 
     def _require_positive_inertia(self) -> None:
         """Reject a robot whose inertia matrix is singular; the message names the joint or link."""

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import casadi as ca
@@ -256,6 +257,21 @@ def test_equal_robots_share_functions_and_others_do_not(monkeypatch: pytest.Monk
     assert not other.inputs[0].any()
     monkeypatch.setenv("SPACEROBOT_COMPILE", "1")
     assert again.function("velocity_step:2") is not step
+
+
+def test_a_model_answers_several_threads() -> None:
+    """Each thread has its own memory for arguments and results."""
+    robot = SpaceRobot.from_file(robot_file("surveyor"))
+    shapes = np.random.default_rng(1).uniform(-1.0, 1.0, (500, robot.n))
+    alone = [robot.inertia_matrix(q) for q in shapes]
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(8) as threads:
+            together = [*threads.map(robot.inertia_matrix, [*shapes] * 10)]
+    finally:
+        sys.setswitchinterval(before)
+    np.testing.assert_array_equal(together, alone * 10)
 
 
 def test_a_long_wait_is_announced_once_in_a_process(tmp_path: Path) -> None:
