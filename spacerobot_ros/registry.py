@@ -18,6 +18,7 @@ import os
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import fields
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -70,8 +71,9 @@ class Registry(dict[str, type[T]]):
         Raises
         ------
         ParameterError
-            The class is not derived from the base class, lacks an abstract member or a name, or
-            its name is already used by the package or by a class in another file.
+            The class is not derived from the base class, lacks an abstract member or a name, its
+            ``Options`` have no defaults, or its name is already used by the package or by a class
+            in another file.
         """
         name = self._usable_name(entry)
         self[name] = entry
@@ -127,6 +129,13 @@ class Registry(dict[str, type[T]]):
             raise ParameterError(
                 f"{named} needs a name of letters, digits and underscores: name = 'my_name'."
             )
+        if (options := getattr(entry, "Options", None)) is not None:
+            try:
+                fields(options())
+            except TypeError as error:
+                raise ParameterError(
+                    f"{named} needs Options that are a dataclass with defaults: {error}."
+                ) from error
         if name in self._own and self.get(name) is not entry:
             raise ParameterError(
                 f"{named} has the same name as the package's own '{name}': choose another name."

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,8 @@ from spacerobot_ros.control import ControlState, Reference
 from spacerobot_ros.control.laws.numpy_law import NumpyLaw
 from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
-from spacerobot_ros.errors import ParameterError, SpaceRobotError
+from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError
+from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.registry import PLUGINS_VARIABLE, add_plugin
 
@@ -146,12 +148,29 @@ class _Clash(TransposedJacobianLaw):
     pass
 
 
+class _Mapped(TransposedJacobianLaw):
+    name = "mapped"
+    Options = dict
+
+
+@dataclass(frozen=True)
+class _OptionsWithoutDefault:
+    reach: float
+
+
+class _Open(TransposedJacobianLaw):
+    name = "open"
+    Options = _OptionsWithoutDefault
+
+
 @pytest.mark.parametrize(
     ("entry", "sentence"),
     [
         (_Plain, "The control law '_Plain' lacks compute."),
         (_Unnamed, "needs a name of letters, digits and underscores"),
         (_Clash, "has the same name as the package's own 'transposed_jacobian'"),
+        (_Mapped, "'_Mapped' needs Options that are a dataclass with defaults"),
+        (_Open, "'_Open' needs Options that are a dataclass with defaults: .*'reach'"),
         (METHODS["optimal"], "'OptimalGait' is not a class derived from ControlLaw."),
         ("lqr", "'lqr' is not a class derived from ControlLaw."),
     ],
@@ -266,6 +285,24 @@ def test_a_plugin_adds_what_it_defines_and_not_what_it_imports(tmp_path: Path) -
         str(EXAMPLES / "lqr_law.py"),
         str(EXAMPLES / "own_gait_method.py"),
     ]
+
+
+@pytest.mark.usefixtures("plugins")
+@pytest.mark.parametrize(
+    ("member", "sentence"),
+    [
+        ({"controls": frozenset({"shpae"})}, "controls 'shpae', but goals have only position"),
+        ({"plan": lambda *given: None}, "The method 'mine' returned no GaitSchedule"),
+    ],
+)
+def test_a_method_whose_plan_cannot_be_judged_flies_no_goal(
+    member: dict[str, Any], sentence: str
+) -> None:
+    add_plugin(EXAMPLES / "own_gait_method.py")
+    METHODS.register(type("Mine", (METHODS["stow"],), {"name": "mine", **member}))
+    goal = Goal(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.1, -0.2, 0.3]))
+    with pytest.raises(PlanningError, match=sentence):
+        fly("three_joint_arm", goal, method="mine")
 
 
 _METRIC = """

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import get_args
 
 import casadi as ca
 import numpy as np
@@ -96,6 +97,14 @@ class GaitSchedule:
     controls: frozenset[Controlled] = POSE
     progress: object = None
     end_velocities: Array | None = None
+
+    def __post_init__(self) -> None:
+        # Only known components are evaluated: with a misspelt one alone, any goal would be reached.
+        if unknown := ", ".join(sorted(set(self.controls) - set(get_args(Controlled)))):
+            known = ", ".join(get_args(Controlled))
+            raise PlanningError(
+                f"The method '{self.method}' controls '{unknown}', but goals have only {known}."
+            )
 
     def __repr__(self) -> str:
         error = PoseError.between(self.path.position[-1], self.path.quaternion[-1], self.goal)

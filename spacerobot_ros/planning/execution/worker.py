@@ -282,7 +282,10 @@ class PlanningWorker:
         PlanningError
             No plan was found; the message says why.
         """
-        schedule = self._make_schedule(task, self._choose_method(task), cancellation)
+        method = self._choose_method(task)
+        schedule = self._make_schedule(task, method, cancellation)
+        if not isinstance(schedule, GaitSchedule):
+            raise PlanningError(f"The method '{method.name}' returned no GaitSchedule.")
         replans = self._config.replanning > 0 and self._config.takeover_time > 0
         if replans and self.starts_in_motion(schedule):
             # These derivatives take longer than a tick: in flight, the first command would be late.
