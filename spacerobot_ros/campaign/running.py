@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -14,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.campaign.config import FLIGHTS, Campaign, parse_campaign, scenario_of_section
@@ -289,7 +291,7 @@ def sweep(
     parameters: Mapping[str, Any] | None = None,
     seed: int = 0,
     flights: int = 100,
-    folder: Path | None = None,
+    folder: str | os.PathLike[str] | None = None,
     **section: Any,
 ) -> Any:
     """Fly a small campaign, and return one row per flight.
@@ -329,9 +331,17 @@ def sweep(
     if parameters is not None:
         section["set"] = {**parameters, **section.get("set", {})}
     scenario = scenario_of_section(scenario, section)
-    given = {**section, "disperse": dict(disperse), "flights": flights, "seed": seed}
+    given = _plain({**section, "disperse": disperse, "flights": flights, "seed": seed})
     campaign = parse_campaign(scenario.name, given, scenario=scenario)
     with TemporaryDirectory() as left_nowhere:
-        kept = Path(left_nowhere) / "sweep" if folder is None else folder
+        kept = Path(left_nowhere) / "sweep" if folder is None else Path(folder)
         run_campaign(campaign, kept)
         return Dataset(kept).table()
+
+
+def _plain(value: Any) -> Any:
+    """Return a campaign section with the types that a file has, instead of those of numpy."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    value = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    return [*map(_plain, value)] if isinstance(value, (list, tuple)) else value

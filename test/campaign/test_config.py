@@ -385,7 +385,7 @@ def test_a_sweep_is_a_campaign(run: list[tuple[Any, Path]], tmp_path: Path) -> N
         parameters={"planner.position_tolerance": 0.0125},
         seed=5,
         flights=7,
-        folder=tmp_path / "kept",
+        folder=str(tmp_path / "kept"),
         sampler="sobol",
         criteria={"position_error_m": {"max": 0.02}},
     )
@@ -425,6 +425,19 @@ def test_a_robot_without_a_goal_and_an_unknown_key_are_refused() -> None:
         sweep("surveyor", NOISE)
     with pytest.raises(ParameterError, match="there is no key 'flight'"):
         sweep("sliding_masses", NOISE, flight=3)
+
+
+def test_a_sweep_takes_numbers_of_numpy(run: list[tuple[Any, Path]]) -> None:
+    """They can be stored in a file, as numbers."""
+    ends, mean = np.array([0.001, 0.002]), {"loc": np.float64(1.0), "scale": np.float32(0.25)}
+    drawn = {"plant.sensors.position_noise": {"uniform": ends}, "mass": {"norm": mean}}
+    counts: dict[str, Any] = {"seed": np.int64(5), "flights": np.int32(7)}
+    sweep("sliding_masses", drawn, **counts)
+    ((campaign, _),) = run
+    assert (campaign.flights, campaign.seed) == (7, 5)
+    kept = yaml.safe_load(yaml.safe_dump(campaign.section["disperse"]))
+    assert kept["mass"] == {"norm": {"loc": 1.0, "scale": 0.25}}
+    assert kept["plant.sensors.position_noise"] == {"uniform": [0.001, 0.002]}
 
 
 @pytest.mark.slow
