@@ -204,7 +204,9 @@ class BatchController:
         )
         results = dict(zip(names, values, strict=True))
         omega, q, qdot = measured[10:13], measured[13 : 13 + n], measured[13 + n :]
-        actuation, lowered = self.controller.limits_expression(omega, q, qdot, results["actuation"])
+        joint_rates = self.controller.joint_rate_limits
+        actuation = self.controller.limits.expression(results["actuation"])
+        lowered = joint_rates.exceeds_limits_expression(omega, q, qdot, actuation)
         exact = ca.logic_or(lowered, ca.logic_not(law.is_complete(results)))
         largest = dict.fromkeys(OutputDistance._fields, ca.SX(0))
         for kind, places in law.outputs.selection.distances:
@@ -212,8 +214,7 @@ class BatchController:
         error_share, rate_share = ca.SX(0), ca.SX(0)
         for error, bound in zip(ca.vertsplit(results["error"]), ca.vertsplit(bounds), strict=True):
             error_share = ca.fmax(error_share, ca.fabs(error) / bound)
-        limits = self.controller.joint_rate_limits.rates
-        for rate, limit in zip(ca.vertsplit(qdot), limits, strict=True):
+        for rate, limit in zip(ca.vertsplit(qdot), joint_rates.rates, strict=True):
             rate_share = ca.fmax(rate_share, ca.fabs(rate) * (1.0 / limit))
         monitor = GoalMonitor(0.0, *ca.vertsplit(memory))
         verdict = monitor.decide(

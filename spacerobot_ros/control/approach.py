@@ -14,9 +14,9 @@ limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import accumulate, product, takewhile
+from operator import mul
 
 import numpy as np
 
@@ -43,9 +43,9 @@ _COARSE_STRIDE = 8
 
 _START_PERIOD = 1.0  # s
 
-_SHORTEST_PATH, _PATH_RATIO, _LONGEST_PATH = 4.0, 1.4, 60.0
-"""Shortest duration of a path to the standoff, s, ratio of successive trial durations, and longest
-duration, s."""
+_LONGEST_PATH = 60.0
+_PATH_DURATIONS = tuple(takewhile(_LONGEST_PATH.__gt__, accumulate([4.0] + [1.4] * 9, mul)))
+"""Trial durations of a path to the standoff, s, in a constant ratio."""
 
 _CLOSING_SHARE = 0.5
 """Fraction of the acceleration limit used for closing in; the motion of the grapple frame needs the
@@ -251,7 +251,13 @@ def plan_approach(
     moving = bool(held.velocity.any() or held.angular_velocity.any())
     starts = np.arange(0.0, 0.0 if moving else options.horizon, _START_PERIOD)
     standoffs = [factor * np.array(options.standoff) for factor in _STANDOFF_FACTORS]
-    ways = [(each, _closing_path(each, options, limits)) for each in standoffs]
+    # From a standoff to contact, at rest relative to the grapple frame at both.
+    limit = min(options.closing_speed, limits.speed), _CLOSING_SHARE * limits.acceleration
+    lasts = [quintic_duration(float(np.linalg.norm(each)), *limit) for each in standoffs]
+    ways = [
+        (each, RelativePath(RelativeMotionOverTime.at_rest(each), np.zeros(3), T))
+        for each, T in zip(standoffs, np.maximum(lasts, _SAMPLE_PERIOD).tolist(), strict=True)
+    ]
     ways.insert(0, ways[0])  # Short relative to the grapple frame; the others are short in W.
     at_rest, within = held.motion, f"within the next {options.horizon:g} s"
     # The greater of two refusal reasons belongs to the approach that got farther.
@@ -263,7 +269,7 @@ def plan_approach(
     for start in [0.0] if moving else starts.tolist():
         first = round(start / _SAMPLE_PERIOD)
         begin = RelativeMotionOverTime.between(grapple.rows(slice(first, first + 1)), at_rest)
-        for duration, (way, (standoff, closing)) in product(_outward_durations(), enumerate(ways)):
+        for duration, (way, (standoff, closing)) in product(_PATH_DURATIONS, enumerate(ways)):
             if not way:
                 in_the_way = False
             elif not in_the_way:
@@ -323,21 +329,6 @@ def plan_approach(
             if blocked == _MAX_BLOCKED_PATHS:
                 raise PlanningError(refused[2])
     raise PlanningError(refused[2])
-
-
-def _closing_path(standoff: Array, options: ApproachOptions, limits: MotionLimits) -> RelativePath:
-    """Return the path from a standoff to contact, at rest relative to the grapple frame at both."""
-    length, speed = float(np.linalg.norm(standoff)), min(options.closing_speed, limits.speed)
-    acceleration = _CLOSING_SHARE * limits.acceleration
-    duration = max(quintic_duration(length, speed, acceleration), _SAMPLE_PERIOD)
-    return RelativePath(RelativeMotionOverTime.at_rest(standoff), np.zeros(3), duration)
-
-
-def _outward_durations() -> Iterator[float]:
-    duration = _SHORTEST_PATH
-    while duration < _LONGEST_PATH:
-        yield duration
-        duration *= _PATH_RATIO
 
 
 def _largest_limit_share(

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from enum import Enum
 
-import casadi as ca
 import numpy as np
 from typing_extensions import Unpack
 
@@ -168,7 +167,8 @@ class CoordinatedController:
         carries the end-effector along and the arm keeps its shape. The error integral is reset. The
         reference follows the profile; it is not planned.
         """
-        self._begin_motion(time, state, self.motion_to(time, state, **aims))
+        start, goal, carries, _ = self.motion_to(time, state, **aims)
+        self.begin(time, self._profile(state, start, goal, carries=carries))
 
     def motion_to(self, time: float, state: ControlState, **aims: Unpack[Aims]) -> GoalMotion:
         """Return the motion from the reference at a given time to goals as in
@@ -264,10 +264,6 @@ class CoordinatedController:
         profile.duration *= math.sqrt(share)
         return profile
 
-    def _begin_motion(self, time: float, state: ControlState, motion: GoalMotion) -> None:
-        start, goal, carries, _ = motion
-        self.begin(time, self._profile(state, start, goal, carries=carries))
-
     @contextmanager
     def _failures_of_law(self, time: float) -> Iterator[None]:
         """Name the law in errors from its code, which may be user code and may even end Python."""
@@ -302,7 +298,7 @@ class CoordinatedController:
         profile, self.profile, self.coming_to_rest = self.profile, None, False
         start = self.reference_at(time, state)
         goal, carries = (start, True) if profile is None else (profile.goal, profile.carries)
-        self._begin_motion(time, state, GoalMotion(start, goal, carries))
+        self.begin(time, self._profile(state, start, goal, carries=carries))
 
     def hold_here(self, time: float, state: ControlState) -> None:
         """Hold the measured pose and shape; the previous reference is dropped."""
@@ -360,40 +356,44 @@ class CoordinatedController:
         NotFiniteError
             A measurement is not finite.
         """
-        state, around_B = self._known_state(measured, q, qdot), None
+        state, around_B, period = self._known_state(measured, q, qdot), None, self._control_period
         if state is None:
-            commanded = self._braking_command(q, qdot)
-        else:
-            if self.profile is None:
-                here = self.reference_at(time, state)
-                self.begin(time, StepReference(here, here, carries=True))
-            # The law is always evaluated, for its errors and status.
-            self.law.time = time
-            with self._failures_of_law(time):
-                commanded = self.law.command(state, self._followed_reference(time))
-            if not self.gains_checked:
-                self.gains_checked = True
-                if warning := self.law.sampling_warning():
-                    warn_once(warning)
-            profile, follows = self.profile, self.law.follows_accelerations
-            if self.coming_to_rest:
-                commanded = self._to_rest(state)
-            elif isinstance(profile, PlannedReference) and (profile.uses_table or not follows):
-                planned = profile.actuation(
-                    time - self._began, self._control_period, self.law.joint_damping
-                )
-                around_B = planned.wrench_B if profile.uses_table else None
-                if not follows:
-                    commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
-        if state is not None:
-            periods = self._periods_held(time)
-            result = self.apply_limits(state, commanded, periods, around_B)
-            if self.law.integrates and not self.coming_to_rest:
-                self.law.integrate_error(periods * self._control_period, limited=result.limited)
-        else:
-            result = self.limits.apply(commanded)
+            if self._stopped_at is None:
+                # The joints stop where a smooth deceleration from their current rates ends.
+                self._stopped_at = q + qdot / _BRAKE_RATE
+            qddot = _BRAKE_RATE**2 * (self._stopped_at - q) - 2 * _BRAKE_RATE * qdot
+            efforts = self.joint_rate_limits.efforts(q, qdot, qddot)
+            result = self.limits.apply(Actuation(np.zeros(6), efforts))
             if self.wheels is not None:
                 self.wheels.coast()
+            self._sent = result.realised
+            return result
+        if self.profile is None:
+            here = self.reference_at(time, state)
+            self.begin(time, StepReference(here, here, carries=True))
+        # The law is always evaluated, for its errors and status.
+        self.law.time = time
+        with self._failures_of_law(time):
+            commanded = self.law.command(state, self._followed_reference(time))
+        if not self.gains_checked:
+            self.gains_checked = True
+            if warning := self.law.sampling_warning():
+                warn_once(warning)
+        profile, follows = self.profile, self.law.follows_accelerations
+        if self.coming_to_rest:
+            commanded = self._to_rest(state)
+        elif isinstance(profile, PlannedReference) and (profile.uses_table or not follows):
+            planned = profile.actuation(time - self._began, period, self.law.joint_damping)
+            around_B = planned.wrench_B if profile.uses_table else None
+            if not follows:
+                commanded = Actuation(*(a + b for a, b in zip(commanded, planned, strict=True)))
+        # This command will probably be held for as many periods as the last one: an overloaded
+        # machine does not answer every state.
+        elapsed, self._commanded_at = (time - self._commanded_at) / period, time
+        periods = round(elapsed) if 1.0 < elapsed < _MAX_HELD_PERIODS else 1
+        result = self.apply_limits(state, commanded, periods, around_B)
+        if self.law.integrates and not self.coming_to_rest:
+            self.law.integrate_error(periods * period, limited=result.limited)
         self._sent = result.realised
         return result
 
@@ -432,15 +432,6 @@ class CoordinatedController:
         limited = self.limits.apply(Actuation(rest, wanted.tau)).realised
         wheels.thrust = limited.wrench_B
         return Actuation(wanted.wrench_B - (rest - limited.wrench_B), limited.tau)
-
-    def limits_expression(
-        self, omega: ca.SX, q: ca.SX, qdot: ca.SX, actuation: ca.SX
-    ) -> tuple[ca.SX, ca.SX]:
-        """Return the part of ``[f; n; tau]`` (6 + n,) within the actuator limits, and whether joint
-        rate limits lower it further; if so, call :meth:`apply_limits`.
-        """
-        realised = self.limits.expression(actuation)
-        return realised, self.joint_rate_limits.exceeds_limits_expression(omega, q, qdot, realised)
 
     @property
     def goal(self) -> Reference:
@@ -510,14 +501,6 @@ class CoordinatedController:
 
     # -- parts --------------------------------------------------------------------------------
 
-    def _periods_held(self, time: float) -> int:
-        """Return the number of control periods for which the last command was held, as this one
-        probably will be: an overloaded machine does not answer every state.
-        """
-        before, self._commanded_at = self._commanded_at, time
-        periods = (time - before) / self._control_period
-        return round(periods) if 1.0 < periods < _MAX_HELD_PERIODS else 1
-
     def _followed_reference(self, time: float) -> Reference:
         assert self.profile is not None
         own, given = self.profile.at(time - self._began), self.followed
@@ -551,14 +534,6 @@ class CoordinatedController:
             return None
         self.mode = Mode.ESTIMATED
         return self._estimator.step(self._sent, q, qdot)
-
-    def _braking_command(self, q: Array, qdot: Array) -> Actuation:
-        """Return a command that turns off thrusters and stops joints, whatever the base pose."""
-        if self._stopped_at is None:
-            # The joints stop where a smooth deceleration from their current rates ends.
-            self._stopped_at = q + qdot / _BRAKE_RATE
-        qddot = _BRAKE_RATE**2 * (self._stopped_at - q) - 2 * _BRAKE_RATE * qdot
-        return Actuation(np.zeros(6), self.joint_rate_limits.efforts(q, qdot, qddot))
 
 
 def build_controller(robot: SpaceRobot, config: ControllerConfig) -> CoordinatedController:

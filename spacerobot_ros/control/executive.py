@@ -30,7 +30,6 @@ from spacerobot_ros.errors import CommandError, ParameterError, PlanningError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.planning.core.cancellation import PlanningJob
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import (
     BASE_GOAL_KEY,
@@ -606,7 +605,16 @@ class ControlExecutive:
             controller.hold_here(time, state)
         job = None
         if controller.planner is not None:
-            job = self._planned(time, state)
+            try:
+                job = self._planning.planned(time, state, controller, pending)
+            except PlanningError as error:
+                goal_id = self._latest_id()
+                if all(goal is self._goals.get(part) for part, goal in pending.items()):
+                    self._give_up(f"Aborted: {error}")
+                    self._hold_pose(time, state, aborted=True)
+                else:
+                    pending.clear()
+                    self.refuse(str(error), goal_id)
             if job is None:
                 return
         pursued = self._goals if self._pursues else {}
@@ -638,24 +646,6 @@ class ControlExecutive:
             resumes=resumes,
         )
         self.outputs.append(PursuedGoals(saved))
-
-    def _planned(self, time: float, state: ControlState) -> PlanningJob[PlannedReference] | None:
-        """Return the job that has planned the reference of the pending goals.
-
-        None: it is still being planned, or the goals have been rejected.
-        """
-        pending = self._pending
-        try:
-            return self._planning.planned(time, state, self.controller, pending)
-        except PlanningError as error:
-            goal_id = self._latest_id()
-            if all(goal is self._goals.get(part) for part, goal in pending.items()):
-                self._give_up(f"Aborted: {error}")
-                self._hold_pose(time, state, aborted=True)
-            else:
-                pending.clear()
-                self.refuse(str(error), goal_id)
-            return None
 
     def _take_tolerance(self, tolerance: Tolerance | None) -> None:
         self._goal_tolerance = tolerance

@@ -16,8 +16,6 @@ import numpy as np
 
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.outputs import OutputDistance
-from spacerobot_ros.model.description import Array
-from spacerobot_ros.model.space_robot import SpaceRobot
 
 if TYPE_CHECKING:
     from spacerobot_ros.control.controller import CoordinatedController
@@ -251,8 +249,11 @@ class StallMonitor:
             self._largest = []
             self._begin(time, controller, config)
         self._next_sample = time + self._window / _SAMPLES
-        errors = controller.errors()
-        self._share, self._lag = _largest_share(errors, config), _lag(errors, controller, config)
+        assert controller.profile is not None
+        errors, tolerances = controller.errors(), config.tolerances
+        parts = list(zip(errors, controller.profile.distances(), tolerances, strict=True))
+        self._share = max(e / max(most, _LEAST_SMALLEST_TOLERANCE) for e, _, most in parts)
+        self._lag = max((e / way for e, way, most in parts if min(e, way) > most), default=0.0)
         self._largest[0] = max(self._largest[0], self._share)
         self._samples += 1
         self._limited += result.limited
@@ -293,7 +294,12 @@ class StallMonitor:
 
     def _find_cause(self, controller: CoordinatedController, result: Saturated) -> str:
         law, limited = controller.law, self._is_limited
-        stop = _joint_at_stop(law.robot, law.state.q)
+        robot, q = law.robot, law.state.q
+        span = robot.upper - robot.lower
+        margin = _STOP_SHARE * np.where(np.isfinite(span), span, 0.0)
+        at_stop = (q <= robot.lower + margin) | (q >= robot.upper - margin)
+        first = next(iter(np.flatnonzero(at_stop)), None)
+        stop = "" if first is None else f"joint '{robot.joint_names[first]}' is at its stop"
         if stop and limited:
             return stop
         if law.singular_error_share > _SINGULAR_SHARE:
@@ -303,37 +309,9 @@ class StallMonitor:
                 cause += "; the end-effector keeps its own goal until ~/abort"
             return cause
         if limited:
-            for part, name in (
-                (result.excess.wrench_B[:3], "the thruster force is at its limit"),
-                (result.excess.wrench_B[3:], "the base torque is at its limit"),
-            ):
-                if np.any(part):
-                    return name
+            if result.excess.wrench_B[:3].any():
+                return "the thruster force is at its limit"
+            if result.excess.wrench_B[3:].any():
+                return "the base torque is at its limit"
             return "joint efforts are at their limits"
         return stop or "its errors no longer shrink"
-
-
-def _joint_at_stop(robot: SpaceRobot, q: Array) -> str:
-    span = robot.upper - robot.lower
-    margin = _STOP_SHARE * np.where(np.isfinite(span), span, 0.0)
-    for name, at_stop in zip(
-        robot.joint_names, (q <= robot.lower + margin) | (q >= robot.upper - margin), strict=True
-    ):
-        if at_stop:
-            return f"joint '{name}' is at its stop"
-    return ""
-
-
-def _largest_share(errors: OutputDistance, config: ControllerConfig) -> float:
-    return max(
-        error / max(tolerance, _LEAST_SMALLEST_TOLERANCE)
-        for error, tolerance in zip(errors, config.tolerances, strict=True)
-    )
-
-
-def _lag(
-    errors: OutputDistance, controller: CoordinatedController, config: ControllerConfig
-) -> float:
-    assert controller.profile is not None
-    parts = zip(errors, controller.profile.distances(), config.tolerances, strict=True)
-    return max((e / way for e, way, tolerance in parts if min(e, way) > tolerance), default=0.0)

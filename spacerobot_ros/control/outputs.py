@@ -320,11 +320,11 @@ class OutputVector:
         """
         parts: list[Array] = []
         if self.selection.base:
-            parts += _pose_parts("the base", reference.base)
+            parts += _parts_of("the base, whose pose is", reference.base)
         if self.selection.end_effector:
-            parts += _pose_parts("the end-effector", reference.end_effector)
+            parts += _parts_of("the end-effector, whose pose is", reference.end_effector)
         if self.selection.joints:
-            parts += _joint_parts(reference.joints)
+            parts += _parts_of("the joints, which are", reference.joints)
         np.concatenate(parts, out=memory)
         require_finite("reference", memory)
 
@@ -399,23 +399,11 @@ def _selected(group: _OutputGroup, names: Sequence[str], chosen: Sequence[str]) 
     return _OutputGroup(*(part[rows, :] for part in group))
 
 
-def _pose_parts(frame: str, pose: PoseReference | None) -> list[Array]:
-    if pose is None:
-        raise TargetNotSetError(f"There is no reference for {frame}, whose pose is controlled.")
-    return [
-        pose.position,
-        pose.quaternion,
-        pose.velocity,
-        pose.angular_velocity,
-        pose.acceleration,
-        pose.angular_acceleration,
-    ]
-
-
-def _joint_parts(joints: JointReference | None) -> list[Array]:
-    if joints is None:
-        raise TargetNotSetError("There is no reference for the joints, which are controlled.")
-    return [joints.q, joints.qdot, joints.qddot]
+def _parts_of(subject: str, group: PoseReference | JointReference | None) -> list[Array]:
+    """Return the components of a group's reference, in the order of its fields."""
+    if group is None:
+        raise TargetNotSetError(f"There is no reference for {subject} controlled.")
+    return list(vars(group).values())
 
 
 def require_finite(name: str, memory: Array) -> None:

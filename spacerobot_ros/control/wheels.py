@@ -259,8 +259,10 @@ class WheelControl:
             self.torque = self._dumping_torques()
         else:
             self.torque = np.zeros(len(self.wheels))
-            used = self._used
-            lower, upper = self._bounds()
+            used, wheels = self._used, self.wheels
+            soon = wheels.inertia / (_MIN_PERIODS_TO_LIMIT * self._period)
+            upper = np.clip(soon * (wheels.rate - self.rates), 0.0, wheels.torque)
+            lower = -np.clip(soon * (wheels.rate + self.rates), 0.0, wheels.torque)
             wanted = -(torque + gyroscopic)
             self.torque[used] = self._allocate.allocate(wanted, lower[used], upper[used])
         given = -(A @ self.torque) - gyroscopic
@@ -288,14 +290,6 @@ class WheelControl:
             angular_acceleration=min(motion.angular_acceleration, share * torque),
             angular_speed=min(motion.angular_speed, share * momentum),
         )
-
-    def _bounds(self) -> tuple[Array, Array]:
-        """Return the smallest and largest torques (k,) within the torque and rate limits."""
-        wheels = self.wheels
-        soon = wheels.inertia / (_MIN_PERIODS_TO_LIMIT * self._period)
-        upper = np.clip(soon * (wheels.rate - self.rates), 0.0, wheels.torque)
-        lower = -np.clip(soon * (wheels.rate + self.rates), 0.0, wheels.torque)
-        return lower, upper
 
     # -- momentum -----------------------------------------------------------------------------
 
