@@ -258,7 +258,8 @@ class GaitMethod(ABC):
             self._require_no_path(goal)
         if not is_clear:
             start = RobotState(path.position[0], path.quaternion[0], positions[0])
-            self._require_clear(positions, self._base_poses(start, positions))
+            if clause := self._too_near(positions, self._base_poses(start, positions)):
+                raise PlanningError(f"On the way {clause}.")
         if self._joint_efforts is not None:
             motion = motion or HeldMotion(positions, self.control_period)
             beyond = self._joint_efforts.beyond_limits(motion)
@@ -376,17 +377,12 @@ class GaitMethod(ABC):
             return None
         return self._prediction.poses(start, positions, attitudes)
 
-    def _require_clear(self, positions: Array, base: BasePoses | None = None) -> None:
-        """Reject shapes (K, n) on the path, with straight lines in between, at which links come too
-        close to each other or, at the ``base`` poses, to obstacles.
-        """
-        if clause := self._too_near(positions, base):
-            raise PlanningError(f"On the way {clause}.")
-
     def _too_near(
         self, positions: Array, base: BasePoses | None = None, *, at_ticks: bool = True
     ) -> str:
-        """Return a clause that states where links come too close; empty: nowhere."""
+        """Return a clause that states where, on straight lines between shapes (K, n), links come
+        too close to each other or, at the ``base`` poses, to obstacles; empty: nowhere.
+        """
         if self.clearance is None:
             return ""
         found = self.clearance.approaches(positions, base=base)

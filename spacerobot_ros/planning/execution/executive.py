@@ -353,7 +353,18 @@ class Executive:
         self._stamp_ns = stamp
         if tracker.has_ended(stamp, q):
             self._end_schedule(stamp)
-        self._do_phase_work(measured)
+        match self.phase:
+            case Phase.MEASURING | Phase.EVALUATING:
+                self._measure_at_rest(measured)
+            case Phase.PLANNING:
+                self._take_plan_result()
+            case Phase.REPLANNING | Phase.TAKING_OVER:
+                self._await_take_over()
+            case Phase.EXECUTING | Phase.BRAKING if self._new_goal is not None:
+                self._measure_in_motion(self._new_goal, measured)
+            case Phase.EXECUTING if tracker.is_check_due(stamp):
+                assert self._active_goal is not None
+                self._check_path(self._active_goal, measured)
         if tracker.is_active:
             stuck = tracker.track(stamp, q, obeyed=not self.plant_rests)
             if stuck and self._active_goal is not None:
@@ -365,20 +376,6 @@ class Executive:
             tracker.hold(q, qdot, obeyed=not self.plant_rests)
         self.statistics.commands_published += 1
         return tracker.setpoint
-
-    def _do_phase_work(self, measured: MeasuredState) -> None:
-        match self.phase:
-            case Phase.MEASURING | Phase.EVALUATING:
-                self._measure_at_rest(measured)
-            case Phase.PLANNING:
-                self._take_plan_result()
-            case Phase.REPLANNING | Phase.TAKING_OVER:
-                self._await_take_over()
-            case Phase.EXECUTING | Phase.BRAKING if self._new_goal is not None:
-                self._measure_in_motion(self._new_goal, measured)
-            case Phase.EXECUTING if self._tracker.is_check_due(self._stamp_ns):
-                assert self._active_goal is not None
-                self._check_path(self._active_goal, measured)
 
     # -- TELEOPERATING ------------------------------------------------------------------------
 
@@ -468,19 +465,14 @@ class Executive:
         if take_over is None:
             self._plan_new_goal(waiting)
         elif active is not None and waiting.goal.equals(active.identified.goal):
-            self._keep_schedule_for(waiting, active)
+            left, self._new_goal = active.time_left(self._stamp_ns), None
+            active = replace(active, identified=waiting, corrections=0, manoeuvre_time=left)
+            self._accept_goal(active)
+            message = "The current schedule also leads to this goal."
+            self.outputs.append(active.status(PlannerState.EXECUTING, message))
         elif self.config.averaging == 1 or self._tracker.is_check_due(self._stamp_ns):
             self._plan_new_goal(waiting, take_over)
         self._average.restart()
-
-    def _keep_schedule_for(self, identified: IdentifiedGoal, active: ActiveGoal) -> None:
-        """Make a goal with the same pose and shape the active goal; the schedule continues."""
-        self._new_goal = None
-        left = active.time_left(self._stamp_ns)
-        active = replace(active, identified=identified, corrections=0, manoeuvre_time=left)
-        self._accept_goal(active)
-        message = "The current schedule also leads to this goal."
-        self.outputs.append(active.status(PlannerState.EXECUTING, message))
 
     def _check_path(self, active: ActiveGoal, measured: MeasuredState) -> None:
         """Plan the remaining motion periodically, and when the base is off its predicted path."""

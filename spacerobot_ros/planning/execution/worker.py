@@ -282,8 +282,14 @@ class PlanningWorker:
         PlanningError
             No plan was found; the message says why.
         """
-        method = self._choose_method(task)
-        schedule = self._make_schedule(task, method, cancellation)
+        method, request, braking = self._choose_method(task), task.request, task.braking
+        if task.take_over is not None:
+            state = self._predict_motion(request.state, task.take_over.shapes)[0]
+            request, braking = replace(request, state=state, motion=task.take_over.motion), None
+        if braking is None:
+            schedule = method.plan(request, cancellation)
+        else:
+            schedule = self._plan_with_braking(braking, task, method, cancellation)
         if not isinstance(schedule, GaitSchedule):
             raise PlanningError(f"The method '{method.name}' returned no GaitSchedule.")
         replans = self._config.replanning > 0 and self._config.takeover_time > 0
@@ -293,17 +299,6 @@ class PlanningWorker:
             path = replace(schedule.path, mass_derivatives=derivatives)
             schedule = replace(schedule, path=path)
         return schedule
-
-    def _make_schedule(
-        self, task: PlanningTask, method: GaitMethod, cancellation: Cancellation
-    ) -> GaitSchedule:
-        if task.take_over is not None:
-            state = self._predict_motion(task.request.state, task.take_over.shapes)[0]
-            motion = task.take_over.motion
-            return method.plan(replace(task.request, state=state, motion=motion), cancellation)
-        if task.braking is None:
-            return method.plan(task.request, cancellation)
-        return self._plan_with_braking(task.braking, task, method, cancellation)
 
     def _choose_method(self, task: PlanningTask) -> GaitMethod:
         stuck, required, config = task.stuck_joint_positions, task.required, self._config

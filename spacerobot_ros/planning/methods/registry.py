@@ -26,12 +26,11 @@ from spacerobot_ros.errors import (
 )
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.parameters import configured, declared, require_known
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation, PlanningCancelled
 from spacerobot_ros.planning.core.clearance import Clearance
-from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, PoseError, RobotState
+from spacerobot_ros.planning.core.goal import POSE, Controlled, Goal, PoseError
 from spacerobot_ros.planning.core.method import NO_JOINTS, GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.area_loop import AreaLoopGait
@@ -318,7 +317,12 @@ class RemainingJointsGait(GaitMethod):
                 reasons.append(PlanningError(left))
                 continue
             if "shape" in schedule.controls and shape is not None:
-                self._require_stuck_at(state, shape, request.tolerance.shape)
+                far = np.abs(shape - state.q) * self._is_stuck
+                if far.max() > request.tolerance.shape:
+                    joint, at = self.robot.joint_names[far.argmax()], shape[far.argmax()]
+                    raise UnreachableError(
+                        f"the goal requires joint '{joint}' at {at:.4g}.", Proof.LIMITS
+                    )
             positions = np.tile(state.q, (len(schedule.positions), 1))
             positions[:, moving] = schedule.positions
             end = None
@@ -364,15 +368,6 @@ class RemainingJointsGait(GaitMethod):
                 self.clearance and self.clearance.of(self._remaining.description),
             )
         return self._methods[name]
-
-    def _require_stuck_at(self, state: RobotState, shape: Array, tolerance: float) -> None:
-        far = np.abs(shape - state.q) * self._is_stuck
-        worst = int(np.argmax(far))
-        if far[worst] > tolerance:
-            raise UnreachableError(
-                f"the goal requires joint '{self.robot.joint_names[worst]}' at {shape[worst]:.4g}.",
-                Proof.LIMITS,
-            )
 
 
 def _options_of_remaining(options: Any, gone: Set[str], names: Sequence[str]) -> Any:

@@ -238,8 +238,12 @@ class ManoeuvreModel:
         moves_end, programs = free and self.end_effectors is not None, 0
         while ticks <= most:
             factor, too_fast = 1.0, True
-            positions = trajectory.at_ticks(ticks)
-            positions = self._move_to_final(positions, boundary, final, limits)
+            positions, s = trajectory.at_ticks(ticks), np.linspace(0.0, 1.0, ticks + 1)
+            # The solver reaches the final shape only to its own precision.
+            late = (s**3 * (10 - 15 * s + 6 * s**2))[:, np.newaxis]
+            positions = positions + late * (final - positions[-1])
+            positions = np.clip(positions, limits.lower, limits.upper)
+            positions[0], positions[-1] = boundary.start, final
             held = self._adjust_to_goal(positions, boundary, limits, moves_end=moves_end)
             if held is not None:
                 too_fast, factor = self._excess(held, boundary, limits)
@@ -311,17 +315,6 @@ class ManoeuvreModel:
         start = np.array([0.0, 0.0, 0.0, 1.0])
         attitudes = self.prediction.attitudes(positions, start, boundary.angular_momentum)
         return HeldCommands(positions, attitudes)
-
-    def _move_to_final(
-        self, positions: Array, boundary: BoundaryConditions, final: Array, limits: MotionLimits
-    ) -> Array:
-        """Return shapes (N + 1, n) that end in the shape ``final`` exactly."""
-        s = np.linspace(0.0, 1.0, len(positions))[:, np.newaxis]
-        # The solver reaches the final shape only to its own precision.
-        positions = positions + s**3 * (10 - 15 * s + 6 * s**2) * (final - positions[-1])
-        positions = np.clip(positions, limits.lower, limits.upper)
-        positions[0], positions[-1] = boundary.start, final
-        return positions
 
     def corrected_end(
         self, trajectory: Trajectory, boundary: BoundaryConditions, ticks: int

@@ -35,7 +35,7 @@ from spacerobot_ros.model.wheels import ReactionWheels
 from spacerobot_ros.parameters import values_of
 from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
 from spacerobot_ros.planning.core.controllability import sliders_of
-from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import Controlled, Goal, PoseError, Tolerance
 from spacerobot_ros.planning.core.method import GaitMethod, InitialMotion, PlanRequest
 from spacerobot_ros.planning.core.progress import SearchClock
 from spacerobot_ros.planning.core.schedule import GaitSchedule, HeldMotion, Notes
@@ -385,7 +385,10 @@ class OptimalGait(GaitMethod):
         if motion is not None:
             return self._plan_in_motion(task, motion)
         end = boundary.final_velocity
-        if self._is_reached(state, goal) and np.allclose(end, boundary.velocity, rtol=_ZERO_ERROR):
+        error = PoseError.between(state.position, state.quaternion, goal, state.q, self.robot)
+        nothing = Tolerance(_ZERO_ERROR, _ZERO_ERROR, _ZERO_ERROR)
+        is_reached = nothing.admits(error, self.controls_for(goal))
+        if is_reached and np.allclose(end, boundary.velocity, rtol=_ZERO_ERROR):
             return _Plan(q[np.newaxis], {"starts": 0.0}, end)
         attitude = state.quaternion[np.newaxis]
         try:
@@ -706,11 +709,6 @@ class OptimalGait(GaitMethod):
         L_B = task.boundary.momenta_in_base(found.held.quaternions)
         motion = HeldMotion(shapes, self.control_period, task.velocity, after, L_B)
         return self._efforts.excess(motion) <= 1 + _LIMIT_ROUNDING
-
-    def _is_reached(self, state: RobotState, goal: Goal) -> bool:
-        error = PoseError.between(state.position, state.quaternion, goal, state.q, self.robot)
-        nothing = Tolerance(_ZERO_ERROR, _ZERO_ERROR, _ZERO_ERROR)
-        return nothing.admits(error, self.controls_for(goal))
 
     def _build_schedule(self, request: PlanRequest, plan: _Plan) -> GaitSchedule:
         """Return a plan as a schedule, with notes on its end."""

@@ -215,10 +215,15 @@ class MultipleShooting:
         parameters = _pack_parameters(
             boundary, limits, guess, fixed=duration.fixed, drifting=self._drifting
         )
+        h, v = first.step, first.velocities
+        a = np.diff(v, axis=0) / h
+        x = pack_knots(layout, h, first.quaternions, first.shapes + h * v / 2, v, a)
+        if layout.has_lack:
+            x[-1] = lack / 2
         found = self._solver.solve(
             "refining" if refining and not self._has_distances else "",
             stop,
-            self._initial_variables(first, lack),
+            x,
             bounds,
             parameters,
         )
@@ -230,14 +235,6 @@ class MultipleShooting:
         self.lack = float(x[-1]) if layout.has_lack else 0.0
         h, (X, s, v, _) = float(x[0]), (x[each] for each in layout.knots())
         return Trajectory(h, s - h * v / 2, v, X)
-
-    def _initial_variables(self, guess: Trajectory, lack: float) -> Array:
-        h, v = guess.step, guess.velocities
-        a = np.diff(v, axis=0) / h
-        x = pack_knots(self._layout, h, guess.quaternions, guess.shapes + h * v / 2, v, a)
-        if self._layout.has_lack:
-            x[-1] = lack / 2
-        return x
 
 
 def _pack_parameters(

@@ -67,7 +67,6 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     Trajectory,
     UnusableCandidateError,
 )
-from spacerobot_ros.planning.methods.optimal.transcription import Stages
 
 _LOG = logging.getLogger(__name__)
 
@@ -307,8 +306,20 @@ class ManoeuvreSearch:
     def __init__(self, model: ManoeuvreModel) -> None:
         self._model = model
         # No function refers to this object, so that solvers are released together with it.
-        stages = cache(model.stages)
-        self._solvers = lru_cache(_KEPT_SOLVERS)(partial(_built_solver, model, stages))
+        stages_of = cache(model.stages)
+
+        @lru_cache(_KEPT_SOLVERS)
+        def solver(
+            position: bool, drifting: bool, grid: _Grid, pairs: tuple[int, ...]
+        ) -> MultipleShooting:
+            # Most of the time is spent on clear paths.
+            stages = stages_of(position, drifting, bool(pairs))
+            if pairs and model.clearance is not None:
+                rows = PlaneDistances.of(model.clearance.geometry, pairs)
+                stages = stages.with_distances(rows, instants_of(grid.intervals))
+            return MultipleShooting(stages, *grid)
+
+        self._solvers = solver
 
     def search(self, problem: SearchProblem) -> Manoeuvre:
         """Return the fastest manoeuvre found.
@@ -353,23 +364,6 @@ class ManoeuvreSearch:
                 f"a longer optimal.{limit}, or a closer goal may help."
             )
         return replace(found, starts=search.starts, cut_short=cut_short)
-
-
-def _built_solver(
-    model: ManoeuvreModel,
-    stages_of: Callable[[bool, bool, bool], Stages],
-    position: bool,
-    drifting: bool,
-    grid: _Grid,
-    pairs: tuple[int, ...],
-) -> MultipleShooting:
-    """Return the solver on a grid, which keeps pairs of links apart."""
-    # Most of the time is spent on clear paths.
-    stages = stages_of(position, drifting, bool(pairs))
-    if pairs and model.clearance is not None:
-        rows = PlaneDistances.of(model.clearance.geometry, pairs)
-        stages = stages.with_distances(rows, instants_of(grid.intervals))
-    return MultipleShooting(stages, *grid)
 
 
 class _Search:

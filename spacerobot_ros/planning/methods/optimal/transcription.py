@@ -459,16 +459,6 @@ def momentum_in_base(tau: float, X: ca.SX, X_next: ca.SX, L_0: ca.SX) -> ca.SX:
     return turned / ca.sumsqr(mean)
 
 
-def _rotation(robot: SpaceRobot, *, drifting: bool) -> ca.Function:
-    """Return the base's rotation ``w = -D^-1 D_q u`` (3,) of ``[q; u]``.
-
-    Drifting, it is ``D^-1 (l - D_q u)`` of ``[q; u; l]``, with the angular impulse l (3,).
-    """
-    q, u, impulse, D, _, of_joints = _momentum_symbols(robot, drifting)
-    point = ca.vertcat(q, u, impulse)
-    return ca.Function("rotation", [point], [-solve_positive_definite(D, of_joints)])
-
-
 def _momentum_symbols(robot: SpaceRobot, drifting: bool) -> tuple[ca.SX, ...]:
     """Return q, u and l, which is empty at zero momentum, D and D_q, and ``D_q u - l``."""
     q, u, impulse = (
@@ -510,9 +500,12 @@ def turn_function(robot: SpaceRobot, *, drifting: bool = False) -> ca.Function:
     If the robot drifts, the fourth argument is the angular impulse (3,) of the step: the angular
     momentum in the base frame at about half of the step, times the step duration.
     """
+    # The base's rotation, ``-D^-1 D_q u`` or ``D^-1 (l - D_q u)``.
+    *point, D, _, of_joints = _momentum_symbols(robot, drifting)
+    w = -solve_positive_definite(D, of_joints)
+    rotation = ca.Function("rotation", [ca.vertcat(*point)], [w])
     q, u, u_next = (ca.SX.sym(name, robot.n) for name in ("q", "u", "u_next"))
     impulse = ca.SX.sym("impulse", 3 if drifting else 0)
-    rotation = _rotation(robot, drifting=drifting)
     rates = [
         rotation(ca.vertcat(state_within_interval(tau, q + u / 2, u, u_next), impulse))
         for tau in GAUSS
