@@ -555,23 +555,24 @@ class Commander(ABC):
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status from the named plant."""
+        executive = self.executive
         for change in self.plant.update(status, name):
             if isinstance(change, PlantStopped):
                 self.give_up_goals(change.reason)
-            elif isinstance(change, PlantRested):
-                if self.executive is not None:
-                    self.executive.plant_rested(change.commanded_until_ns, change.since_ns)
-            elif change is PlantChange.RESET:
+            if change is PlantChange.RESET:
                 self.states.forget_pose()
                 self._contradicted_ns = _NEVER_NS
-                if self.executive is not None:
-                    self.executive.plant_reset()
-            elif self.executive is not None:
-                self.executive.on_plant_obeying()
+            if executive is not None:
+                if isinstance(change, PlantRested):
+                    executive.plant_rested(change.commanded_until_ns, change.since_ns)
+                elif change is PlantChange.RESET:
+                    executive.plant_reset()
+                elif change is PlantChange.OBEYS:
+                    executive.on_plant_obeying()
         if self.plant.in_lockstep and self.config.plan_in_background:
             self.config = self._adapted(self.config)
-            if self.executive is not None:
-                self.executive.plan_at_once()
+            if executive is not None:
+                executive.plan_at_once()
         self._forward_outputs()
         self._forward_plant_state()
         if self._actuation_refusal:

@@ -305,21 +305,15 @@ class ControllerCommander(Commander):
         try:
             self.executive.submit(key, goal)
         except PlanningError as error:
-            if self._leaves_to_planner(key, goal):
+            controlled = getattr(self.executive.controller.law.outputs.selection, key)
+            # A goal that was sent to all commanders is for the planner whose reference the law
+            # tracks; the client of an action waits for the controller's answer.
+            if goal.resumes and not controlled and self.host.has_publisher(JOINT_REFERENCE):
                 self._fly_to.leave(goal.goal_id)
                 self._goal_file.end(goal.goal_id, refused=True)
                 self.host.log("info", f"The goal is left to the planner. {error}")
             else:
                 self._refuse_goal(str(error), goal.goal_id)
-
-    def _leaves_to_planner(self, key: str, goal: IdentifiedGoal) -> bool:
-        """Whether a goal that was sent to all commanders is for the planner whose reference the law
-        tracks; action goals are not, because their client waits for the controller's answer.
-        """
-        assert self.executive is not None
-        controlled = getattr(self.executive.controller.law.outputs.selection, key)
-        of_action = not goal.resumes
-        return not (controlled or of_action) and self.host.has_publisher(JOINT_REFERENCE)
 
     def _forward_plant_state(self) -> None:
         if self.executive is not None:

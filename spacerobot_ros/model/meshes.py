@@ -199,26 +199,24 @@ class _DamagedError(Exception):
 def _sound_mesh(read: Callable[[bytes], TriangleMesh], data: bytes, name: str) -> TriangleMesh:
     """Read a mesh without faces of zero area; reject invalid coordinates and indices."""
     try:
-        return _without_flaws(read(data))
+        mesh = read(data)
+        vertices, faces = mesh.vertices, mesh.faces
+        if len(faces) > _MAX_TRIANGLES:
+            most = f"at most {_MAX_TRIANGLES} are read"
+            raise _DamagedError(f"it has {len(faces)} triangles, and {most}")
+        if not np.isfinite(vertices).all():
+            raise _DamagedError("a coordinate is not finite")
+        if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+            raise _DamagedError("a face refers to a missing vertex")
+        faces = _without_degenerate_faces(faces)
+        if not len(faces):
+            raise _DamagedError("it has no triangle")
     except _DamagedError as error:
         raise MeshError(f"The mesh {name} cannot be read: {error}.") from error
     except (ValueError, IndexError, OverflowError) as error:
         # The text of a parse error would quote the file.
         why = "a coordinate or index is not a number"
         raise MeshError(f"The mesh {name} cannot be read: {why}.") from error
-
-
-def _without_flaws(mesh: TriangleMesh) -> TriangleMesh:
-    vertices, faces = mesh.vertices, mesh.faces
-    if len(faces) > _MAX_TRIANGLES:
-        raise _DamagedError(f"it has {len(faces)} triangles, and at most {_MAX_TRIANGLES} are read")
-    if not np.isfinite(vertices).all():
-        raise _DamagedError("a coordinate is not finite")
-    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise _DamagedError("a face refers to a missing vertex")
-    faces = _without_degenerate_faces(faces)
-    if not len(faces):
-        raise _DamagedError("it has no triangle")
     return TriangleMesh(vertices, faces)
 
 
@@ -296,15 +294,10 @@ def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
         faces = np.asarray(found.faces, dtype=np.int32).reshape(-1, 3)
     except Exception as error:  # Each trimesh parser raises its own exceptions.
         raise _DamagedError(f"trimesh raised {type(error).__name__}") from error
-    return TriangleMesh(vertices * _unit_in_metres(path, data), faces)
-
-
-def _unit_in_metres(path: Path, data: bytes) -> float:
-    """Return the unit of a COLLADA file in m; other formats use metres."""
-    if path.suffix.lower() != ".dae":
-        return 1.0
-    found = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)
-    return 1.0 if found is None else float(found[1])
+    # COLLADA files may use a unit other than the metre.
+    unit = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)[\"']", data)
+    scale = float(unit[1]) if unit is not None and path.suffix.lower() == ".dae" else 1.0
+    return TriangleMesh(vertices * scale, faces)
 
 
 # -- visuals -------------------------------------------------------------------------------------

@@ -154,7 +154,13 @@ class ModelFunctions:
                 name = f"link_pose_{self.link_index(argument)}"
                 return self._function_of(name, "q", R_BL=R, r_BL_B=r)
             case "curvature":
-                return self._curvature()
+                K = curvature(self._connection, self._kin.q)
+                # Index i varies fastest: reshaped in Fortran order, this is (6, i, j).
+                stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
+                symbols = {"q": self._kin.q} | self.mass_inputs
+                names, result = ([*symbols], ["result"]), ca.densify(stacked)
+                # Searching its few common subexpressions takes several times as long.
+                return ca.Function(kind, [*symbols.values()], [result], *names)
             case "shape_equations" | "loaded_shape_equations":
                 return shape_equations(self._kin, loaded=kind.startswith("loaded"))
             case "velocity_step":
@@ -238,15 +244,6 @@ class ModelFunctions:
         """Return a function of named inputs; symbolic mass properties become its last input."""
         symbols = {each: self._symbols[each] for each in inputs.split()}
         return dense_function(name, symbols | self.mass_inputs, outputs)
-
-    def _curvature(self) -> ca.Function:
-        K = curvature(self._connection, self._kin.q)
-        # Index i varies fastest: reshaped in Fortran order, this is (6, i, j).
-        stacked = ca.horzcat(*(K[i][j] for j in range(self.n) for i in range(self.n)))
-        inputs = {"q": self._kin.q} | self.mass_inputs
-        # It has few common subexpressions, and searching for them takes several times as long.
-        names = [*inputs], ["result"]
-        return ca.Function("curvature", [*inputs.values()], [ca.densify(stacked)], *names)
 
 
 _MAX_SYMBOLIC_MODELS = 8

@@ -244,11 +244,8 @@ class CapturePlant(WrappedPlant):
         """Motion after a capture or release, until the next tick."""
         self._ready = True
         """Whether an automatic capture takes place as soon as its conditions hold."""
-        self._compile(initial)
-
-    def _compile(self, initial: InitialState) -> None:
-        """Call all functions of a capture once: compiling them later would delay the flight."""
-        robot, motion, inertia = self.robot, self._motion(), self.target.inertia
+        # Call all functions of a capture once: compiling them later would delay the flight.
+        motion, inertia = self._motion(), self.target.inertia
         grasp_impact(robot, self.link, motion, self._body(), inertia)
         joined = Payload.in_generic_pose(self.link, inertia).attached_to(robot)
         _summed_momenta(joined, motion)

@@ -206,11 +206,7 @@ class CommandValidator:
     @property
     def complete(self) -> bool:
         """Whether all commands that a lockstep plant waits for have arrived."""
-        # A loop is twice as fast as all() over a generator, and this runs every tick.
-        for source in self.sources:  # noqa: SIM110
-            if source.required and not source.arrived:
-                return False
-        return True
+        return all(source.arrived or not source.required for source in self.sources)
 
     @property
     def in_force(self) -> bool:

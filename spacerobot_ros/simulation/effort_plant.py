@@ -121,7 +121,13 @@ class JointStops:
                 arrivals_left -= 1
                 if arrivals_left < 0:
                     raise SpaceRobotError(FAILURES[1])
-                step = self._time_to_stop(x, command, fixed, step)
+                # The step ends when the first joint leaves its limits.
+                early = 0.0
+                for _ in range(BISECTIONS):
+                    middle = (early + step) / 2
+                    after = self._integrate_step(x, command, fixed, middle)
+                    outside = self._is_outside_limits(after)
+                    early, step = (early, middle) if outside else (middle, step)
                 after = self._integrate_step(x, command, fixed, step)
                 after[self._q] = np.clip(after[self._q], self._lower, self._upper)
             x, left = after, left - step
@@ -171,17 +177,6 @@ class JointStops:
     def _is_outside_limits(self, x: Array) -> bool:
         q = x[self._q]
         return bool(np.any((q < self._below) | (q > self._above)))
-
-    def _time_to_stop(self, x: Array, command: Array, held: Flags, step: float) -> float:
-        """Return the time within a step (s) at which the first joint leaves its limits."""
-        early, late = 0.0, step
-        for _ in range(BISECTIONS):
-            middle = (early + late) / 2
-            if self._is_outside_limits(self._integrate_step(x, command, held, middle)):
-                late = middle
-            else:
-                early = middle
-        return late
 
 
 def stop_joints(compliance: Array, rates: Array, joints: Flags) -> tuple[Array, Array]:
@@ -358,7 +353,12 @@ class EffortPlant(CompiledPlant):
         parts = state_slices(n)
         state, command = ca.MX.sym("state", parts[-1].stop), ca.MX.sym("command", n + 6)
         h = ca.MX.sym("h")
-        lowest, highest = _effort_bounds(robot, state[parts[2]])
+        lowest, highest = -robot.effort_limit, robot.effort_limit
+        if wheels := robot.description.wheel_names:
+            is_wheel = np.array([name in wheels for name in robot.joint_names])
+            rate, qdot = np.where(is_wheel, robot.velocity_limit, np.inf), state[parts[2]]
+            lowest = ca.if_else(qdot <= -rate, 0.0, lowest)
+            highest = ca.if_else(qdot >= rate, 0.0, highest)
         effort = ca.fmin(ca.fmax(command[:n], lowest), highest)
         realised = ca.vertcat(effort, command[n:])
         march = repeat_step(_step_counting_stops(robot, model, loaded=loaded), substeps)
@@ -387,16 +387,6 @@ class EffortPlant(CompiledPlant):
                 ca.densify(ca.vertcat(ca.sum1(clipped) + touched, clipped, touched)),
             ],
         )
-
-
-def _effort_bounds(robot: SpaceRobot, qdot: ca.MX) -> tuple[ca.MX | Array, ca.MX | Array]:
-    """Return the smallest and the largest efforts (n,) of the motors."""
-    limit, wheels = robot.effort_limit, robot.description.wheel_names
-    if not wheels:
-        return -limit, limit
-    is_wheel = np.array([name in wheels for name in robot.joint_names])
-    rate = np.where(is_wheel, robot.velocity_limit, np.inf)
-    return ca.if_else(qdot <= -rate, 0.0, -limit), ca.if_else(qdot >= rate, 0.0, limit)
 
 
 def _step_counting_stops(

@@ -140,7 +140,13 @@ def build_model(
             active=False,
         )
     if contacts:
-        _set_masses(spec, robot)
+        # The mass properties of the description may not be those of its URDF.
+        inertias = {body.name: body.inertia for body in robot.bodies}
+        for link in robot.links:
+            body = spec.body(body_name(link.name))
+            body.explicitinertial = True
+            # A link on a fixed joint is part of another body.
+            _set_inertia(body, inertias.get(link.name, Inertia()))
         shapes = _add_contacts(mujoco, spec, robot, target)
     try:
         model = spec.compile()
@@ -194,16 +200,6 @@ def _add_contacts(
     for first, second in pairs:
         spec.add_pair(geomname1=first, geomname2=second)
     return shapes
-
-
-def _set_masses(spec: Any, robot: RobotDescription) -> None:
-    """Give each rigid body the mass properties of the description, which may not be its URDF's."""
-    bodies = {body.name: body.inertia for body in robot.bodies}
-    for link in robot.links:
-        body = spec.body(body_name(link.name))
-        body.explicitinertial = True
-        # A link on a fixed joint is part of another body.
-        _set_inertia(body, bodies.get(link.name, Inertia()))
 
 
 def _set_inertia(body: Any, inertia: Inertia) -> None:

@@ -127,6 +127,8 @@ class MujocoPlant:
         if self._target is not None:
             root = f"{TARGET}{self._target.description.base_link}"
             self._target_body = int(model.body(root).id)
+            joint = model.joint(f"{TARGET}free")
+            self._target_places = int(joint.qposadr[0]), int(joint.dofadr[0])
             links = [f"{TARGET}{name}" for name in self._target.description.frames]
             self._applied_to_target = MujocoLoads(mujoco, model, self._data, links)
         self._locks = [model.equality(f"lock {name}").id for name in robot.joint_names]
@@ -188,7 +190,11 @@ class MujocoPlant:
         data.qvel[:3], data.qvel[3:6] = motion.R_WB @ motion.twist[:3], motion.twist[3:]
         self._aim[:] = motion.qdot
         if target is not None:
-            self._place_target(target)
+            at, rate = self._target_places
+            data.qpos[at : at + 3] = target.r_WT
+            data.qpos[at + 3 : at + 7] = np.roll(quaternion_from_matrix(target.R_WT), 1)
+            data.qvel[rate : rate + 3] = target.v
+            data.qvel[rate + 3 : rate + 6] = target.R_WT.T @ target.omega
         self._update()
         if welded:
             self.weld()
@@ -235,8 +241,10 @@ class MujocoPlant:
             else:
                 self._step_at_rates(realised)
         else:
-            lowest, highest = self._effort_bounds()
-            realised = np.clip(wanted, lowest, highest)
+            # A wheel at its largest rate gets no faster.
+            rate, limit, wheel = robot.velocity_limit, robot.effort_limit, self._is_wheel
+            lowest = np.where(wheel & (self.qdot <= -rate), 0.0, -limit)
+            realised = np.clip(wanted, lowest, np.where(wheel & (self.qdot >= rate), 0.0, limit))
             self._data.ctrl[6:] = self.effort[:] = realised
             self._advance(self._steps)
         if not np.all(np.isfinite(self._data.qpos)):
@@ -281,32 +289,14 @@ class MujocoPlant:
     @property
     def target_motion(self) -> BodyMotion:
         """The current motion of the target's root link."""
-        joint, data = self._model.joint(f"{TARGET}free"), self._data
-        at, rate = int(joint.qposadr[0]), int(joint.dofadr[0])
+        data, (at, rate) = self._data, self._target_places
         R = matrix_from_quaternion(np.roll(data.qpos[at + 3 : at + 7], -1))
         omega = R @ data.qvel[rate + 3 : rate + 6]
         return BodyMotion(
             R, data.qpos[at : at + 3].copy(), data.qvel[rate : rate + 3].copy(), omega
         )
 
-    def _place_target(self, motion: BodyMotion) -> None:
-        joint, data = self._model.joint(f"{TARGET}free"), self._data
-        at, rate = int(joint.qposadr[0]), int(joint.dofadr[0])
-        data.qpos[at : at + 3] = motion.r_WT
-        data.qpos[at + 3 : at + 7] = np.roll(quaternion_from_matrix(motion.R_WT), 1)
-        data.qvel[rate : rate + 3] = motion.v
-        data.qvel[rate + 3 : rate + 6] = motion.R_WT.T @ motion.omega
-
     # -- a tick -------------------------------------------------------------------------------
-
-    def _effort_bounds(self) -> tuple[Array, Array]:
-        """Return the least and largest efforts (n,); a wheel at its largest rate gets no faster."""
-        limit, rate = self.robot.effort_limit, self.robot.velocity_limit
-        slowest, fastest = (
-            self._is_wheel & (self.qdot <= -rate),
-            self._is_wheel & (self.qdot >= rate),
-        )
-        return np.where(slowest, 0.0, -limit), np.where(fastest, 0.0, limit)
 
     def _advance(self, steps: int) -> None:
         mujoco = self._mujoco
