@@ -128,6 +128,8 @@ class Commander(ABC):
         """The obstacles described by that URDF."""
         self._goal_file = GoalFile(config.resume_file, goal_keys)
         self._goal_ids = GoalIds()
+        self._refused = "", ""
+        """Key and id of the last goal that was refused when it arrived."""
         self._waiting_goals: dict[str, IdentifiedGoal] = {}
         """Goals received before the robot description."""
         self._fly_to = FlyToGoals(self._goal_errors, self._report_aborted)
@@ -263,6 +265,7 @@ class Commander(ABC):
             goal = read()
             self._require_free()
         except PlanningError as error:
+            self._refused = key, goal_id
             self._refuse_goal(str(error), goal_id)
             return None
         accepted = IdentifiedGoal(goal, goal_id)

@@ -140,11 +140,21 @@ class PlannerCommander(Commander):
 
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
         """Accept a goal; base and end-effector goals with the same stamp form one goal."""
+        refused_key, refused_id = self._refused
+        if goal.goal_id == refused_id and key != refused_key:
+            self._refuse_goal("Another pose of the goal is refused.", goal.goal_id)
+            return
         last = self._last_goal
         if last is not None and last.goal_id == goal.goal_id and goal.goal_id:
             goal = replace(goal, goal=last.goal.joined_with(goal.goal))
         self._last_goal = goal
         super()._accept_goal(BASE_GOAL_KEY, goal)
+
+    def _refuse_goal(self, message: str, goal_id: str) -> None:
+        if goal_id in self._active_goal_ids():
+            self.abort(f"because another pose of the goal is refused: {message.rstrip('.')}")
+        else:
+            super()._refuse_goal(message, goal_id)
 
     def receive_twist(self, link: str, frame: str, linear: Array, angular: Array) -> None:
         """Make a link follow a twist until no more twists arrive; if this is impossible, the reason

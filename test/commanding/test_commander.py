@@ -352,6 +352,26 @@ def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
     assert not second.results
 
 
+@pytest.mark.parametrize("first", ["refused", "accepted"])
+def test_a_goal_of_which_a_pose_is_refused_moves_nothing(planner: Rig, first: str) -> None:
+    def elsewhere() -> Goal:
+        raise PlanningError("The goal is in another frame.")
+
+    parts = [(BASE_GOAL_KEY, elsewhere), ("end_effector", lambda: GOAL)]
+    for key, read in parts if first == "refused" else reversed(parts):
+        planner.commander.receive_goal(key, 5, 0, read)
+    for tick in range(1, 9):
+        planner.state(tick)
+    decided = [each for each in planner.host.statuses if each.goal_id == "5.000000000"]
+    assert {each.state.value for each in decided} == {first.replace("accepted", "aborted")}
+    assert "frame" in decided[0].message
+    assert not planner.host.starts
+    planner.goal(sec=5)  # once more, by the topic of the pose that was refused
+    planner.state(9)
+    planner.state(10)
+    assert planner.host.states[-1] == "executing"
+
+
 def test_after_the_end_of_a_waiting_goal_the_last_status_is_about_the_present_one(
     planner: Rig,
 ) -> None:
