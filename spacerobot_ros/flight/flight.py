@@ -359,7 +359,7 @@ class Flight(FlightData):
             # A controller's message states what kept it from the goal, if known.
             fact = self.message.partition(": ")[0]
         fact += ", but the target is not captured" * missed
-        if reached and not within and not missed:
+        if reached and not (missed or within):
             # The robot was moved later, for instance by a reset.
             fact = f"{self.message} At the end of the flight, the robot is elsewhere"
         return Verdict(word, f"{fact}: {errors}.", succeeded, succeeded and not left_out)
