@@ -129,6 +129,9 @@ class EpisodeConfig:
         return kind
 
 
+ARGUMENTS = frozenset(each.name for each in fields(EpisodeConfig))
+
+
 @dataclass(frozen=True)
 class _Start:
     """Start of an episode; ``states`` and ``sensors`` are rows of one flight."""
@@ -383,7 +386,7 @@ class Episodes:
         if name in _CHANGEABLE:
             checked = getattr(EpisodeConfig.of({name: value}), name)
             self._apply(replace(self._config, **{name: checked}))
-        elif self.has_attribute(name):
+        elif self.has_attribute(name) and name not in ARGUMENTS:
             setattr(self.task, name, value)
         else:
             known = *_CHANGEABLE, "attributes of the task"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from spacerobot_ros.environments import import_gymnasium
-from spacerobot_ros.environments.episodes import EpisodeConfig, Episodes
+from spacerobot_ros.environments.episodes import ARGUMENTS, EpisodeConfig, Episodes
 from spacerobot_ros.environments.tasks import require_names
 from spacerobot_ros.errors import ParameterError
 
@@ -117,7 +117,7 @@ class SpaceRobotEnv(gymnasium.Env, EzPickle):
 
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
         """Change an attribute; see `Episodes.change`."""
-        if not self.episodes.has_attribute(name):
+        if name not in ARGUMENTS and not self.episodes.has_attribute(name):
             return bool(super().set_wrapper_attr(name, value, force=force))
         self.episodes.change(name, value)
         return True

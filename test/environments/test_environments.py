@@ -454,6 +454,10 @@ def test_arguments_change_from_episode_to_episode() -> None:
     np.testing.assert_allclose(rewards, -7.0 - 0.01 * 0.02, atol=1e-3)
     with pytest.raises(ParameterError, match="no changeable attribute 'speed'; it has reward, "):
         vector.set_attr("speed", 1.0)
+    for change in vector.set_attr, single.set_wrapper_attr:
+        for name in ("hold", "scenario"):
+            with pytest.raises(ParameterError, match=f"no changeable attribute '{name}'; it has"):
+                change(name, 5)
     with pytest.raises(ParameterError, match=r"'tolerance' is -1\.0; it must be a number of"):
         vector.set_attr("tolerance", -1.0)
     assert vector.get_attr("tolerance") == (0.05,) * 3
