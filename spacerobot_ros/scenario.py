@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
@@ -481,7 +482,7 @@ def _end_effector_values(goal: Goal) -> dict[str, list[float] | list[list[float]
     return {each.link: each.numbers for each in goal.end_effectors}
 
 
-def load_scenario(name: str) -> Scenario:
+def load_scenario(name: str | os.PathLike[str]) -> Scenario:
     """Return a packaged scenario by name, or any parameter file by path.
 
     A file whose plant has a robot, such as a file from ``ros2 param dump``, needs no ``scenario``
@@ -492,6 +493,7 @@ def load_scenario(name: str) -> Scenario:
     ParameterError
         There is no such scenario, or the file cannot be used; the message names the file.
     """
+    name = os.fspath(name)
     path = Path(name)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():

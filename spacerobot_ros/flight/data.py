@@ -53,7 +53,7 @@ _TRUE_QUANTITIES = ("pose", "twist", "q", "qdot", "effort", "momentum")
 class FlightData:
     """The data of a flight, from :func:`spacerobot_ros.fly` or from a bag.
 
-    All arrays are copies; arrays for which data are missing have no rows.
+    All arrays are read-only; arrays for which data are missing have no rows.
 
     Attributes
     ----------

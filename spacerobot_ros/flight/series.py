@@ -40,6 +40,10 @@ class Signal:
     time: Array
     values: Array
 
+    def __post_init__(self) -> None:
+        # A caller that changed them would change errors, pictures and saved bags.
+        self.time.flags.writeable = self.values.flags.writeable = False
+
     def __len__(self) -> int:
         return len(self.time)
 

@@ -129,6 +129,8 @@ def quaternion_from_rotvec(rotvec: npt.ArrayLike) -> Array:
     vector = np.asarray(rotvec, dtype=float)
     angle = float(np.linalg.norm(vector))
     # np.sinc is sin(pi x)/(pi x), finite at zero.
+    if not math.isfinite(angle):
+        return np.full(4, math.nan)
     return np.append(0.5 * np.sinc(angle / (2 * math.pi)) * vector, math.cos(angle / 2))
 
 

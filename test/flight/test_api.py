@@ -106,10 +106,21 @@ def test_goals_of_a_plan_are_given_as_those_of_a_flight_are() -> None:
 
 
 @pytest.mark.parametrize(
-    "given", ["x", "1 2 3", {"x": 1}, (1.0, 2.0), 5, [[1, 2], [3]], (np.nan, 0, 0), object()]
+    "given",
+    [
+        "x",
+        "1 2 3",
+        {"x": 1},
+        (1.0, 2.0),
+        5,
+        [[1, 2], [3]],
+        (np.nan, 0, 0),
+        (np.inf, 0, 0),
+        object(),
+    ],
 )
 def test_what_is_no_goal_is_refused_in_one_sentence(given: Any) -> None:
-    scenario = load_scenario("faults/stuck_slider")
+    scenario = load_scenario(Path("faults/stuck_slider"))
     for action in (
         lambda: fly(scenario, given),
         lambda: fly(scenario, rotvec=given),
@@ -183,6 +194,9 @@ def test_every_joint_of_a_plot_is_told_from_the_others() -> None:
 def test_a_flight_is_saved_once_unless_it_may_replace_what_is_there(tmp_path: Path) -> None:
     flight = fly("faults/stuck_slider", parameters=QUICK)
     file = tmp_path / "Bäge mit Lücken" / "ein Flug.mcap"
+    for array in flight.q, flight.pose, flight.time:
+        with pytest.raises(ValueError, match="read-only"):  # A change would be saved, too.
+            array += 1.0
     flight.save(file)
     before = file.read_bytes()
     with pytest.raises(RecordingError, match="File exists"):
