@@ -17,7 +17,7 @@ class PinocchioOracle(Oracle):
         self.model.armature = np.zeros(self.model.nv)
         self.data = self.model.createData()
         ids = [self.model.getJointId(name) for name in self.joint_names]
-        assert max(ids) < self.model.njoints
+        assert max(ids, default=0) < self.model.njoints
         self._joints = [self.model.joints[index] for index in ids]
         self._selection = np.zeros((3 + self.n, 6 + self.n))
         self._selection[:3, 3:6] = np.eye(3)
