@@ -198,7 +198,7 @@ def stalls(flight: Flight) -> tuple[float, ControllerStatus]:
     found = [each for each in statuses(flight) if each[1].state is ControllerState.STALLED]
     assert {each.state.level for _, each in found} == {1}
     assert flight.outcome is Outcome.FAILED, flight.message
-    cause = found[-1][1].message.removesuffix(".").split("reference: ")[1]
+    cause = found[-1][1].message.removesuffix(".").partition("): ")[2]
     beginning = f"The goal is not reached in time, as {cause}: "
     assert flight.message.startswith(beginning)
     assert flight.verdict.sentence.startswith(beginning)
