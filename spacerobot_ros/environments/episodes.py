@@ -130,6 +130,7 @@ class EpisodeConfig:
 
 
 ARGUMENTS = frozenset(each.name for each in fields(EpisodeConfig))
+"""Names of the arguments with which an environment is made."""
 
 
 @dataclass(frozen=True)
