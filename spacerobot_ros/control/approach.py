@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import accumulate, product, takewhile
+from itertools import accumulate, product
 from operator import mul
 
 import numpy as np
@@ -44,8 +44,8 @@ _COARSE_STRIDE = 8
 _START_PERIOD = 1.0  # s
 
 _LONGEST_PATH = 60.0
-_PATH_DURATIONS = tuple(takewhile(_LONGEST_PATH.__gt__, accumulate([4.0] + [1.4] * 9, mul)))
-"""Trial durations of a path to the standoff, s, in a constant ratio."""
+_PATH_DURATIONS = tuple(accumulate([4.0] + [1.4] * 8, mul))
+"""Longest duration of a path to the standoff, s, and trial durations, s, in a constant ratio."""
 
 _CLOSING_SHARE = 0.5
 """Fraction of the acceleration limit used for closing in; the motion of the grapple frame needs the

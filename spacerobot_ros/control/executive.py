@@ -676,11 +676,11 @@ class ControlExecutive:
         if flies and ends is not None:
             settled = ends + self._config.settle_time
         report, pose = self._command_report, self.controller.goal.base
-        of_base, goal = self._goals.get(BASE_GOAL_KEY), list[float]()
         leads = self._pursues and not self._holds_until_planned  # The reference, to the goals.
-        if leads and pose is not None and of_base is not None and of_base.goal_id == goal_id:
-            goal = pose.values.tolist()
-        status = ControllerStatus(state, message, goal_id, report, name, settled, tuple(goal))
+        of_base = self._goals.get(BASE_GOAL_KEY) if leads else None
+        told = pose if of_base is not None and of_base.goal_id == goal_id else None
+        goal = () if told is None else tuple(told.values.tolist())
+        status = ControllerStatus(state, message, goal_id, report, name, settled, goal)
         self.outputs.append(status)
 
     def _publish_decision(self, state: ControllerState, message: str, goal_id: str) -> None:

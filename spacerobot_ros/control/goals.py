@@ -407,14 +407,13 @@ def decided_message(
     ``cause`` is the reason, if known, why the robot came no closer; ``missed`` lists the missed
     components of a partly reached goal; ``touched`` is the contact that made the goal fail.
     """
-    limits = list(zip(distance, config.tolerances, strict=True))
     away = f"{distance} from it ({tolerance_of(distance, config)})"
     if state is not ControllerState.FAILED:
         return reached_message(away, missed or {})
     if touched:
         return f"The goal is not reached without contact, as {touched}: {away}."
     late = f"not reached in time, as {cause}" if cause else "not reached in time"
-    if not any(off > most for off, most in limits):
+    if not any(off > most for off, most in zip(distance, config.tolerances, strict=True)):
         away += f", within tolerance for less than the settling time of {config.settle_time:g} s"
     return f"The goal is {late}: {away}."
 

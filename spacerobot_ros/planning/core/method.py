@@ -258,8 +258,7 @@ class GaitMethod(ABC):
             self._require_no_path(goal)
         if not is_clear:
             start = RobotState(path.position[0], path.quaternion[0], positions[0])
-            if clause := self._too_near(positions, self._base_poses(start, positions)):
-                raise PlanningError(f"On the way {clause}.")
+            self._require_clear(positions, self._base_poses(start, positions))
         if self._joint_efforts is not None:
             motion = motion or HeldMotion(positions, self.control_period)
             beyond = self._joint_efforts.beyond_limits(motion)
@@ -376,6 +375,11 @@ class GaitMethod(ABC):
         if not self._has_obstacles:
             return None
         return self._prediction.poses(start, positions, attitudes)
+
+    def _require_clear(self, positions: Array, base: BasePoses | None = None) -> None:
+        """Reject shapes (K, n) on the path that are too close; see :meth:`_too_near`."""
+        if clause := self._too_near(positions, base):
+            raise PlanningError(f"On the way {clause}.")
 
     def _too_near(
         self, positions: Array, base: BasePoses | None = None, *, at_ticks: bool = True

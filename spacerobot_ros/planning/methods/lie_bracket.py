@@ -117,8 +117,7 @@ class LieBracketGait(GaitMethod):
         slide = straight_motion(self.robot, state.q, ends, period, self.options.longest, 2 * n1)
         t1 = (len(slide) - 1) * period or self.options.t1
         attitudes = self._prediction.attitudes(slide, state.quaternion, state.angular_momentum)
-        if clause := self._too_near(slide):
-            raise PlanningError(f"On the way {clause}.")
+        self._require_clear(slide)
         cycle, n, notes = self._plan_turn(attitudes[-1], z_f, request)
         turn = np.tile(cycle[1:], (n, 1)) if n else np.empty((0, self.robot.n))
         path = self._predict_path(state, slide, attitudes, cycle, n)
