@@ -71,6 +71,7 @@ setup(
         NAME: [
             "py.typed",
             "batch/*.hpp",
+            "nodes/common/*.xml",
             "report/*.css",
             "report/*.js",
             "viewer/*.js",
@@ -145,6 +146,7 @@ setup(
             "pin",
             "pypdf",
             "pytest>=8",
+            "pytest-timeout",
             "pytest-xdist",
             "ruff",
             "setuptools",

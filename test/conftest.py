@@ -33,9 +33,13 @@ if not _WORKER:
     os.environ.setdefault("SPACEROBOT_CACHE_DIR", str(_scratch / "compiled"))
     # Generated message classes read it when they are imported.
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     for name in ("ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY", "ROS_DOMAIN_ID"):
         os.environ.pop(name, None)
+    if importlib.util.find_spec("rclpy"):
+        from spacerobot_ros.nodes.common.process import use_loopback_discovery
+
+        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = ""
+        use_loopback_discovery()
 
 # The same examples in every run, on every machine.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=40)

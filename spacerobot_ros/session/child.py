@@ -92,7 +92,6 @@ class NodeProcess:
         self,
         parameters: Mapping[str, Any],
         arguments: Sequence[str] = (),
-        environment: Mapping[str, str] | None = None,
         stdout: int | None = None,
     ) -> None:
         """Start the node with parameters and ROS arguments; standard output goes to the log unless
@@ -107,7 +106,7 @@ class NodeProcess:
         words = ["-m", __name__, self._module, *ros]
         words += ["--params-file", str(self._parameter_file), *arguments]
         with self._log_file.open("wb") as log:
-            self.child = start_child(words, environment, stdout=stdout or log, stderr=log)
+            self.child = start_child(words, stdout=stdout or log, stderr=log)
 
     @property
     def exit_code(self) -> int | None:

@@ -37,7 +37,6 @@ from spacerobot_ros.nodes.common.node import (
     endpoints_of,
     topics_without_all_matches,
 )
-from spacerobot_ros.nodes.common.process import FASTDDS_FILE_VARIABLES
 from spacerobot_ros.nodes.common.watchdog import HEARTBEAT_QOS, TOPIC, HeartbeatState, Role
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
@@ -53,27 +52,6 @@ _LONGEST_START = 60.0  # wall s
 
 _LONGEST_END = 10.0
 """Wall time, s, after a signal at which a node that is still running is killed."""
-
-_SETTINGS_WITHOUT_SHARED_MEMORY = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""Settings without shared memory; otherwise, Fast DDS could continue to write to the memory of a
-killed node.
-"""
-
-_FASTDDS_SETTINGS = """<?xml version="1.0" encoding="UTF-8"?>
-<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <profiles>
-    <data_writer profile_name="prompt" is_default_profile="true">
-      <times>
-        <initialHeartbeatDelay><sec>0</sec><nanosec>5000000</nanosec></initialHeartbeatDelay>
-        <heartbeatPeriod><sec>0</sec><nanosec>10000000</nanosec></heartbeatPeriod>
-      </times>
-    </data_writer>
-  </profiles>
-</dds>
-"""
-"""Fast DDS settings that make writers resend lost messages after 10 ms.
-
-With the default of 3 s, a lockstep plant would wait, and other nodes would lose messages."""
 
 _LONGEST_RECORDING_DELAY = 1.0
 """Wall time, s, in which the recorder receives the last messages from the plant."""
@@ -231,19 +209,10 @@ class MultiProcessStack:
         module, folder = NODE_TYPES[name].__module__, self._path()
         process = NodeProcess(name, module, folder, self.namespace, self._restarts)
         process = self._processes.setdefault(name, process)
-        process.start({**overrides, **parameters}, environment=self._environment())
+        process.start({**overrides, **parameters})
 
     def _path(self, name: str = "") -> Path:
         return Path(self._folder.name, name)
-
-    def _environment(self) -> dict[str, str]:
-        """Return the environment of a node; variables set by the user are kept."""
-        environment = {**_SETTINGS_WITHOUT_SHARED_MEMORY, **os.environ}
-        if not any(name in environment for name in FASTDDS_FILE_VARIABLES):
-            file = self._path("fastdds.xml")
-            file.write_text(_FASTDDS_SETTINGS, "utf-8")
-            environment |= dict.fromkeys(FASTDDS_FILE_VARIABLES, str(file))
-        return environment
 
     def start(self, goal: Goal | None, stopped: Callable[[], bool] = lambda: False) -> None:
         """Activate all nodes and send the goal, if any; the plant starts last. Return early if

@@ -34,10 +34,8 @@ from spacerobot_ros.nodes.common.process import start_ros
 from spacerobot_ros.nodes.viewer.node import ViewerNode
 
 DISCOVERY = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
-TRANSPORT = (
-    *("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE"),
-    "FASTRTPS_DEFAULT_PROFILES_FILE",
-)
+FILES = "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"
+TRANSPORT = "FASTDDS_BUILTIN_TRANSPORTS", *FILES
 KILOBYTE = 1024
 
 
@@ -47,59 +45,59 @@ def _no_choices(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv(name, "")
 
 
-@pytest.mark.parametrize("own", [None, *DISCOVERY, "ROS_DOMAIN_ID"])
-def test_discovery_is_on_this_machine_unless_the_user_chose(
-    monkeypatch: pytest.MonkeyPatch, own: str | None
+@pytest.mark.parametrize("own", ["", "ROS_AUTOMATIC_DISCOVERY_RANGE", *TRANSPORT])
+def test_messages_stay_on_this_machine_unless_the_user_chose(
+    monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:
-    with_free(monkeypatch, 2**30)
-    if own is not None:
-        monkeypatch.setenv(own, "7")
+    """By settings of Fast DDS that name the loopback interface, unless the user has others."""
+    if own:
+        monkeypatch.setenv(own, "LOCALHOST")
     process.use_loopback_discovery()
-    found = {name: os.environ[name] for name in DISCOVERY if os.environ[name]}
-    assert found == ({own: "7"} if own in DISCOVERY else {DISCOVERY[0]: "LOCALHOST"})
-
-
-def with_free(monkeypatch: pytest.MonkeyPatch, free: int | None) -> None:
-    """Let shared memory have so many bytes left; None: let there be none."""
-
-    def statvfs(_: object) -> os.statvfs_result:
-        if free is None:
-            raise FileNotFoundError
-        left = free // KILOBYTE
-        return os.statvfs_result((KILOBYTE, KILOBYTE, 1, left, left, 0, 0, 0, 0, 255))
-
-    monkeypatch.setattr("os.statvfs", statvfs)
+    process.use_loopback_discovery()  # As a child of this process does.
+    files = [os.environ[name] for name in FILES]
+    if own in FILES:
+        assert os.environ[DISCOVERY[0]] == "LOCALHOST"
+        assert sorted(files) == ["", "LOCALHOST"]
+    else:
+        assert os.environ[DISCOVERY[0]] == "SYSTEM_DEFAULT"
+        text = Path(files[0]).read_text()
+        assert files[0] == files[1]
+        assert "<address>127.0.0.1</address>" in text
+        assert "<useBuiltinTransports>false</useBuiltinTransports>" in text
 
 
 @pytest.mark.parametrize(
-    ("free", "own", "transport"),
-    [
-        *((free, "", "UDPv4") for free in (None, 0, 2**20)),
-        *((free, "", "") for free in (2**21, 2**30)),
-        pytest.param(2**30, "not writable", "UDPv4", id="not writable"),
-        pytest.param(0, "LARGE_DATA", "LARGE_DATA", id="a choice of the user"),
-    ],
+    ("own", "value"), [(DISCOVERY[0], "SUBNET"), (DISCOVERY[1], "10.0.0.7"), (DISCOVERY[2], "1")]
 )
-def test_without_shared_memory_messages_go_through_sockets(
-    free: int | None,
-    own: str,
-    transport: str,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+@pytest.mark.parametrize("transport", ["", "LARGE_DATA"])
+def test_a_chosen_network_is_kept(
+    monkeypatch: pytest.MonkeyPatch, own: str, value: str, transport: str
 ) -> None:
-    with_free(monkeypatch, free)
-    if own == "not writable":
-        monkeypatch.setattr("os.access", lambda *_: False)
-    elif own:
-        monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", own)
+    monkeypatch.setenv(own, value)
+    monkeypatch.setenv(TRANSPORT[0], transport)
     process.use_loopback_discovery()
-    assert os.environ["FASTDDS_BUILTIN_TRANSPORTS"] == transport
-    assert ("messages go through sockets" in caplog.text) == (transport == "UDPv4")
+    assert {name: os.environ[name] for name in DISCOVERY if os.environ[name]} == {own: value}
+    assert os.environ[TRANSPORT[0]] == (transport or "UDPv4")
+    assert "127.0.0.1" not in Path(os.environ[FILES[0]]).read_text()
 
 
-@pytest.mark.parametrize(("free", "warned"), [(None, False), (0, True), (2**20, False)])
+def test_other_middleware_has_only_its_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rclpy.get_rmw_implementation_identifier", lambda: "rmw_cyclonedds_cpp")
+    process.use_loopback_discovery()
+    assert os.environ[DISCOVERY[0]] == "LOCALHOST"
+    assert [os.environ[name] for name in TRANSPORT] == ["", "", ""]
+
+
+def with_free(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
+    """Let shared memory have so many bytes left."""
+    left = free // KILOBYTE
+    facts = os.statvfs_result((KILOBYTE, KILOBYTE, 1, left, left, 0, 0, 0, 0, 255))
+    monkeypatch.setattr("os.statvfs", lambda _: facts)
+
+
+@pytest.mark.parametrize(("free", "warned"), [(0, True), (2**20, False)])
 def test_full_memory_is_said_before_a_library_is_ended_by_it(
-    free: int | None,
+    free: int,
     warned: bool,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,

@@ -35,8 +35,6 @@ class Processes:
             **os.environ,
             "ROS_DOMAIN_ID": str(domain),
             "PYTHONPATH": str(ROOT),
-            # What a killed process leaves in shared memory holds its successor up.
-            "FASTDDS_BUILTIN_TRANSPORTS": "UDPv4",
         }
         self.running: dict[str, subprocess.Popen[str]] = {}
 

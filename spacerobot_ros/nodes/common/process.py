@@ -26,8 +26,6 @@ from spacerobot_ros.nodes.common.node import FlightNode
 from spacerobot_ros.parameters import declared
 from spacerobot_ros.termination import Terminated, graceful_shutdown, guarded
 
-_LOG = logging.getLogger(__name__)
-
 _LONGEST_DELIVERY = 1.0
 """Maximum wall time, s, to wait after a signal until readers confirm messages."""
 
@@ -37,44 +35,36 @@ _LONGEST_END = 10.0
 _LAST_DOMAIN = 232
 """Largest ROS_DOMAIN_ID: larger values have no valid ports."""
 
-_DISCOVERY_CHOICES = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
-
 FASTDDS_FILE_VARIABLES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 """Environment variables for the Fast DDS settings file: new and old name."""
-
-_TRANSPORT_CHOICES = ("FASTDDS_BUILTIN_TRANSPORTS", *FASTDDS_FILE_VARIABLES)
 
 _turn = itertools.count(os.getpid())
 """Consecutive tests in one process use different domains."""
 
-_SHARED_MEMORY = Path("/dev/shm")
-
-_REQUIRED_SHARED_MEMORY = 2 * 2**20
-"""Minimum free shared memory for a process, in bytes; the middleware uses about 1 MiB."""
-
 
 def use_loopback_discovery() -> None:
-    """Limit discovery to this machine unless the user chose otherwise; send messages through
-    sockets where shared memory is missing or full, and say why."""
-    if not any(os.environ.get(name) for name in _DISCOVERY_CHOICES):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    if any(os.environ.get(name) for name in _TRANSPORT_CHOICES):
+    """Limit discovery to this machine unless the user chose otherwise, and send messages through
+    sockets.
+
+    Through shared memory, a process that does not read for a second may never receive anything
+    again: Fast DDS takes it for dead, and replaces the memory that the process reads. In the
+    settings files, writers resend lost messages after 10 ms; with the default of 3 s, a plant in
+    lockstep would wait, and other nodes would lose messages.
+    """
+    reach = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+    elsewhere = any(os.environ.get(name) for name in ("ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY"))
+    local = not elsewhere and os.environ.get(reach, "") in ("", "LOCALHOST")
+    if local:
+        os.environ[reach] = "LOCALHOST"
+    chosen = any(os.environ.get(name) for name in FASTDDS_FILE_VARIABLES)
+    if chosen or not rclpy.get_rmw_implementation_identifier().startswith("rmw_fastrtps"):
         return
-    try:
-        facts = os.statvfs(_SHARED_MEMORY)
-    except OSError:
-        free = 0
-    else:
-        free = facts.f_bavail * facts.f_frsize if os.access(_SHARED_MEMORY, os.W_OK) else 0
-    if free < _REQUIRED_SHARED_MEMORY:
+    if local:
+        os.environ[reach] = "SYSTEM_DEFAULT"  # With LOCALHOST, ROS would choose the transports.
+    elif not os.environ.get("FASTDDS_BUILTIN_TRANSPORTS"):
         os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
-        _LOG.warning(
-            "%s has %d kB of usable space: messages go through sockets "
-            "(FASTDDS_BUILTIN_TRANSPORTS=UDPv4). fastrtps_* files left by killed processes may be "
-            "deleted while nothing runs.",
-            _SHARED_MEMORY,
-            free // 1024,
-        )
+    file = Path(__file__).with_name(f"fastdds_{'loopback' if local else 'network'}.xml")
+    os.environ.update(dict.fromkeys(FASTDDS_FILE_VARIABLES, str(file)))
 
 
 @contextmanager
