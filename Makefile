@@ -41,8 +41,10 @@ demo: $(STAMP)/demo ## fly sliding_masses, the paper's way, and the fast way by 
 	$(BIN)/spacerobot run sliding_masses --nodes --bag out/sliding_masses.mcap
 	$(BIN)/spacerobot report out/sliding_masses.mcap --beside out/sliding_masses_paper.mcap
 
-# Nodes in real time may fail beside other tests: those that fail are run once more, alone.
-AGAIN := $(BIN)/python3 -m pytest --last-failed --last-failed-no-failures none
+# Nodes in real time may fail beside other tests: those that fail are run once more, alone. A test
+# that hangs fails with the stacks of its threads.
+PYTEST := $(BIN)/python3 -m pytest --timeout 600
+AGAIN := $(PYTEST) --last-failed --last-failed-no-failures none
 
 .PHONY: test
 test: $(STAMP)/test ## check style and types, run the tests
@@ -53,12 +55,12 @@ test: $(STAMP)/test ## check style and types, run the tests
 	@# time wait for their clock.
 	@$(BIN)/mypy >$(STAMP)/mypy.txt 2>&1 & types=$$!; \
 	    $(BIN)/python3 -m pytest --collect-only -qq >$(STAMP)/collected.txt 2>&1; \
-	    $(BIN)/python3 -m pytest -n 3 || $(AGAIN); tests=$$?; \
+	    $(PYTEST) -n 3 || $(AGAIN); tests=$$?; \
 	    wait $$types; types=$$?; cat $(STAMP)/mypy.txt; exit $$((tests | types))
 
 .PHONY: test-slow
 test-slow: $(STAMP)/test ## run the slow tests: long flights and plans, nodes in real time, pages of the documentation
-	$(BIN)/python3 -m pytest -m "slow and not study" -n 3 --dist loadfile --durations=20 || \
+	$(PYTEST) -m "slow and not study" -n 3 --dist loadfile --durations=20 || \
 	    $(AGAIN) -m "slow and not study"
 
 # With TESTED and VENV given here, the rules below make another environment.
