@@ -175,21 +175,23 @@ class Stack:
         self.executor.add_node(client.node)
 
         def launch() -> None:
-            """Send the goal, once; nodes that are not active are activated, the plant after it."""
+            """Activate nodes that are not active, and send the goal, once."""
             for node in self._inactive:
                 if node.get_name() == "plant":
-                    client.send(goal)
+                    # Topics have no common order: the plant starts once the goal is known.
+                    if client.goal_id is None:
+                        client.send(goal)
+                    if client.decider in self.nodes and not client.message:
+                        return
                 node.require_transition(node.trigger_activate)
             if client.goal_id is None:
                 client.send(goal)
+            timer.cancel()
 
         try:
             self._connect([*self.nodes.values(), client.node])
-            # Messages published by one callback are delivered in order: the goal comes first.
             clock = Clock(clock_type=ClockType.STEADY_TIME)
             timer = client.node.create_timer(1e-3, launch, clock=clock)
-            self.spin_until(lambda: client.goal_id is not None)
-            client.node.destroy_timer(timer)
             self.spin_until(
                 lambda: client.outcome is not None,
                 lambda: (

@@ -496,7 +496,8 @@ class Commander(ABC):
         goal_id = self._pursued_goal_id if missing else ""
         if (missing, goal_id) == self._reported_missing or not self.active:
             return
-        if missing and self._reported_missing[0] and self.inputs.just_begun:
+        reported, reported_id = self._reported_missing
+        if missing and reported and goal_id == reported_id and self.inputs.just_begun:
             return  # The other messages are on their way.
         self._reported_missing = missing, goal_id
         if missing:
