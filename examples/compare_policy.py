@@ -42,7 +42,8 @@ def main(file: Path, count: int) -> None:
     tell("policy", reached[:count], durations[:count])
     for method in ("optimal", "area_loop"):
         scenario = load_scenario("arm_attitude").with_method(method)
-        flights = [spacerobot_ros.fly(scenario, np.array([0, 0, 0, *q])) for q in goals[:count]]
+        poses = [[np.nan, np.nan, np.nan, *q] for q in goals[:count]]  # Any position.
+        flights = [spacerobot_ros.fly(scenario, pose) for pose in poses]
         succeeded = np.array([flight.succeeded for flight in flights])
         tell(method, succeeded, np.array([flight.manoeuvre_time for flight in flights]))
 

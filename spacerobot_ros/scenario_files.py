@@ -252,7 +252,7 @@ def changed_goal(
     before
         The other goal; its end-effector goals and waypoints are dropped.
     pose
-        A goal, a pose (7,) or a position (3,), m.
+        A goal, a pose (7,), a part of which may be NaN (not requested), or a position (3,), m.
     position, rotvec, rpy_deg
         Position (3,), m, and attitude (3,) as a rotation vector (rad), or as roll, pitch and yaw
         about fixed axes (deg); they override ``pose``.
@@ -260,7 +260,7 @@ def changed_goal(
     Raises
     ------
     GoalError
-        The pose or the attitude is not finite, or the attitude is given twice.
+        The pose requests nothing, or a part of it is not finite, or the attitude is given twice.
     """
     if rotvec is not None and rpy_deg is not None:
         raise GoalError("The goal attitude is given twice, in radians and in degrees.")
@@ -275,8 +275,12 @@ def changed_goal(
                 f"{len(numbers)}."
             )
         whole = len(numbers) == 7
-        given = Goal.checked(numbers[:3], numbers[3:] if whole else before.quaternion)
-        asked = POSE if whole else before.asked | _POSITION
+        given = (
+            Goal.received(numbers[:3].tolist(), numbers[3:].tolist())
+            if whole
+            else Goal.checked(numbers[:3], before.quaternion)
+        )
+        asked = given.asked if whole else before.asked | _POSITION
         made = replace(made, position=given.position, quaternion=given.quaternion, asked=asked)
     if position is not None:
         place = as_numbers(position, "The position", GoalError).reshape(-1)

@@ -30,6 +30,7 @@ from spacerobot_ros.flight.trials import (
     try_goals,
     try_method,
 )
+from spacerobot_ros.measures import Outcome
 from spacerobot_ros.model import SpaceRobot, load_robot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import GaitSchedule, Goal, PlanRequest
@@ -106,10 +107,24 @@ def test_goals_of_a_plan_are_given_as_those_of_a_flight_are() -> None:
 
 
 @pytest.mark.parametrize(
+    ("place", "outcome"), [(np.nan, Outcome.REACHED), (0.0, Outcome.REACHED_PARTLY)]
+)
+def test_a_position_that_is_nan_is_not_asked_for(place: float, outcome: Outcome) -> None:
+    """The base of an arm moves as it turns."""
+    turn = Rotation.from_rotvec((0.05, -0.03, 0.04)).as_quat()
+    flight = fly(load_scenario("arm_attitude"), [place] * 3 + [*turn], method="optimal")
+    assert flight.outcome is outcome
+    last = Rotation.from_quat(flight.pose[-1, 3:])
+    assert (Rotation.from_quat(turn).inv() * last).magnitude() < 1e-6
+
+
+@pytest.mark.parametrize(
     "given",
     [
         "x",
         "1 2 3",
+        [np.nan] * 7,
+        (0, 0, np.nan, 0, 0, 0, 1),
         {"x": 1},
         (1.0, 2.0),
         5,
