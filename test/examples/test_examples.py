@@ -80,8 +80,13 @@ def test_an_example_runs(example: Path, tmp_path: Path, warm_python: WarmPython)
     if example.stem == "train_policy":
         pytest.importorskip("stable_baselines3")
         given += ["200000"]
+    if example.stem == "train_on_device":
+        pytest.importorskip("torch")
+        given += ["host", "200000"]
     said = run(warm_python, tmp_path, example, *given)
     assert len(said.splitlines()) >= 3
+    if example.stem == "compare_policy":
+        assert " 0.0%" not in said, said
 
 
 def test_the_bag_example_draws_a_picture(tmp_path: Path, warm_python: WarmPython) -> None:
