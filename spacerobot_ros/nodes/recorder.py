@@ -435,9 +435,10 @@ class RecorderNode(FlightNode):
 class _RecordedTransforms:
     """Writes transforms of one robot, computed from its recorded topics.
 
-    A state is used once its odom and its joint_states have arrived, in either order. So the
-    transforms have the stamps of states, and are at least ``tf_period`` of bag time apart. While a
-    node publishes /tf itself, its messages are recorded, and none are written here.
+    A state is used once its odom and its joint_states have arrived, in either order: topics have no
+    common order. So the transforms have the stamps of states, and are at least ``tf_period`` of bag
+    time apart. While a node publishes /tf itself, its messages are recorded, and none are written
+    here.
     """
 
     def __init__(self, node: RecorderNode, recording: Recording) -> None:
@@ -451,7 +452,8 @@ class _RecordedTransforms:
         }
         self.listeners = {node.resolve_topic_name(name): f for name, f in callbacks.items()}
         """Functions that take the messages, by topic."""
-        self._latest = {"odom": b"", "joint_states": b""}
+        self._unpaired: dict[str, dict[bytes, bytes]] = {"odom": {}, "joint_states": {}}
+        """By topic and stamp: messages whose state is not complete, in order of arrival."""
         self._last_ns, self._next_ns = 0, 0
         self._description: RobotDescription | None = None
         self._state: StateFrames | None = None
@@ -469,10 +471,18 @@ class _RecordedTransforms:
     def _on_state(self, topic: str, raw: bytes) -> None:
         """Write the transforms of a complete state if the period is over, or time has jumped
         back."""
-        self._latest[topic] = raw
-        odom, joint_states = self._latest.values()
-        if odom[HEADER_STAMP] != joint_states[HEADER_STAMP]:
+        stamp, own = raw[HEADER_STAMP], self._unpaired[topic]
+        (other,) = (each for name, each in self._unpaired.items() if name != topic)
+        if stamp not in other:
+            own[stamp] = raw
+            if len(own) > STREAM.depth:
+                del own[next(iter(own))]
             return
+        own.clear()  # The other topic has passed these.
+        while (first := next(iter(other))) != stamp:
+            del other[first]
+        partner = other.pop(stamp)
+        odom, joint_states = (raw, partner) if topic == "odom" else (partner, raw)
         state, time_ns = self._state, first_time_ns(odom)
         if self._last_ns <= time_ns < self._next_ns or state is None:
             return

@@ -15,6 +15,8 @@ from nav_msgs.msg import Odometry
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from support.made_bags import stamped
 from support.planner_flight import Flight, goal_at, values_of
 from support.ros_harness import Harness, nanoseconds
 
@@ -30,6 +32,7 @@ from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot
 from spacerobot_ros.nodes import PlantNode, RecorderNode
 from spacerobot_ros.nodes.common.messages import KnownFrames, pose_array
+from spacerobot_ros.nodes.common.node import LATCHED, STREAM
 from spacerobot_ros.nodes.plant import publisher
 from spacerobot_ros.resources import robot_file
 
@@ -174,6 +177,40 @@ def test_a_recorder_writes_frames_as_often_as_it_is_to(harness: Harness, tmp_pat
     every = {"tf_period": 0.2}
     bag = record_states(harness, tmp_path / "bag.mcap", "planar_chain", every, tf_period=0.0)
     assert set(np.diff([time for time, _ in bag["/tf"].messages()])) == {200_000_000}
+
+
+def test_frames_need_no_order_between_topics(harness: Harness, tmp_path: Path) -> None:
+    """Positions come late, two states at once, then early; one state has no pose."""
+    robot, bag = robot_file("planar_chain"), tmp_path / "bag.mcap"
+    names = [joint.name for joint in load_robot(robot).joints if joint.name]
+    recorder = harness.make(RecorderNode, {"bag": str(bag), "tf_period": 0.0001}, autostart=False)
+    recorder.start()
+    source = harness.probe({"joint_states": JointState})
+    description = source.create_publisher(String, "robot_description", LATCHED)
+    odoms = source.create_publisher(Odometry, "odom", STREAM)
+    joints = source.create_publisher(JointState, "joint_states", STREAM)
+    for each in (description, odoms, joints):
+        harness.matched(each)
+    harness.spin_until(lambda: {"/odom", "/joint_states", "/robot_description"} <= recorder.topics)
+    description.publish(String(data=robot.read_text("utf-8")))
+    harness.settle(source)
+    for order in ((odoms, (0, 1)), (joints, (0, 1, 2, 3)), (odoms, (3,))):
+        for k in order[1]:
+            if order[0] is odoms:
+                odom = Odometry(child_frame_id="base_link")
+                odom.header.frame_id, odom.pose.pose.orientation.w = "world", 1.0
+                odom.pose.pose.position.x = 0.1 * k
+                odoms.publish(stamped(odom, 0.05 * k, "world"))
+            else:
+                state = JointState(name=names, position=[0.1 * k] * len(names))
+                state.velocity = [0.0] * len(names)
+                joints.publish(stamped(state, 0.05 * k))
+        harness.settle(source)
+    recorder.trigger_deactivate()
+    recorder.trigger_cleanup()
+    frames = [message.transforms[0] for _, message in read_bag(bag)["/tf"].messages()]
+    found = [(each.header.stamp.nanosec, each.transform.translation.x) for each in frames]
+    assert found == [(0, 0.0), (50_000_000, 0.1), (150_000_000, pytest.approx(0.3))]
 
 
 class Frames:
