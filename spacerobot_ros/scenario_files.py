@@ -20,6 +20,7 @@ from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionErr
 from spacerobot_ros.files import load_yaml, warn_once
 from spacerobot_ros.model.urdf import load_world
 from spacerobot_ros.parameters import as_numbers, declared, known_values
+from spacerobot_ros.planning.api import warn_of_large_angles
 from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal, Goal
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import is_path, suggestion
@@ -289,6 +290,7 @@ def changed_goal(
     if rotvec is not None:
         turn = as_numbers(rotvec, "The rotvec", GoalError).reshape(-1)
         given = Goal.from_rotvec(made.position, turn.tolist())
+        warn_of_large_angles(turn)
     elif rpy_deg is not None:
         given = Goal.from_rpy(made.position, rpy_deg)
     else:
@@ -369,4 +371,5 @@ def _parse_pose(name: str, values: Mapping[str, Any]) -> Goal:
         if f"{name}_orientation" in values:
             raise GoalError(f"{name}_orientation and {name}_rotvec are both given: remove one.")
         orientation = Goal.from_rotvec(position, values[f"{name}_rotvec"]).quaternion
+        warn_of_large_angles(values[f"{name}_rotvec"])
     return Goal.checked(position, orientation, values.get(f"{name}_joint_positions"))

@@ -28,7 +28,6 @@ from spacerobot_ros.cli.options import (
     settings_option,
     view_option,
     viewer_if_requested,
-    warn_of_large_angles,
     write_json,
 )
 from spacerobot_ros.cli.terminal import display, exit_if_terminated, fail, say
@@ -398,6 +397,7 @@ def goal_command(
             "With end-effector goals, give the base attitude together with the position X Y Z."
         )
     from spacerobot_ros.planning import Goal
+    from spacerobot_ros.planning.api import warn_of_large_angles
 
     if not (pose or turned):
         goal = Goal.of_end_effectors(hands)

@@ -290,7 +290,6 @@ def goal_options(command: Callable[..., None]) -> Callable[..., None]:
         hands = end_effector_goals(*given)
 
         def changed(scenario: Scenario) -> Scenario:
-            warn_of_large_angles(rotvec or ())
             return scenario.with_goal(goal or position, rotvec, rpy_deg, end_effectors=hands)
 
         command(*words, goal=changed, **options)
@@ -341,17 +340,6 @@ def end_effector_options(command: Callable[..., None]) -> Callable[..., None]:
     ):
         command = option(command)
     return command
-
-
-def warn_of_large_angles(rotvec: Sequence[float]) -> None:
-    """Warn about a rotation of more than one revolution, which may be in degrees."""
-    angle = math.hypot(*rotvec)
-    if 2 * math.pi < angle < math.inf:
-        say(
-            f"The goal rotates by {angle:.5g} rad, which is {angle / (2 * math.pi):.3g} "
-            "revolutions: only the final attitude matters. For degrees, use --goal-rpy-deg.",
-            err=True,
-        )
 
 
 class RegisteredName(_Choice):

@@ -11,10 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import GoalError, ParameterError, counted
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.model.urdf import load_world, with_world
+from spacerobot_ros.parameters import as_numbers
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, RobotState, Tolerance
 from spacerobot_ros.planning.core.method import END_EFFECTOR_METHOD, PATH_METHOD, PlanRequest
@@ -100,6 +102,8 @@ def plan(
             end_effector_position, end_effector_pose, end_effector, path=end_effector_path
         )
         quaternion = None if rotvec is None else quaternion_from_rotvec(rotvec)
+        if rotvec is not None:
+            warn_of_large_angles(rotvec)
         if hands:
             goal = Goal.of_end_effectors(
                 hands, position=position, quaternion=quaternion, joint_positions=joint_positions
@@ -173,12 +177,23 @@ def end_effector_goals(
     return tuple(goals)
 
 
+def warn_of_large_angles(rotvec: npt.ArrayLike) -> None:
+    """Warn about a rotation of more than one revolution, which may be in degrees."""
+    angle = float(np.linalg.norm(rotvec))
+    if 2 * np.pi < angle < np.inf:
+        warn_once(
+            f"The goal rotates by {angle:.5g} rad, which is {angle / (2 * np.pi):.3g} "
+            "revolutions: only the final attitude matters. Rotation vectors are in rad; "
+            "--goal-rpy-deg takes degrees."
+        )
+
+
 def _start_state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) -> RobotState:
     if isinstance(start, RobotState):
         return start
     q = np.clip(np.zeros(robot.n), robot.lower, robot.upper)
     if start is not None:
-        q = np.asarray(start, dtype=float)
+        q = as_numbers(start, "The start")
     if q.shape != (robot.n,):
         raise ParameterError(
             f"The start has {counted(q.size, 'joint position')}, but robot "

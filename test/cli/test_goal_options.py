@@ -30,10 +30,10 @@ from spacerobot_ros.cli.options import (
     beside,
     end_effector_goals,
     goal_options,
-    warn_of_large_angles,
 )
 from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
+from spacerobot_ros.planning.api import plan, warn_of_large_angles
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.termination import Terminated
 
@@ -106,12 +106,24 @@ def test_end_effectors_with_more_or_fewer_names_are_refused(
     ],
 )
 def test_a_rotation_of_more_than_a_turn_is_noted(
-    rotvec: tuple[float, float, float], turn: str, capsys: pytest.CaptureFixture[str]
+    rotvec: tuple[float, float, float], turn: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    advice = "only the final attitude matters. For degrees, use --goal-rpy-deg."
-    said = f"The goal rotates by {turn}: {advice}\n" if turn else ""
+    advice = "Rotation vectors are in rad; --goal-rpy-deg takes degrees."
+    said = f"The goal rotates by {turn}: only the final attitude matters. {advice}"
     warn_of_large_angles(rotvec)
-    assert capsys.readouterr() == ("", said)
+    assert caplog.messages == ([said] if turn else [])
+
+
+def test_degrees_in_a_file_or_in_python_are_noted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "degrees.yaml"
+    file.write_text("scenario: {ros__parameters: {goal_rotvec: [0, 0, 20]}}", "utf-8")
+    load_scenario(str(file)).with_goal(rotvec=(0, 0, 30))
+    with pytest.raises(PlanningError, match="lie_bracket needs three sliders"):
+        plan("planar_chain", rotvec=(0, 0, 40), method="lie_bracket")
+    noted = [message.partition(" rad, which is ")[0] for message in caplog.messages]
+    assert noted == [f"The goal rotates by {angle}" for angle in (20, 30, 40)]
 
 
 # -- how commands end -----------------------------------------------------------------------------
@@ -173,7 +185,9 @@ def test_files_that_are_no_paths_are_refused(tmp_path: Path, text: str | None, w
 
 
 @pytest.mark.parametrize("words", [["0.25", "-0.5", "1e-1"], ["0.25", "-0.5", ".1", *"0001"]])
-def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) -> None:
+def test_a_goal_of_the_command_line_is_a_position_or_a_pose(
+    words: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
     """Three numbers keep the attitude of the scenario; negative ones are no options."""
     found: list[Any] = []
 
@@ -183,8 +197,10 @@ def test_a_goal_of_the_command_line_is_a_position_or_a_pose(words: list[str]) ->
     def fly(scenario: str, goal: GoalOptions) -> None:
         found.append(goal(load_scenario(scenario)).goal)
 
-    options = ["--goal-rotvec", "0", "0", "7"]
-    assert "1.11 revolutions" in CliRunner().invoke(fly, ["sliding_masses", *options]).stderr
+    angle = 10 + len(words)
+    options = ["--goal-rotvec", "0", "0", str(angle)]
+    assert CliRunner().invoke(fly, ["sliding_masses", *options]).exit_code == 0
+    assert f"The goal rotates by {angle} rad" in caplog.text
     found.clear()
     result = CliRunner().invoke(fly, ["sliding_masses", "--goal", *words])
     assert result.exit_code == 0, result.output
