@@ -522,7 +522,7 @@ def load_scenario(name: str | os.PathLike[str]) -> Scenario:
         published_method=str(values.get("published_method", "")),
         kills=parse_kills(values.get("kills", []), f"the file {path}"),
         in_file=in_file,
-        has_goal=True,
+        has_goal=any("goal" in key for key in values),
     )._with_goal_topics()
 
 

@@ -158,7 +158,7 @@ def _sections(content: Mapping[str, Any], path: Path) -> dict[str, dict[str, Any
         node = str(key).rpartition("/")[2]
         if node not in (*NODES, "**"):
             # Sections of other nodes are allowed, but this may be a misspelt name.
-            if node != "scenario" and (meant := suggestion(node, NODES)):
+            if node != "scenario" and (meant := suggestion(node, (*NODES, "scenario"))):
                 warn_once(f"The section '{key}' of {path} is of no node of this package.{meant}")
             continue
         section = {} if section is None else section

@@ -253,7 +253,7 @@ def test_files_beside_a_scenario_come_before_those_of_the_present_folder(
     assert scenario.parameters("planner")["srdf"] == str(folder / "pairs.srdf")
 
 
-def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
+def test_a_robot_alone_is_a_scenario_without_a_goal(tmp_path: Path) -> None:
     alone = scenario_or_robot("three_joint_arm")
     with pytest.raises(ParameterError) as refused:
         alone.require_goal()
@@ -261,6 +261,7 @@ def test_a_robot_alone_is_a_scenario_without_a_goal() -> None:
         "'three_joint_arm' has no goal: give one, for instance --goal-rpy-deg 0 0 10, or "
         "write a scenario with a goal (`spacerobot new` writes one for a robot)."
     )
+    assert not written(tmp_path, text_of("description: Without a goal")).has_goal
     there = alone.with_goal(rpy_deg=(0.0, 0.0, 90.0))
     there.require_goal()
     half = np.sqrt(0.5)
@@ -390,13 +391,14 @@ def test_files_without_sections(tmp_path: Path, caplog: pytest.LogCaptureFixture
         )
     path.write_text("[1]")
     assert read_sections(path) == {}
-    path.write_text("camera: {}\n/**/recoder: {ros__parameters: {compression: zstd}}")
+    path.write_text("camera: {}\n/**/recoder: {ros__parameters: {compression: zstd}}\nszenario: {}")
     assert read_sections(path) == {}
     every = "{camera_gain: 2.0, law: model_based, tick_rte: 50.0, use_sim_time: true}"
     path.write_text(f"/**: {{ros__parameters: {every}}}\nplant: {{}}")
     assert read_sections(path) == {"plant": {}}
-    said, again = caplog.messages
+    said, other, again = caplog.messages
     assert said.endswith(" Did you mean 'recorder'?")
+    assert other.endswith(" Did you mean 'scenario'?")
     assert_one_sentence(again, "'tick_rte'", "Did you mean 'tick_rate'?")
     with pytest.raises(ParameterError, match="cannot be read"):
         read_sections(tmp_path / "none.yaml")
