@@ -466,7 +466,9 @@ class Episodes:
         elif self._goals_of_scenario:
             self.goals[chosen] = np.array([task.goal_of(each.scenario) for each in drawn])[which]
         else:
-            self.goals[chosen] = task.random_goals(self._states[chosen], self.spread, own)
+            random_goals = task.random_goals(self._states[chosen], self.spread, own)
+            self._require_shape("random_goals", random_goals, len(own), task.goal_size)
+            self.goals[chosen] = random_goals
         self._observe(chosen)
 
     def _begin_on_device(self, rows: Any, rng: Any, goals: Array | None) -> None:
@@ -548,12 +550,18 @@ class Episodes:
         measured = self._arrays.flatnonzero(under_way)
         self._observe(measured if self._source.has_sensor_errors else slice(None))
         alive = flights.has_not_ended
-        reached = alive & task.reached(after, self.errors, self.tolerance)
-        failed = (under_way & ~alive) | (alive & ~reached & task.failed(after, self.goals))
+        reached = task.reached(after, self.errors, self.tolerance)
+        failed = task.failed(after, self.goals)
+        self._require_shape("reached", reached, len(shares))
+        self._require_shape("failed", failed, len(shares))
+        reached = alive & reached
+        failed = (under_way & ~alive) | (alive & ~reached & failed)
         shares = np.clip(shares, -1.0, 1.0)
         done = (before, after, self.goals, shares, errors, self.errors, reached, failed)
         step = Step(*done, self.step_duration)
-        rewards = np.where(under_way, task.reward(step, self._weights), 0.0)
+        rewards = task.reward(step, self._weights)
+        self._require_shape("reward", rewards, len(shares))
+        rewards = np.where(under_way, rewards, 0.0)
         self.rewards = rewards.astype(self.errors.dtype, copy=False)
         self.reached, self.terminations = reached, reached | failed
         late = flights.time > self.time_limit - 0.5 * self.step_duration
@@ -562,11 +570,24 @@ class Episodes:
     def _observe(self, rows: Any = slice(None)) -> None:
         states, goals = self._states[rows], self.goals[rows]
         remaining = self.task.remaining(states, goals)
-        self.errors[rows] = self.task.errors(remaining)
+        errors = self.task.errors(remaining)
+        self._require_shape("errors", errors, len(goals))
+        self.errors[rows] = errors
         if self._source.has_sensor_errors and len(rows):
             states = self._measured(states, rows)
             remaining = self.task.remaining(states, goals)
-        self.observations[rows] = self.task.observe(states, remaining)
+        observations = self.task.observe(states, remaining)
+        self._require_shape("observe", observations, len(goals), self.observations.shape[1])
+        self.observations[rows] = observations
+
+    def _require_shape(self, function: str, found: Any, *wanted: int) -> None:
+        shape = getattr(found, "shape", None)
+        if shape != wanted:
+            what = found if shape is None else f"an array of shape {shape}"
+            raise ParameterError(
+                f"{function} of task '{self.task.name}' returned {what}; it must return an array "
+                f"of shape {wanted}, with one row per robot."
+            )
 
     def _measured(self, states: RobotStates, rows: Any) -> RobotStates:
         size = 12 + 2 * self.robot.n

@@ -434,6 +434,34 @@ def test_a_task_of_ones_own_decides_starts_rewards_and_ends() -> None:
     assert (reward, lost, info["is_success"]) == (pytest.approx(-5.0), True, False)
 
 
+@pytest.mark.parametrize(
+    ("function", "found", "sentence"),
+    [
+        ("random_goal", np.zeros(4), r"random_goals .* of shape \(2, 4\); .* of shape \(2, 3\)"),
+        ("remaining", np.zeros((2, 2)), r"of shape \(2, 2\); each row must have 3 numbers"),
+        ("errors", np.zeros((2, 1)), r"of shape \(2, 1\); it must return an array of shape \(2,\)"),
+        ("reached", np.array([True]), r"of shape \(1,\); it must return an array of shape \(2,\)"),
+        ("failed", None, r"failed of task 'odd_failed' returned None; it must return an array"),
+        ("reward", 3.0, r"reward of task 'odd_reward' returned 3.0; it must return an array"),
+        (
+            "observe",
+            np.zeros((2, 3)),
+            r"of shape \(2, 3\); it must return an array of shape \(2, 13",
+        ),
+    ],
+)
+def test_arrays_of_a_task_have_one_row_per_robot(function: str, found: Any, sentence: str) -> None:
+    task = type("Odd", (Point,), {"name": f"odd_{function}", function: lambda *_: found})
+
+    def step() -> None:
+        vector: Any = gymnasium.make_vec(OWN, num_envs=2, task=task, scenario="planar_chain")
+        vector.reset(seed=1)
+        vector.step(np.zeros((2, 2)))
+
+    with pytest.raises(ParameterError, match=sentence):
+        step()
+
+
 def test_arguments_change_from_episode_to_episode() -> None:
     vector: Any = gymnasium.make_vec(OWN, num_envs=3, task="point", scenario="planar_chain")
     single: Any = gymnasium.make(OWN, task="point", scenario="planar_chain")
