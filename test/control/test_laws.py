@@ -159,6 +159,20 @@ def test_a_law_says_which_gains_it_lacks() -> None:
 
 
 @pytest.mark.parametrize(
+    ("results", "shape"), [({"actuation": ca.SX(5, 1)}, "(5, 1)"), ({"tau": ca.SX(8, 1)}, "(0, 1)")]
+)
+def test_a_command_of_the_wrong_size_is_refused(results: dict[str, ca.SX], shape: str) -> None:
+    class Short(_Spring):
+        def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+            return results
+
+    robot = load("planar_manipulator")
+    with pytest.raises(ParameterError) as refused:
+        Short(robot, Short.default_outputs(robot, END_EFFECTOR), PLANAR_GAINS)
+    assert_one_sentence(str(refused.value), f"has shape {shape}; it must be a column of 8")
+
+
+@pytest.mark.parametrize(
     "chosen",
     [
         {},

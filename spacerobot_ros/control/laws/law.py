@@ -314,6 +314,12 @@ class ControlLaw(ABC):
             "J_z": self.outputs.J_z,
             **self.results(symbols),
         }
+        size = 6 + self.robot.n
+        if (shape := ca.SX(results.get("actuation", [])).shape) != (size, 1):
+            raise ParameterError(
+                f"The 'actuation' in the results of law '{self.name}' has shape {shape}; it must "
+                f"be a column of {size} expressions: the base wrench, then the joint efforts."
+            )
         if self._weighs and not self._fills_gains:
             gains = ca.vertcat(symbols["kp"], symbols["kd"])
             if ca.depends_on(results["actuation"], gains):
