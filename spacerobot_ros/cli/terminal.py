@@ -161,9 +161,9 @@ class Display:
             self._work, self._course = "planning", f": {progress.message}"
 
     def fly(self, now: float, end: float) -> None:
-        """Show the simulated time and the end of the schedule in s; 0: unknown."""
+        """Show the simulated time and the end of the schedule in s, unless it has passed."""
         if end > 0.0 or now > 0.0:
-            of_end = f" of {end:.1f}" if end > 0.0 else ""
+            of_end = f" of {end:.1f}" if end >= now else ""
             self._work, self._course = "flying", f": {now:.1f}{of_end} s"
 
     def show_line(self, message: str) -> None:

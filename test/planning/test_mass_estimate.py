@@ -281,6 +281,8 @@ def test_a_long_search_and_flight_are_shown_by_a_line_that_stays_true(
     shown.fly(5.0, 20.0)
     shown.search(SearchProgress(1, 8))
     await_line("flying arm for 1 s: 5.0 of 20.0 s\r")
+    shown.fly(20.5, 20.0)
+    await_line("flying arm for 1 s: 20.5 s\r")
     shown.close()
     text = terminal.getvalue()
     assert text.endswith("\r\x1b[K"), "nothing of it stays"
