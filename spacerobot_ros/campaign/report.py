@@ -80,7 +80,7 @@ def write_campaign_report(folder: Path, path: Path) -> list[str]:
     lines += [
         f"{outcome:<11} {count} of {len(results)}: {message}"
         for outcome, count, message in results.shown_messages
-        if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED)
+        if message and outcome in (ERROR, Outcome.REFUSED, Outcome.ABORTED, Outcome.INTERRUPTED)
     ]
     drivers = [each for each in found if each.is_significant]
     lines += [f"driver      {each}" for each in _sort_passing_first(drivers)[:3]]

@@ -335,7 +335,7 @@ def test_designs_of_another_covariance_or_table_have_other_draws() -> None:
 def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -> None:
     made = campaign(disperse=MASSES, flights=9)
     reasons = [
-        *[("reached", "At the goal after 3.5 s."), ("reached", "At the goal after 4.25e-1 s.")],
+        *[("reached", "At the goal after 3.5 s."), ("interrupted", "Interrupted after 9 s.")],
         *[("refused", "Too far by 2 m."), ("error", "No robot."), ("refused", "Too far by 3 m.")],
         *[("refused", "No way."), ("aborted", "Lost."), ("failed", "Off by 1 m."), ("error", "")],
     ]
@@ -345,6 +345,7 @@ def test_messages_are_counted_by_outcome_without_their_numbers(tmp_path: Path) -
         "refused     2 of 9: Too far by … m.",
         "refused     1 of 9: No way.",
         "error       1 of 9: No robot.",
+        "interrupted 1 of 9: Interrupted after 9 s.",
         "aborted     1 of 9: Lost.",
     ]
 
