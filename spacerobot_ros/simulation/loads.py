@@ -24,6 +24,9 @@ EARTH_GRAVITATION = 3.986004418e14
 EARTH_RADIUS = 6378137.0
 """Earth's equatorial radius, m (WGS 84)."""
 
+_LOWEST_ORBIT = 100e3
+"""Smallest altitude of an orbit, m; smaller values are probably in km."""
+
 
 def mean_motion_at(altitude: float) -> float:
     """Return the mean motion of a circular orbit around the Earth, rad/s.
@@ -61,13 +64,18 @@ class Surroundings:
         Raises
         ------
         ParameterError
-            The orbit is specified twice, its orientation is not a quaternion, or both a table and
-            an orbit are set.
+            The orbit is specified twice or is too low, its orientation is not a quaternion, or both
+            a table and an orbit are set.
         """
         if orbit.altitude and orbit.mean_motion:
             raise ParameterError(
                 f"Parameters 'orbit.altitude' ({orbit.altitude:g} m) and 'orbit.mean_motion' "
                 f"({orbit.mean_motion:g} rad/s) both define the orbit: set one of them to 0."
+            )
+        if 0.0 < orbit.altitude < _LOWEST_ORBIT:
+            raise ParameterError(
+                f"Parameter 'orbit.altitude' is {orbit.altitude:g} m, but no orbit is below "
+                f"{_LOWEST_ORBIT:g} m: give it in m, not in km, or set it to 0."
             )
         try:
             orientation = unit_quaternion(np.array(orbit.orientation))

@@ -244,6 +244,12 @@ TABLE = TableConfig(tilt=0.01)
         ),
         (
             "servicer",
+            {"orbit": OrbitConfig(altitude=400.0)},
+            "Parameter 'orbit.altitude' is 400 m, but no orbit is below 100000 m: give it in m, "
+            "not in km, or set it to 0.",
+        ),
+        (
+            "servicer",
             {"orbit": OrbitConfig(mean_motion=0.001, orientation=(0, 0, 0, 0))},
             "Parameter 'orbit.orientation' is refused: ",
         ),
