@@ -95,6 +95,8 @@ def fly(
     hands = end_effector_goals(end_effector_position, end_effector_pose, end_effector)
     scenario = scenario_to_fly(what, goal, position, rotvec, hands)
     _require_goal(scenario)
+    if isinstance(law, str):
+        raise ParameterError(f"law={law!r} is not a class: to select a law by name, use method=.")
     if law is not None:
         LAWS.register(law)
         require_known(law.name, law.Options, law_options or {})

@@ -277,6 +277,7 @@ def test_a_flight_takes_a_law_that_is_in_no_registry() -> None:
     [
         ("sliding_masses", {"law": _HalfLaw}, ("'half'", "planner")),
         ("coordinated_control", {"law_options": {"a": 1}}, ("law=MyLaw",)),
+        ("coordinated_control", {"law": "model_based"}, ("not a class", "method=")),
         ("coordinated_control", {"law": _HalfLaw, "law_options": {"a": 1}}, ("half", "'a'")),
     ],
 )
