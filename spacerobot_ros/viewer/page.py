@@ -614,6 +614,12 @@ class Page:
         async def _(client: Any) -> None:
             defer(lambda: self._aim_camera(client.camera))
 
+            # A browser may move to the initial camera after that.
+            @client.camera.on_update
+            async def _(camera: Any) -> None:
+                if np.allclose(camera.position, self._server.initial_camera.position):
+                    defer(lambda: self._aim_camera(camera))
+
         style = gui.add_button("Dark or light", color="gray")
         themes: dict[int, bool] = {}
 

@@ -70,6 +70,10 @@ class Element:
             self.value = value
         client = type("Client", (), {"client_id": 3, "camera": page.camera, "gui": page.gui})()
         event = type("Event", (), {"target": self, "client": client})()
+        self.tell(event)
+
+    def tell(self, event: Any) -> None:
+        """Call what waits for a user, or for the camera of a browser."""
         for callback in self.callbacks:
             with suppress(StopIteration):
                 callback(event).send(None)
@@ -166,6 +170,12 @@ class Server:
     def on_client_connect(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
         self.greetings.append(callback)
         return callback
+
+    def open(self) -> None:
+        """Open the page in a browser."""
+        for greet in self.greetings:
+            with suppress(StopIteration):
+                greet(self.get_clients()[0]).send(None)
 
     def flush(self) -> None:
         self.flushed = True

@@ -623,6 +623,28 @@ def test_a_robot_with_thrusters_is_followed_until_a_user_says_otherwise(
     assert not follow.value
 
 
+def test_a_browser_that_moves_to_the_initial_camera_late_still_sees_the_robot(
+    server: Server, page: Page
+) -> None:
+    camera = server.camera
+    camera.aspect, camera.position = 0.46, np.full(3, 3.0)
+    page.update(FIRST, 1.0)
+    page.update(LATER, 2.0)
+    server.open()
+    page.update(LATER, 3.0)
+    aimed = camera.position
+    camera.position = server.initial_camera.position
+    assert np.linalg.norm(camera.position - aimed) > REACH
+    camera.tell(camera)
+    page.update(LATER, 4.0)
+    np.testing.assert_allclose(camera.position, aimed)
+    # A user's own view stays.
+    camera.position = own = aimed + 0.1
+    camera.tell(camera)
+    page.update(LATER, 5.0)
+    np.testing.assert_allclose(camera.position, own)
+
+
 @pytest.mark.parametrize(("aspect", "phone"), [(0.46, True), (0.8, False), (1.5, False)])
 def test_the_panel_does_not_cover_the_robot(
     aspect: float, phone: bool, server: Server, page: Page
