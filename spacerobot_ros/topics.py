@@ -274,7 +274,7 @@ _TOPIC_TABLE = (
     Topic(
         "markers",
         "visualization_msgs/msg/MarkerArray",
-        "links, target, goal and planned path, for viewers",
+        "robot, target, obstacles, goal and planned path as namespaces, for viewers",
         ("plant", "planner"),
     ),
     Topic(

@@ -392,7 +392,8 @@ def goal_markers(goal: Goal, path: BasePath, robot: RobotDescription, frame: str
 
 
 class RobotMarkers:
-    """All visuals of a robot, its target and its obstacles as one marker array.
+    """All visuals of a robot, its target and its obstacles as one marker array, in the namespaces
+    ``robot``, ``target`` and ``obstacles``.
 
     Parameters
     ----------
@@ -415,18 +416,18 @@ class RobotMarkers:
         markers: list[dict[str, Any]] = []
         for index, link in enumerate(robot.links):
             for shape in link.shapes:
-                markers.append(shape_marker(shape, frame, link.name, len(markers)))
+                markers.append(shape_marker(shape, frame, "robot", len(markers)))
                 poses.append((index, shape.pose))
         self._of_target: list[Pose] = []
         """Poses of the target's visuals in the frame of its root link."""
         for link in () if target is None else target.links:
             for shape in link.shapes:
-                markers.append(shape_marker(shape, frame, link.name, len(markers)))
+                markers.append(shape_marker(shape, frame, "target", len(markers)))
                 assert target is not None
                 self._of_target.append(target.frames[link.name][1] @ shape.pose)
         for link in () if world is None else world.links:
             for shape in link.shapes or link.collisions:
-                marker = shape_marker(shape, frame, link.name, len(markers))
+                marker = shape_marker(shape, frame, "obstacles", len(markers))
                 assert world is not None
                 at = world.frames[link.name][1] @ shape.pose
                 markers.append({**marker, "pose": _pose_fields(at.r, quaternion_from_matrix(at.R))})

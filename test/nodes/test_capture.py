@@ -93,7 +93,7 @@ def test_a_target_is_captured_and_released_on_request(harness: Harness) -> None:
     assert "payload" not in values_of(rig.probe.last("plant/status"))
     # The last visual of the robot is followed by the two of the target.
     markers = rig.wait("markers", 3).markers
-    assert [each.ns for each in markers[-2:]] == ["block", "grapple"]
+    assert [each.ns for each in markers[-2:]] == ["target", "target"]
     at = rig.wait("target/odom", 3).pose.pose.position
     assert markers[-2].pose.position.x == pytest.approx(at.x)
     assert markers[-2].pose.position.y == pytest.approx(at.y)

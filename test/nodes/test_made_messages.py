@@ -336,7 +336,7 @@ def test_shapes_are_drawn_where_they_are() -> None:
     link_r = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 2.0]])
     markers = RobotMarkers(parse_robot(URDF), None, "map")
     box, arm = markers_of(markers.message(7_250_000_000, pose, link_R, link_r, None))
-    assert (box.ns, arm.ns, box.id, arm.id) == ("base", "arm", 0, 1)
+    assert (box.ns, arm.ns, box.id, arm.id) == ("robot", "robot", 0, 1)
     assert {m.header.frame_id for m in (box, arm)} == {"map"}
     assert {nanoseconds(m.header.stamp) for m in (box, arm)} == {7_250_000_000}
     assert numbers(box.pose) == pytest.approx(pose.tolist())
@@ -360,7 +360,7 @@ def test_obstacles_are_drawn_where_they_rest() -> None:
         markers = RobotMarkers(robot, None, "map")
         base, link_R = np.array(pose), np.hstack([np.eye(3), np.eye(3)])
         *_, post = markers_of(markers.message(7, base, link_R, np.zeros((3, 2)), None))
-        assert (post.ns, post.id, post.header.frame_id) == ("post", 2, "map")
+        assert (post.ns, post.id, post.header.frame_id) == ("obstacles", 2, "map")
         assert numbers(post.pose) == pytest.approx(
             [1.0, -1.5, 4.0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)]
         )
@@ -387,10 +387,10 @@ def test_obstacles_that_are_gone_are_erased() -> None:
         found = markers_of(markers.message(7, pose, link_R, link_r, None))
         drawn.append([(each.ns, each.id, each.action) for each in found[2:]])
     assert drawn == [
-        [("post", 2, Marker.DELETE)],
-        [("post", 2, Marker.ADD), ("ball", 3, Marker.ADD)],
-        [("ball", 3, Marker.DELETE), ("post", 2, Marker.DELETE)],
-        [("ball", 2, Marker.ADD), ("ball", 3, Marker.DELETE), ("post", 2, Marker.DELETE)],
+        [("obstacles", 2, Marker.DELETE)],
+        [("obstacles", 2, Marker.ADD), ("obstacles", 3, Marker.ADD)],
+        [("obstacles", 2, Marker.DELETE), ("obstacles", 3, Marker.DELETE)],
+        [("obstacles", 2, Marker.ADD), ("obstacles", 3, Marker.DELETE)],
     ]
 
 

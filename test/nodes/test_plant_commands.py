@@ -444,7 +444,7 @@ def test_markers_stand_where_the_links_are(harness: Harness) -> None:
     arrays = rig.probe.messages["markers"]
     assert [nanoseconds(a.markers[0].header.stamp) // TICK_NS for a in arrays] == [0, 2, 4]
     spheres = [m for m in arrays[-1].markers if m.type == Marker.SPHERE]
-    assert [m.ns for m in spheres] == ["mass_1", "mass_2", "mass_3"]
+    assert [m.ns for m in spheres] == ["robot"] * 3
     odom, joints = rig.probe.last("odom"), rig.probe.last("joint_states")
     r, quaternion = pose_of(odom)
     for axis, marker in enumerate(spheres):

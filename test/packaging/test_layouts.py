@@ -134,6 +134,8 @@ def test_foxglove_names_topics_and_fields_of_the_stack(
         "visualization_msgs/msg/MarkerArray",
     }
     assert {types[topic] for topic in shown} == kinds
+    # The robot itself is drawn from its description, with /tf.
+    assert shown["/markers"]["namespaces"] == {"robot": {"visible": False}}
     assert types[panels["3D!robot"]["publish"]["poseTopic"]] == "geometry_msgs/msg/PoseStamped"
     assert types[panels["DiagnosticSummary!plant"]["topicToRender"]].endswith("DiagnosticArray")
     for name, panel in panels.items():
@@ -160,6 +162,7 @@ def test_rviz_names_topics_of_the_type_that_its_displays_take(types: dict[str, s
     robot = next(d for d in manager["Displays"] if d["Class"].endswith("/RobotModel"))
     found["rviz_default_plugins/RobotModel"] = robot["Description Topic"]
     assert any(d["Class"] == "rviz_default_plugins/TF" for d in manager["Displays"])
+    assert [d["Namespaces"] for d in manager["Displays"] if "Namespaces" in d] == [{"robot": False}]
     assert set(found) == set(DISPLAYED)
     for kind, topic in found.items():
         assert types[topic["Value"]] == DISPLAYED[kind]
