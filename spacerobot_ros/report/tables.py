@@ -138,9 +138,9 @@ def result_table(flight: FlightReport) -> Table:
         rows.append(("Final position", _position_text(flight.pose[-1, :3])))
         rows.append(("Final attitude", _attitude_text(flight.pose[-1, 3:])))
     if flight.tool_goals and len(flight.tool):
-        goal = flight.tool_goals[-1].goal
-        rows.append(("End-effector goal", _position_text(goal.position)))
-        rows.append(("End-effector, final", _position_text(flight.tool.values[-1, :3])))
+        goal, final = flight.tool_goals[-1].goal, flight.tool.values[-1]
+        rows.append(("End-effector goal", _tool_text(flight, goal.position, goal.quaternion)))
+        rows.append(("End-effector, final", _tool_text(flight, final[:3], final[3:])))
     for link, aim in flight.link_goals.items():
         rows.append((f"Goal of {link}", _pose_text(aim.position, aim.quaternion)))
         if (error := flight.end_effector_errors.get(link)) is not None:
@@ -174,6 +174,12 @@ def _pose_text(position: Array, quaternion: Array | None) -> str:
     return f"{_position_text(position)}, {_attitude_text(quaternion)}"
 
 
+def _tool_text(flight: FlightReport, position: Array, quaternion: Array) -> str:
+    """Return an end-effector pose, with its attitude if the controller controls it."""
+    turns = set(flight.controls("end_effector")) & {3, 4, 5}
+    return _pose_text(position, quaternion) if turns else _position_text(position)
+
+
 def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
     """Return a row for each goal component that differs between flights: name and values."""
     goals = [
@@ -181,6 +187,10 @@ def different_goals(flights: Sequence[FlightReport]) -> list[tuple[str, ...]]:
         | {f"of {x.link}": _pose_text(x.position, x.quaternion) for x in flight.link_goals.values()}
         for flight in flights
     ]
+    for texts, flight in zip(goals, flights, strict=True):
+        for sent in flight.tool_goals[-1:]:
+            pose = sent.goal.position, sent.goal.quaternion
+            texts["of end_effector"] = _tool_text(flight, *pose)
     parts = dict.fromkeys(part for each in goals for part in each)
     rows = [(part, *(each.get(part, _NO_VALUE) for each in goals)) for part in parts]
     return [row for row in rows if len({*row[1:]}) > 1]

@@ -37,6 +37,7 @@ from spacerobot_ros.report.figures_space import cycles_figure
 from spacerobot_ros.report.flight import FlightReport, joint_unit, pose_errors, read_report
 from spacerobot_ros.report.page_parts import PagePart, tiles
 from spacerobot_ros.report.tables import (
+    different_goals,
     headline,
     joint_table,
     published_table,
@@ -426,12 +427,22 @@ def test_a_controller_and_the_components_that_it_controls(tmp_path: Path) -> Non
     assert rows["End-effector goal"] == "(4.00000, 2.00000, 2.50000) m"
     assert rows["End-effector, final"] == "(4.00000, 2.00000, 3.00000) m"
     assert ("End-effector error", "0.5 m", "") in headline(found)
+
+    def aside(say: Any, time: float, k: int) -> None:
+        if k == 0:
+            say("/end_effector/goal_pose", pose(time, 4.5, 2.0, 2.5, 0.0, 0.0, 0.0, 1.0), time)
+
+    other = flight(tmp_path, statuses, more=aside, name="aside.mcap")
+    goals = "(4.00000, 2.00000, 2.50000) m", "(4.50000, 2.00000, 2.50000) m"
+    assert different_goals([found, other]) == [("of end_effector", *goals)]
     turned = [
         controller(status.state, time, "end_effector.rx", goal_id=status.goal_id)
         for _, status, time in statuses
     ]
     found = flight(tmp_path, turned, more=more, name="turned.mcap")
     assert ("End-effector error", "0.5 m", "0.2 rad") in headline(found)
+    assert rows_of(found)["End-effector goal"].endswith(" rad, 0.000° in total")
+    assert rows_of(found)["End-effector, final"].endswith(" rad, 11.459° in total")
     # The base is not under control: its goal, if there is one, is nobody's.
     assert "Goal attitude" not in rows_of(found)
 
