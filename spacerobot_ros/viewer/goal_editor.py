@@ -118,6 +118,7 @@ class GoalEditor:
         self._origin = Origin.ROBOT
         self._in_flight = False
         """Whether the robot is flying to the displayed goal, which hides the gizmos."""
+        self._in_replay = False
         gui = server.gui
         recorded = hint_html("A recording does not accept goals.")
         self._none_taken = gui.add_html(recorded, visible=False)
@@ -310,7 +311,7 @@ class GoalEditor:
             shown = self._tool_too.visible and self._tool_too.value and not in_flight
             self._gizmos[_TOOL].visible = shown
         self._parts.show(visible=planned)
-        self._final.show(visible=planned)
+        self._final.show(visible=planned and not self._in_replay)
 
     def offer_end_effectors(self, links: Iterable[str]) -> None:
         """Offer goals for the links whose goals the planner accepts."""
@@ -324,14 +325,13 @@ class GoalEditor:
         self._on_parts_chosen(BASE_GOAL_KEY)
 
     def show(self, *, visible: bool) -> None:
-        """Show or hide all controls: a replay does not accept goals."""
-        self._hint.visible = visible and self._origin is Origin.ROBOT
-        fields = (self._verdict, self._position, self._angles, self._to_robot)
-        for handle in (*fields, *self._gizmos.values()):
+        """Show or hide all controls: a replay does not accept goals, but shows the sent ones."""
+        self._in_replay, self._origin = not visible, Origin.ROBOT
+        self._parts.steered = visible
+        for handle in (self._hint, self._verdict, self._position, self._to_robot):
             handle.visible = visible
         self._none_taken.visible = not visible
-        if visible:
-            self._show_parts()
+        self._show_parts()
 
     def goals(self) -> dict[Part, Goal]:
         """Return the goals to send, by robot part; a link goal names its link in ``end_effectors``.
@@ -479,19 +479,20 @@ class GoalEditor:
 
     def _show_parts(self) -> None:
         """Show the gizmos of the parts that the goal specifies, and their handles."""
+        hidden = self._in_flight or self._in_replay
         for link in self._parts.links:
             gizmo = self._gizmos.get(link)
             if gizmo is not None:
                 asked = self._parts.asked(link)
-                gizmo.visible = asked is not RequestedPart.NOTHING and not self._in_flight
+                gizmo.visible = asked is not RequestedPart.NOTHING and not hidden
                 gizmo.disable_rotations = asked is RequestedPart.POSITION
         base = self._gizmos.get(BASE_GOAL_KEY)
         if base is not None:
             # Its node stays visible, because the ghost is attached to it.
             free = self._parts.asked(BASE_GOAL_KEY) is RequestedPart.NOTHING
-            hidden = free or self._in_flight
-            base.disable_axes = base.disable_sliders = base.disable_rotations = hidden
-        self._angles.visible = self._parts.asked(self._parts.shown) is not RequestedPart.POSITION
+            base.disable_axes = base.disable_sliders = base.disable_rotations = free or hidden
+        turned = self._parts.asked(self._parts.shown) is not RequestedPart.POSITION
+        self._angles.visible = turned and not self._in_replay
 
     def _show_fields(self) -> None:
         pose = self._poses.get(self._parts.shown)
@@ -522,7 +523,7 @@ class _PartMenu:
         hint = "The part to which the numbers below apply."
         parts = (BASE_GOAL_KEY,)
         self._numbers: Any = gui.add_dropdown("Numbers of", parts, hint=hint, visible=False)
-        self._there = False
+        self._there, self.steered = False, True
         react(self._numbers.on_update, defer, lambda _: self._on_change(self.shown))
 
     @property
@@ -591,13 +592,13 @@ class _PartMenu:
 
     def _update(self, part: Part | None = None) -> None:
         """Show the numbers of a part if the goal specifies it, otherwise of the previous part."""
-        self._folder.visible = self._there
+        self._folder.visible = self._there and self.steered
         parts = [BASE_GOAL_KEY] if self.asked(BASE_GOAL_KEY) is not RequestedPart.NOTHING else []
         parts += self.requested_links()
         wanted = [each for each in (part, self.shown) if each in parts]
         self._numbers.options = tuple(parts)
         self._numbers.value = [*wanted, *parts][0]
-        self._numbers.visible = len(parts) > 1
+        self._numbers.visible = len(parts) > 1 and self.steered
 
 
 class _FinalShape:

@@ -10,6 +10,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from queue import SimpleQueue
@@ -18,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from spacerobot_ros.control.wheels import BUDGET_PARTS
-from spacerobot_ros.errors import GoalError, ParameterError, shortened
+from spacerobot_ros.errors import GoalError, ParameterError, SpaceRobotError, shortened
 from spacerobot_ros.measures import momentum_change
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.thrusters import ThrusterTable
+from spacerobot_ros.model.thrusters import IN_URDF, ThrusterTable, find_thrusters
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import Tolerance
 from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY
@@ -635,6 +636,7 @@ class Page:
         """Start again with another robot; None: there is none."""
         self._robot = robot
         self._table: ThrusterTable | None = None
+        self._thrusters_in_urdf: ThrusterTable | None = None
         self._drawing: scene.RobotDrawing | None = None
         self._target_drawing: scene.RobotDrawing | None = None
         self._drawn_obstacles: list[viser.MeshHandle] = []
@@ -654,6 +656,8 @@ class Page:
         self._plots.show_robot(robot)
         if robot is None:
             return
+        with suppress(SpaceRobotError):
+            self._thrusters_in_urdf = find_thrusters(IN_URDF, robot)
         self._drawing = self._draw_body(_ROBOT_PATH, robot)
         self._draw_obstacles(robot.world if self._obstacles is None else self._obstacles[0])
         self._show_layers()
@@ -778,10 +782,14 @@ class Page:
             self._aim_camera(self._server.initial_camera)
             # Browsers receive the initial camera at the end of this update, and move to it.
             self._inbox.put(self._aim_cameras)
-        if state.replay is None:
-            if not self.editor.placed:
-                self.editor.place(measured.pose, None, measured.q, self._now)
-            self.editor.follow(state.goals, self._now)
+        if state.replay is not None:
+            if state.firing is not None and self._table is None:
+                self.show_thrusters(self._thrusters_in_urdf)  # There is no plant to ask.
+            aims = [aim.link for goal in state.goals.values() for aim in goal.end_effectors]
+            self.editor.offer_end_effectors(aims)
+        if not self.editor.placed and (state.replay is None or state.goals):
+            self.editor.place(measured.pose, None, measured.q, self._now)
+        self.editor.follow(state.goals, self._now)
         self.editor.update_robot(measured.pose, measured.q)
         self._plots.add(state, self._goal_errors(state))
         assert self._kinematics is not None
@@ -842,7 +850,7 @@ class Page:
         self._log.content = content.log_html(self._notices)
         steered, flies = state.replay is None, content.time_to_go(state) is not None
         tool = content.steered_tool(state) if steered else None
-        planned = steered and state.planner is not None
+        planned = state.planner is not None
         self.editor.show_parts(tool=tool, planned=planned, flies=flies)
 
     def _is_due(self, part: str, period: float) -> bool:

@@ -15,6 +15,7 @@ from support.random_robots import random_chain_urdf
 from support.urdf_text import without_collisions
 from support.viewer_page import FIELD_OF_VIEW
 
+from spacerobot_ros.bag.playback import ReplayStatus
 from spacerobot_ros.collision.distances import collision_visuals
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
 from spacerobot_ros.model import load_robot
@@ -32,7 +33,7 @@ from spacerobot_ros.viewer import content, scene
 from spacerobot_ros.viewer.content import GoalErrors
 from spacerobot_ros.viewer.page import CAMERA, Page, Plots, view_beside_panel
 from spacerobot_ros.viewer.server import ViewerConfig
-from spacerobot_ros.viewer.state import Measured, Momenta, Notice, StackState
+from spacerobot_ros.viewer.state import Firing, Measured, Momenta, Notice, StackState
 
 
 @pytest.fixture
@@ -663,6 +664,44 @@ def test_the_panel_does_not_cover_the_robot(
     up = np.cross(away, right) / np.linalg.norm(away)
     seen = np.array([aside @ right, aside @ up]) / half
     np.testing.assert_allclose(seen, [0.0, 0.47] if phone else [-0.42, 0.0], atol=0.02)
+
+
+def test_a_replay_shows_its_goals_and_plumes(server: Any) -> None:
+    page = Page(server, ViewerConfig())
+    robot = load_robot(robot_file("servicer_wheels"))
+    page.show_robot(robot)
+    names, q = find_thrusters("urdf", robot).names, np.zeros(len(robot.joint_names))
+    at = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
+    replayed = StackState(
+        Measured(1.0, at, q, q, q),
+        firing=Firing(names, np.ones(len(names))),
+        age_s=0.0,
+        planner=PlannerStatus(PlannerState.EXECUTING, "Flies."),
+        replay=ReplayStatus(1.0, 20.0, state="playing", rate=1.0),
+    )
+    page.update(replayed, 1.0)
+    assert server.scene.named("/robot/plumes").visible
+    assert not any("/goal" in each.name for each in server.scene.elements)
+
+    to = np.array([4.0, 5.0, 6.0])
+    later = replace(replayed, measured=Measured(2.0, at, q, q, q), goals={"base": Goal(to, at[3:])})
+    page.update(later, 2.0)
+    gizmo, ghost = map(server.scene.named, ("/goal", "/goal/ghost"))
+    np.testing.assert_allclose(gizmo.position, to)
+    assert gizmo.visible
+    assert gizmo.disable_axes
+    assert ghost.visible
+    # A link that was sent somewhere, which a planner answers with its plan.
+    aim = EndEffectorGoal.checked(robot.links[-1].name, [7.0, 8.0, 9.0])
+    goals = {aim.link: Goal.of_end_effectors([aim])}
+    for time in (3.0, 4.0):
+        page.update(replace(later, measured=Measured(time, at, q, q, q), goals=goals), time)
+    assert page.editor.shows_sent_goal
+    assert not ghost.visible, "the base is free, and nothing is predicted"
+    handles = [each for each in server.scene.elements if each.kind == "add_transform_controls"]
+    assert [each.visible for each in handles] == [True, False]
+    fields = ("Goal (m)", "Roll, pitch, yaw (deg)", "Goal to the robot", "Goal for", "Fly")
+    assert not any(server.gui.named(name).visible for name in fields)
 
 
 # -- nodes that have ended ------------------------------------------------------------------------
