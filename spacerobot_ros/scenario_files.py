@@ -20,8 +20,13 @@ from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionErr
 from spacerobot_ros.files import load_yaml, warn_once
 from spacerobot_ros.model.urdf import load_world
 from spacerobot_ros.parameters import as_numbers, declared, known_values
-from spacerobot_ros.planning.api import warn_of_large_angles
-from spacerobot_ros.planning.core.goal import POSE, Controlled, EndEffectorGoal, Goal
+from spacerobot_ros.planning.core.goal import (
+    POSE,
+    Controlled,
+    EndEffectorGoal,
+    Goal,
+    warn_of_large_angles,
+)
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.resources import is_path, suggestion
 from spacerobot_ros.simulation.config import PlantConfig

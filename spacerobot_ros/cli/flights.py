@@ -397,7 +397,7 @@ def goal_command(
             "With end-effector goals, give the base attitude together with the position X Y Z."
         )
     from spacerobot_ros.planning import Goal
-    from spacerobot_ros.planning.api import warn_of_large_angles
+    from spacerobot_ros.planning.core.goal import warn_of_large_angles
 
     if not (pose or turned):
         goal = Goal.of_end_effectors(hands)

@@ -11,14 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import GoalError, ParameterError, counted
-from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import RobotDescription, SpaceRobot
 from spacerobot_ros.model.integration import DEFAULT_INTEGRATION_STEP
 from spacerobot_ros.model.rotations import quaternion_from_rotvec
 from spacerobot_ros.model.urdf import load_world, with_world
 from spacerobot_ros.parameters import as_numbers
 from spacerobot_ros.planning.core.clearance import DEFAULT_CLEARANCE, Clearance
-from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal, RobotState, Tolerance
+from spacerobot_ros.planning.core.goal import (
+    EndEffectorGoal,
+    Goal,
+    RobotState,
+    Tolerance,
+    warn_of_large_angles,
+)
 from spacerobot_ros.planning.core.method import END_EFFECTOR_METHOD, PATH_METHOD, PlanRequest
 from spacerobot_ros.planning.core.schedule import GaitSchedule
 from spacerobot_ros.planning.methods.registry import build_method, method_options
@@ -175,17 +180,6 @@ def end_effector_goals(
     elif link:
         raise GoalError(f"The end-effector '{link}' has no goal: give its position or its pose.")
     return tuple(goals)
-
-
-def warn_of_large_angles(rotvec: npt.ArrayLike) -> None:
-    """Warn about a rotation of more than one revolution, which may be in degrees."""
-    angle = float(np.linalg.norm(rotvec))
-    if 2 * np.pi < angle < np.inf:
-        warn_once(
-            f"The goal rotates by {angle:.5g} rad, which is {angle / (2 * np.pi):.3g} "
-            "revolutions: only the final attitude matters. Rotation vectors are in rad; "
-            "--goal-rpy-deg takes degrees."
-        )
 
 
 def _start_state(robot: SpaceRobot, start: RobotState | npt.ArrayLike | None) -> RobotState:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from spacerobot_ros.errors import GoalError, counted
+from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR, Array, RobotDescription
 from spacerobot_ros.model.rotations import (
@@ -444,6 +445,17 @@ class Goal:
             for each in (self, other)
         )
         return mine == others
+
+
+def warn_of_large_angles(rotvec: npt.ArrayLike) -> None:
+    """Warn about a rotation of more than one revolution, which may be in degrees."""
+    angle = float(np.linalg.norm(rotvec))
+    if 2 * np.pi < angle < np.inf:
+        warn_once(
+            f"The goal rotates by {angle:.5g} rad, which is {angle / (2 * np.pi):.3g} "
+            "revolutions: only the final attitude matters. Rotation vectors are in rad; "
+            "--goal-rpy-deg takes degrees."
+        )
 
 
 def _displaced(waypoints: Array | None, by: Array) -> Array | None:
