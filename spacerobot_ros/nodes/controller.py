@@ -180,7 +180,9 @@ class CoordinatedControlNode(CommanderNode):
         super().publish_status(status)
         awaited = status.message if status.state is ControllerState.WAITING else ""
         decision = status.state, status.goal_id, awaited
-        lasts, self._published = self._published == decision, decision
+        lasts = self._published == decision
+        if status.state is not ControllerState.REFUSED:  # The earlier goal is still pursued.
+            self._published = decision
         # A single lost message is not logged.
         if status.state is ControllerState.ESTIMATING:
             if lasts:

@@ -133,6 +133,21 @@ def test_a_bad_goal_is_refused_and_the_earlier_one_goes_on(
     loop.wait_for("tracking")
 
 
+def test_an_earlier_goal_is_not_logged_again_after_a_refusal(
+    harness: Harness, capfd: pytest.CaptureFixture[str]
+) -> None:
+    loop = Loop(harness, settle_time=0.0)
+    loop.aim(base=pose(np.zeros(3)))
+    loop.answer()
+    said = loop.wait_for("reached").message
+    loop.goals["base"].publish(pose([1.0, 0.0, 0.0], frame="moon"))
+    loop.wait_for("refused")
+    loop.answer()
+    loop.wait_for("reached")
+    logged = capfd.readouterr().err
+    assert (logged.count(said), logged.count("in frame 'moon'")) == (1, 1)
+
+
 class _Failing(TransposedJacobianLaw):
     name = "failing"
 
