@@ -233,7 +233,7 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
     width = max([5, *(len(joint.name) for joint in listed)])
     wide = max([15, *(len(joint.parent) for joint in listed)])
     head = (
-        f"{'joint':<{width}}  {'kind':<11}{'on':<{wide}} {'limits':>19}{'speed':>12}{'effort':>10}"
+        f"{'joint':<{width}}  {'kind':<11}{'on':<{wide}} {'limits':>19} {'speed':>11} {'effort':>9}"
     )
     rows = [f"{head}{'mass':>12}"]
     for joint, body in zip(listed, bodies, strict=False):
@@ -253,7 +253,7 @@ def _joint_rows(robot: SpaceRobot) -> list[str]:
         follows = joint.mimic
         rows.append(
             f"{joint.name:<{width}}  {joint.kind.value:<11}{joint.parent:<{wide}} {range_text:>19}"
-            f"{speed:>12}{effort:>10}{body.inertia.mass:>9.4g} kg{degrees}"
+            f" {speed:>11} {effort:>9}{body.inertia.mass:>9.4g} kg{degrees}"
             + (f"  follows {follows.joint}" if follows is not None else "")
         )
     if len(joints) > _MAX_LISTED_JOINTS:

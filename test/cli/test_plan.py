@@ -221,11 +221,12 @@ def test_the_papers_nominal_shape() -> None:
 
 
 def test_limits_of_turning_joints_are_also_in_degrees() -> None:
-    robot = SpaceRobot.from_urdf(urdf_of(2).replace('upper="1.5"', 'upper="0.25"'))
+    text = urdf_of(2).replace('upper="1.5"', 'upper="0.25"')
+    robot = SpaceRobot.from_urdf(text.replace('velocity="0.8"', 'velocity="0.0123"'))
     lines = analysis_lines(analyze(robot))
     slides, turns = (next(x for x in lines if f"joint_{k}" in x) for k in (0, 1))
-    assert "-1.5 .. 0.25 rad" in turns
-    assert turns.endswith(" kg  -85.94 .. 14.32 deg  45.8 deg/s")
+    assert "-1.5 .. 0.25 rad 0.0123 rad/s " in turns
+    assert turns.endswith(" kg  -85.94 .. 14.32 deg  0.705 deg/s")
     assert slides.endswith(" 2 kg")
 
 
