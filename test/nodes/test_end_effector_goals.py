@@ -89,7 +89,11 @@ def test_positions_on_the_topics_of_links_are_reached_one_after_the_other(harnes
     harness.connect()
     flight.start()
     for number, (link, aim) in enumerate(aims.items(), 1):
-        topics[link].publish(position_goal(aim, number))
+        message = position_goal(aim, number)
+        if link == "link_3":  # NaN asks for no attitude either.
+            o = message.pose.orientation
+            o.x = o.y = o.z = o.w = np.nan
+        topics[link].publish(message)
         await_reached(flight, f"{number}.000000000")
         np.testing.assert_allclose(flown_to(flight, link), aim, atol=1e-6)
         values = values_of(flight.probe.last("planner/status"))
@@ -99,6 +103,8 @@ def test_positions_on_the_topics_of_links_are_reached_one_after_the_other(harnes
         assert float(values["end_effector_position_error_m"]) <= TOLERANCE
         assert "goal" not in values, "the base is free"
         assert "position_error_m" not in values
+    topics["link_3"].publish(position_goal(np.full(3, np.nan), 3))
+    assert_one_sentence(flight.wait("refused").message, "'link_3' has no position", "NaN")
 
 
 def test_goals_of_one_stamp_are_one_goal(harness: Harness) -> None:

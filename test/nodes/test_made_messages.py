@@ -40,7 +40,13 @@ from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.model.urdf import parse_world, with_world
 from spacerobot_ros.nodes.common.fly_to import GoalClient, NavigateToPoseAction
-from spacerobot_ros.nodes.common.messages import goal_of, interface_class, message_class, shape_of
+from spacerobot_ros.nodes.common.messages import (
+    goal_description,
+    goal_of,
+    interface_class,
+    message_class,
+    shape_of,
+)
 from spacerobot_ros.planning import BasePath, Goal
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.resources import robot_file
@@ -192,6 +198,21 @@ def test_a_goal_pose_is_taken_in_its_frame() -> None:
     message.header.frame_id = "world"
     with pytest.raises(PlanningError, match="is in frame 'world'; goals are accepted in 'map'"):
         goal_of(message, "map")
+
+
+@pytest.mark.parametrize(
+    ("left_open", "said"),
+    [("position", "any position, (0.6, 0, 0, 0.8)"), ("orientation", "(1, -2, 0) m, any attitude")],
+)
+def test_a_logged_goal_has_only_what_is_requested(left_open: str, said: str) -> None:
+    message = PoseStamped()
+    p, o = message.pose.position, message.pose.orientation
+    p.x, p.y, o.x, o.w = 1.0, -2.0, 0.6, 0.8
+    part = getattr(message.pose, left_open)
+    for name in part.get_fields_and_field_types():
+        setattr(part, name, math.nan)
+    line = goal_description("the base", "7.0", message, goal_of(message, "world"))
+    assert line == f"Goal 7.0 of the base: {said}."
 
 
 def test_a_goal_shape_is_taken_by_the_names_of_its_joints() -> None:

@@ -261,7 +261,7 @@ class CommanderNode(FlightNode):
 
     def receive(self, key: str, message: PoseStamped | Path, read: Callable[[], Goal]) -> None:
         """Pass the goal returned by ``read`` to the commander; log the goal if it is accepted."""
-        stamp, part = message.header.stamp, key.replace("_", "-")
+        stamp, part = message.header.stamp, "the base" if key == BASE_GOAL_KEY else f"'{key}'"
         accepted = self.commander.receive_goal(key, stamp.sec, stamp.nanosec, read)
         if accepted is not None:
             line = goal_description(part, accepted.goal_id, message, accepted.goal)

@@ -91,8 +91,8 @@ class FlyToAction:
                     )
                     for link, pose in zip(links, poses, strict=True)
                 ],
-                position=None if goal is None else goal.position,
-                quaternion=None if goal is None else goal.quaternion,
+                position=goal.position if goal and "position" in goal.asked else None,
+                quaternion=goal.quaternion if goal and "attitude" in goal.asked else None,
                 joint_positions=shape,
             )
         assert goal is not None

@@ -142,12 +142,12 @@ def end_effector_goal(
     what: str,
     pose_of: Callable[[str], Array | None] = lambda frame: None,
 ) -> EndEffectorGoal:
-    """Return a link goal; if the orientation is all zeros, any attitude is accepted.
+    """Return a link goal; if the orientation is all zeros or all NaN, any attitude is accepted.
 
     Raises
     ------
     PlanningError
-        The message is not a pose, or its frame is unknown; ``what`` names it.
+        The message is not a pose, its position is NaN, or its frame is unknown; ``what`` names it.
     """
     from spacerobot_ros.planning.core.goal import EndEffectorGoal
 
@@ -158,6 +158,9 @@ def end_effector_goal(
         message = PoseStamped(header=message.header)
         message.pose.position, message.pose.orientation.w = given.position, 1.0
     pose = goal_of(message, frame, what, None, pose_of)
+    if "position" not in pose.asked:
+        raise PlanningError(f"{what} has no position: x, y and z are NaN.")
+    any_attitude |= "attitude" not in pose.asked
     return EndEffectorGoal(link, pose.position, None if any_attitude else pose.quaternion)
 
 
@@ -221,13 +224,14 @@ def goal_description(part: str, goal_id: str, message: PoseStamped | Path, goal:
     frame = printable(message.header.frame_id)
     given = f", given in '{frame}'" if frame else ""
     aim = goal.end_effectors[0] if goal.end_effectors else goal
-    position = ", ".join(f"{x:.4g}" for x in aim.position)
-    attitude = "any attitude"
-    if aim.quaternion is not None:
+    position, attitude = "any position", "any attitude"
+    if "position" in goal.asked:
+        position = f"({', '.join(f'{x:.4g}' for x in aim.position)}) m"
+    if aim.quaternion is not None and "attitude" in goal.asked:
         attitude = f"({', '.join(f'{x:.4g}' for x in aim.quaternion)})"
     waypoints = getattr(aim, "waypoints", None)
     through = "" if waypoints is None else f" through {counted(len(waypoints), 'waypoint')}"
-    return f"Goal {goal_id} of the {part}: ({position}) m, {attitude}{through}{given}."
+    return f"Goal {goal_id} of {part}: {position}, {attitude}{through}{given}."
 
 
 def shape_of(message: JointState, joint_names: Sequence[str]) -> Array:
