@@ -33,7 +33,8 @@ from spacerobot_ros.cli.options import (
 )
 from spacerobot_ros.cli.terminal import sentences
 from spacerobot_ros.errors import GoalError, ParameterError, PlanningError
-from spacerobot_ros.planning.api import plan, warn_of_large_angles
+from spacerobot_ros.planning.api import plan
+from spacerobot_ros.planning.core.goal import warn_of_large_angles
 from spacerobot_ros.scenario import load_scenario
 from spacerobot_ros.termination import Terminated
 
