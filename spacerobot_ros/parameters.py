@@ -301,17 +301,23 @@ def known_values(kind: type[Any], values: Mapping[str, V]) -> dict[str, V]:
     return {name: value for name, value in values.items() if name in known}
 
 
+def require_names(none: str, given: Iterable[str], known: Collection[str]) -> None:
+    """For an unknown name, raise a ParameterError whose message begins with ``none``."""
+    for name in given:
+        if name not in known:
+            raise ParameterError(f"{none} '{name}'; it has {', '.join(known) or 'none'}.")
+
+
 def require_known(owner: str, config: type[Any], names: Iterable[str]) -> None:
     """Raise an error for names that are not parameters of a configuration.
 
     Raises
     ------
     ParameterError
-        A name is unknown; the error message states that ``owner`` has no such option.
+        A name is unknown; the error message states which options ``owner`` has.
     """
-    unknown = sorted(set(names) - {parameter.name for parameter in declared(config)})
-    if unknown:
-        raise ParameterError(f"{owner} has no option '{unknown[0]}'.")
+    known = [parameter.name for parameter in declared(config)]
+    require_names(f"{owner} has no option", sorted(names), known)
 
 
 def _configured(defaults: Any, values: Mapping[str, Any], prefix: str) -> Any:

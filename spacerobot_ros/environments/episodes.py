@@ -25,14 +25,19 @@ from spacerobot_ros.environments.tasks import (
     Task,
     action_scale,
     command_of,
-    require_names,
 )
 from spacerobot_ros.errors import CommandError, ParameterError, RobotDescriptionError
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.parameters import as_numbers, configured, nonnegative, parameter
+from spacerobot_ros.parameters import (
+    as_numbers,
+    configured,
+    nonnegative,
+    parameter,
+    require_names,
+)
 from spacerobot_ros.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS

@@ -9,8 +9,8 @@ import numpy as np
 
 from spacerobot_ros.environments import import_gymnasium
 from spacerobot_ros.environments.episodes import ARGUMENTS, EpisodeConfig, Episodes
-from spacerobot_ros.environments.tasks import require_names
 from spacerobot_ros.errors import ParameterError
+from spacerobot_ros.parameters import require_names
 
 import_gymnasium()  # States how to install it if it is missing.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numbers
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar
@@ -27,6 +27,7 @@ from spacerobot_ros.model.rotations import (
     quaternion_multiply,
     quaternions_from_rotvecs,
 )
+from spacerobot_ros.parameters import require_names
 from spacerobot_ros.planning.core.controllability import sample_shapes
 from spacerobot_ros.planning.methods.optimal.goal_specification import BaseRotations
 from spacerobot_ros.registry import Registry
@@ -46,13 +47,6 @@ LARGEST_OBSERVATION = 1e6
 """Bound for observed quantities that have no other bound; observations are clipped to this
 value.
 """
-
-
-def require_names(none: str, given: Iterable[str], known: Collection[str]) -> None:
-    """For an unknown name, raise a ParameterError whose message begins with ``none``."""
-    for name in given:
-        if name not in known:
-            raise ParameterError(f"{none} '{name}'; it has {', '.join(known)}.")
 
 
 @dataclass(frozen=True)
