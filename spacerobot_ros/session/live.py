@@ -110,6 +110,9 @@ _LONGEST_STATUS_WAIT = 1.0
 _LONGEST_RECORDER_WAIT = 1.0
 """Wall time, s, to wait until recorders have subscribed to the goal topics."""
 
+_LONGEST_VERDICT = 2.0
+"""Wall time, s, in which the verdict on a goal arrives after its commander has none."""
+
 _CHECK_PERIOD = 0.1
 
 _NUMBER = re.compile(r"(< )?\d[\d.]* [mµ]?(m|rad)( or [mµ]?rad)?\b")
@@ -183,7 +186,8 @@ def send_goal(
     Raises
     ------
     SpaceRobotError
-        No commander accepts goals, or the namespace is not a valid ROS namespace.
+        No commander accepts goals, the commander was started again or has ended, or the namespace
+        is not a valid ROS namespace.
     """
     namespace = checked_namespace(namespace)
     with ros():
@@ -219,11 +223,15 @@ def send_goal(
             with graceful_shutdown() as stopped:
                 client.on_message = _StatusPrinter(show)
                 client.send(goal)
-                began = time.monotonic()
+                began = kept = time.monotonic()
 
                 def look() -> bool:
-                    late = timeout > 0 and time.monotonic() - began > timeout
-                    return stopped() or late
+                    nonlocal kept
+                    now, lost = time.monotonic(), client.lost
+                    kept = kept if lost else now
+                    if now - kept > _LONGEST_VERDICT:
+                        raise SpaceRobotError(lost)
+                    return stopped() or 0 < timeout < now - began
 
                 return client.follow(executor, look, _CHECK_PERIOD)
         finally:

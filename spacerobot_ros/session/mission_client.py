@@ -39,6 +39,9 @@ _LONGEST_DELIVERY = 5.0  # wall s
 
 _SHAPE = "goal_joint_states"
 
+_WITHOUT_GOAL = "idle", "holding"
+"""States of a planner and of a controller without a goal."""
+
 _VERDICTS = {f"goal_{each.value}": each.value for each in Outcome}
 """State of a status by the kind of the event with the same verdict."""
 
@@ -89,6 +92,8 @@ class MissionClient:
         self._decision: Status | None = None
         """The verdict in an event. The status with the verdict may be lost: latched topics keep one
         message for a busy reader, and that may be about a later goal."""
+        self._pursued, self._forgotten = False, False
+        """Whether the commander has reported on the goal, and whether it has none since then."""
         self._frame, self._now = world_frame, now
         self._joint_names = joint_names
         self._sent = 0
@@ -167,6 +172,20 @@ class MissionClient:
         """Whether a publisher of the commander's status has been discovered."""
         return self.node.count_publishers(self._status_topic.topic_name) > 0
 
+    @property
+    def lost(self) -> str:
+        """Sentence that explains why the goal, once pursued, has no commander; empty: it has one.
+
+        A verdict may still be under way.
+        """
+        if not self._pursued or self.outcome is not None:
+            return ""
+        if self._forgotten:
+            return f"'{self.decider}' was started again and has no goal: send the goal again."
+        if not self.knows_commander():
+            return f"'{self.decider}' has ended: start it again, and send the goal again."
+        return ""
+
     def has_late_recorder(self) -> bool:
         """Whether a node that follows events and states has not yet subscribed to goals: a recorder
         does so once it has discovered this client.
@@ -188,6 +207,7 @@ class MissionClient:
         time_ns = self._now() + self._sent
         self._follower = GoalFollower(GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND)))
         self.message, self._decision = "", None
+        self._pursued, self._forgotten = False, False
         if self._joint_names is not None:
             self._sends[_SHAPE].publish(shape_message(goal, self._joint_names))
         for topic, aim in goal_messages(goal, end_effector, self._frame, time_ns).items():
@@ -267,6 +287,10 @@ class MissionClient:
         if self.outcome is None and (concerns or not (status.goal_id or status.state.decided)):
             self.message = status.message
             self.on_message(self.message)
+        if self._follower.is_about_goal(status):
+            self._pursued, self._forgotten = True, False
+        elif not status.goal_id and status.state.value in _WITHOUT_GOAL:
+            self._forgotten = self._pursued
         if self._follower.update(status):
             self._end(Outcome(status.state.value))
 

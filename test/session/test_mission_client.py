@@ -121,6 +121,26 @@ def test_only_the_status_of_the_goal_that_was_sent_decides_it(
 
 
 @pytest.mark.parametrize("decider", STATUS)
+def test_a_goal_that_its_commander_no_longer_has_is_lost(harness: Harness, decider: str) -> None:
+    mission = Mission(harness, decider)
+    goal_id = mission.send(GOAL)
+    flies = "executing" if decider == "planner" else "tracking"
+    waits = status_of(decider, "idle" if decider == "planner" else "holding", "Waiting.")
+    mission.report(waits)
+    assert not mission.client.lost, "it may not have arrived"
+    for message in ("It flies.", "It flies again."):
+        mission.report(status_of(decider, flies, message, goal_id=goal_id))
+        assert not mission.client.lost
+        mission.report(waits)
+        assert mission.client.lost == (
+            f"'{decider}' was started again and has no goal: send the goal again."
+        )
+    mission.report(status_of(decider, flies, "It flies.", goal_id=goal_id))
+    mission.commander.destroy_publisher(mission.status)
+    harness.spin_until(lambda: mission.client.lost.startswith(f"'{decider}' has ended: "))
+
+
+@pytest.mark.parametrize("decider", STATUS)
 def test_the_end_of_a_replaced_goal_counts_though_the_next_status_comes_at_once(
     harness: Harness, decider: str
 ) -> None:
