@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from typing import TYPE_CHECKING
 
@@ -28,25 +27,6 @@ __getattr__ = lazy_names(
         "scenario": ["load_scenario"],
     },
 )
-
-_MIN_SHARED_MEMORY = 16 * 2**10
-"""Minimum free shared memory in bytes; with less, loading ROS ends the process."""
-
-
-def _warn_of_full_shared_memory() -> None:
-    """Warn of full shared memory, in which the tracing of ROS ends the process with SIGBUS."""
-    try:
-        facts = os.statvfs("/dev/shm")
-    except OSError:
-        return
-    if facts.f_blocks and facts.f_bavail * facts.f_frsize < _MIN_SHARED_MEMORY:
-        logging.getLogger(__name__).warning(
-            "/dev/shm is full: ROS may end here with SIGBUS (bus error). Free space in /dev/shm; "
-            "fastrtps_* files left by killed processes may be deleted while nothing runs."
-        )
-
-
-_warn_of_full_shared_memory()
 
 if os.environ.get("SPACEROBOT_PLUGINS"):
     from spacerobot_ros.registry import import_plugins

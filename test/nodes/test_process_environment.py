@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import inspect
 import os
 import re
@@ -18,7 +17,6 @@ import rclpy
 from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleNode
 
-import spacerobot_ros
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.nodes import (
@@ -36,7 +34,6 @@ from spacerobot_ros.nodes.viewer.node import ViewerNode
 DISCOVERY = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS", "ROS_LOCALHOST_ONLY")
 FILES = "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"
 TRANSPORT = "FASTDDS_BUILTIN_TRANSPORTS", *FILES
-KILOBYTE = 1024
 
 
 @pytest.fixture(autouse=True)
@@ -86,25 +83,6 @@ def test_other_middleware_has_only_its_range(monkeypatch: pytest.MonkeyPatch) ->
     process.use_loopback_discovery()
     assert os.environ[DISCOVERY[0]] == "LOCALHOST"
     assert [os.environ[name] for name in TRANSPORT] == ["", "", ""]
-
-
-def with_free(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
-    """Let shared memory have so many bytes left."""
-    left = free // KILOBYTE
-    facts = os.statvfs_result((KILOBYTE, KILOBYTE, 1, left, left, 0, 0, 0, 0, 255))
-    monkeypatch.setattr("os.statvfs", lambda _: facts)
-
-
-@pytest.mark.parametrize(("free", "warned"), [(0, True), (2**20, False)])
-def test_full_memory_is_said_before_a_library_is_ended_by_it(
-    free: int,
-    warned: bool,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    with_free(monkeypatch, free)
-    importlib.reload(spacerobot_ros)
-    assert ("SIGBUS" in caplog.text) == warned
 
 
 @pytest.mark.parametrize("domain", ["233", "-1", "x", "1.5", "\N{SUPERSCRIPT TWO}"])

@@ -194,17 +194,13 @@ def test_frames_need_no_order_between_topics(harness: Harness, tmp_path: Path) -
     harness.spin_until(lambda: {"/odom", "/joint_states", "/robot_description"} <= recorder.topics)
     description.publish(String(data=robot.read_text("utf-8")))
     harness.settle(source)
-    for order in ((odoms, (0, 1)), (joints, (0, 1, 2, 3)), (odoms, (3,))):
-        for k in order[1]:
-            if order[0] is odoms:
-                odom = Odometry(child_frame_id="base_link")
-                odom.header.frame_id, odom.pose.pose.orientation.w = "world", 1.0
-                odom.pose.pose.position.x = 0.1 * k
-                odoms.publish(stamped(odom, 0.05 * k, "world"))
-            else:
-                state = JointState(name=names, position=[0.1 * k] * len(names))
-                state.velocity = [0.0] * len(names)
-                joints.publish(stamped(state, 0.05 * k))
+    for sender, states in ((odoms, (0, 1)), (joints, (0, 1, 2, 3)), (odoms, (3,))):
+        for k in states:
+            odom = Odometry(child_frame_id="base_link")
+            odom.pose.pose.position.x, odom.pose.pose.orientation.w = 0.1 * k, 1.0
+            rates = [0.0] * len(names)
+            shape = JointState(name=names, position=[0.1 * k] * len(names), velocity=rates)
+            sender.publish(stamped(odom if sender is odoms else shape, 0.05 * k, "world"))
         harness.settle(source)
     recorder.trigger_deactivate()
     recorder.trigger_cleanup()
