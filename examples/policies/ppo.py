@@ -49,9 +49,9 @@ class Agent(nn.Module):
 
     def policy(self) -> Policy:
         """Return the network for the mean action, with observations as they are."""
-        layers = [self.mean[k].double().cpu() for k in (0, 2, 4)]
-        weights = [each.weight.detach().numpy() for each in layers]
-        biases = [each.bias.detach().numpy() for each in layers]
+        layers = [self.mean[k] for k in (0, 2, 4)]
+        weights = [each.weight.detach().cpu().double().numpy() for each in layers]
+        biases = [each.bias.detach().cpu().double().numpy() for each in layers]
         offset, scale = (each.cpu().numpy() for each in self.offset_and_scale())
         weights[0] = weights[0] / scale
         biases[0] = biases[0] - weights[0] @ offset

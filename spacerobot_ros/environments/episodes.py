@@ -471,9 +471,7 @@ class Episodes:
         elif self._goals_of_scenario:
             self.goals[chosen] = np.array([task.goal_of(each.scenario) for each in drawn])[which]
         else:
-            random_goals = task.random_goals(self._states[chosen], self.spread, own)
-            self._require_shape("random_goals", random_goals, len(own), task.goal_size)
-            self.goals[chosen] = random_goals
+            self.goals[chosen] = self._random_goals(chosen, own)
         self._observe(chosen)
 
     def _begin_on_device(self, rows: Any, rng: Any, goals: Array | None) -> None:
@@ -485,8 +483,12 @@ class Episodes:
         elif self._goals_of_scenario:
             self.goals[rows] = self._first_goals[starts]
         else:
-            self.goals[rows] = self.task.random_goals(self._states[rows], self.spread, rng)
+            self.goals[rows] = self._random_goals(rows, rng)
         self._observe(rows)
+
+    def _random_goals(self, rows: Any, rngs: Any) -> Array:
+        goals = self.task.random_goals(self._states[rows], self.spread, rngs)
+        return self._checked("random_goals", goals, len(rows), self.task.goal_size)
 
     def _checked_starts(self, start: Any) -> list[dict[str, Array]]:
         count, n = len(self.goals), self.robot.n
@@ -555,17 +557,14 @@ class Episodes:
         measured = self._arrays.flatnonzero(under_way)
         self._observe(measured if self._source.has_sensor_errors else slice(None))
         alive = flights.has_not_ended
-        reached = task.reached(after, self.errors, self.tolerance)
-        failed = task.failed(after, self.goals)
-        self._require_shape("reached", reached, len(shares))
-        self._require_shape("failed", failed, len(shares))
-        reached = alive & reached
+        arrived = task.reached(after, self.errors, self.tolerance)
+        reached = alive & self._checked("reached", arrived, len(shares))
+        failed = self._checked("failed", task.failed(after, self.goals), len(shares))
         failed = (under_way & ~alive) | (alive & ~reached & failed)
         shares = np.clip(shares, -1.0, 1.0)
         done = (before, after, self.goals, shares, errors, self.errors, reached, failed)
         step = Step(*done, self.step_duration)
-        rewards = task.reward(step, self._weights)
-        self._require_shape("reward", rewards, len(shares))
+        rewards = self._checked("reward", task.reward(step, self._weights), len(shares))
         rewards = np.where(under_way, rewards, 0.0)
         self.rewards = rewards.astype(self.errors.dtype, copy=False)
         self.reached, self.terminations = reached, reached | failed
@@ -575,17 +574,16 @@ class Episodes:
     def _observe(self, rows: Any = slice(None)) -> None:
         states, goals = self._states[rows], self.goals[rows]
         remaining = self.task.remaining(states, goals)
-        errors = self.task.errors(remaining)
-        self._require_shape("errors", errors, len(goals))
-        self.errors[rows] = errors
+        self._checked("remaining", remaining, len(goals), self.task.error_size)
+        self.errors[rows] = self._checked("errors", self.task.errors(remaining), len(goals))
         if self._source.has_sensor_errors and len(rows):
             states = self._measured(states, rows)
             remaining = self.task.remaining(states, goals)
-        observations = self.task.observe(states, remaining)
-        self._require_shape("observe", observations, len(goals), self.observations.shape[1])
-        self.observations[rows] = observations
+        seen, size = self.task.observe(states, remaining), self.observations.shape[1]
+        self.observations[rows] = self._checked("observe", seen, len(goals), size)
 
-    def _require_shape(self, function: str, found: Any, *wanted: int) -> None:
+    def _checked(self, function: str, found: Any, *wanted: int) -> Any:
+        """Return what a function of the task returned; raise a ParameterError for other shapes."""
         shape = getattr(found, "shape", None)
         if shape != wanted:
             what = found if shape is None else f"an array of shape {shape}"
@@ -593,6 +591,7 @@ class Episodes:
                 f"{function} of task '{self.task.name}' returned {what}; it must return an array "
                 f"of shape {wanted}, with one row per robot."
             )
+        return found
 
     def _measured(self, states: RobotStates, rows: Any) -> RobotStates:
         size = 12 + 2 * self.robot.n

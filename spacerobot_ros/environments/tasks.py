@@ -230,11 +230,6 @@ class Task(ABC):
 
     def observe(self, states: RobotStates, remaining: Array) -> Array:
         """Return observations: remaining error, q, qdot and base twist."""
-        if remaining.shape[1:] != (self.error_size,):
-            raise ParameterError(
-                f"remaining of task '{self.name}' returned an array of shape {remaining.shape}; "
-                f"each row must have {self.error_size} numbers, the task's error_size."
-            )
         seen = np.concatenate([remaining, states.q, states.qdot, states.twist], axis=1)
         bounds = (np.asarray(x, seen.dtype, like=seen) for x in self.observation_bounds())
         return np.clip(seen, *bounds)

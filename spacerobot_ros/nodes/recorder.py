@@ -472,7 +472,7 @@ class _RecordedTransforms:
         """Write the transforms of a complete state if the period is over, or time has jumped
         back."""
         stamp, own = raw[HEADER_STAMP], self._unpaired[topic]
-        (other,) = (each for name, each in self._unpaired.items() if name != topic)
+        other = self._unpaired["joint_states" if topic == "odom" else "odom"]
         if stamp not in other:
             own[stamp] = raw
             if len(own) > STREAM.depth:

@@ -92,8 +92,8 @@ class MissionClient:
         self._decision: Status | None = None
         """The verdict in an event. The status with the verdict may be lost: latched topics keep one
         message for a busy reader, and that may be about a later goal."""
-        self._pursued, self._forgotten = False, False
-        """Whether the commander has reported on the goal, and whether it has none since then."""
+        self._last: Status | None = None
+        """Last status about the goal, or without any goal after one about it."""
         self._frame, self._now = world_frame, now
         self._joint_names = joint_names
         self._sent = 0
@@ -178,9 +178,9 @@ class MissionClient:
 
         A verdict may still be under way.
         """
-        if not self._pursued or self.outcome is not None:
+        if self._last is None or self.outcome is not None:
             return ""
-        if self._forgotten:
+        if not self._follower.is_about_goal(self._last):
             return f"'{self.decider}' was started again and has no goal: send the goal again."
         if not self.knows_commander():
             return f"'{self.decider}' has ended: start it again, and send the goal again."
@@ -207,7 +207,7 @@ class MissionClient:
         time_ns = self._now() + self._sent
         self._follower = GoalFollower(GoalIds().of(*divmod(min(time_ns, LATEST_NS), SECOND)))
         self.message, self._decision = "", None
-        self._pursued, self._forgotten = False, False
+        self._last = None
         if self._joint_names is not None:
             self._sends[_SHAPE].publish(shape_message(goal, self._joint_names))
         for topic, aim in goal_messages(goal, end_effector, self._frame, time_ns).items():
@@ -287,10 +287,9 @@ class MissionClient:
         if self.outcome is None and (concerns or not (status.goal_id or status.state.decided)):
             self.message = status.message
             self.on_message(self.message)
-        if self._follower.is_about_goal(status):
-            self._pursued, self._forgotten = True, False
-        elif not status.goal_id and status.state.value in _WITHOUT_GOAL:
-            self._forgotten = self._pursued
+        idle = not status.goal_id and status.state.value in _WITHOUT_GOAL
+        if self._follower.is_about_goal(status) or (idle and self._last is not None):
+            self._last = status
         if self._follower.update(status):
             self._end(Outcome(status.state.value))
 
