@@ -111,6 +111,8 @@ class Commander(ABC):
         self.robot: SpaceRobot | None = None
         self.stamps = StampFilter(clock)
         self.states = StateSynchroniser(pose_required=pose_required)
+        self._received: list[Stamped] = []
+        """Joint states that are not processed yet, older than those that wait."""
         self._contradicted_ns = _NEVER_NS
         """Stamp of the last pose that contradicted another, ns."""
         self.plant = PlantListener()
@@ -424,8 +426,8 @@ class Commander(ABC):
     def receive_joints(self, stamp_ns: int, joints: Any) -> None:
         """Process received joint states; defer them if their stamp is not current, and skip late
         joint states."""
-        odoms, waiting = self.host.waiting_states()
-        self._take_states(odoms, [Stamped(stamp_ns, joints), *waiting])
+        self._received.append(Stamped(stamp_ns, joints))
+        self._take_waiting()
         if self._fly_to:
             self._fly_to.advance(self.stamps.now_ns, self._progress)
             self._abort_fly_to()
@@ -509,8 +511,16 @@ class Commander(ABC):
 
     def answer_latest(self) -> None:
         """Handle the latest received state, after work that kept states waiting."""
-        self._take_states(*self.host.waiting_states())
+        self._take_waiting()
         self.answer()
+
+    def _take_waiting(self) -> None:
+        """Process received and waiting states."""
+        # A status that is processed before them may itself need the latest state.
+        odoms, waiting = self.host.waiting_states()
+        states = [*self._received, *waiting]
+        self._received.clear()
+        self._take_states(odoms, states)
 
     def _take_states(self, odoms: Sequence[Stamped], states: Sequence[Stamped]) -> None:
         """Process waiting messages; of the states at the current time, only the last one.

@@ -34,6 +34,8 @@ class Host:
         self.starts: list[Any] = []
         self.publishers = {"odom"}
         self.waiting: tuple[list[Stamped], list[Stamped]] = ([], [])
+        self.process_statuses: Callable[[], None] = lambda: None
+        """What waits on plant/status, which is processed before waiting states."""
 
     def send_command(self, stamp_ns: int) -> None:
         self.commands.append(stamp_ns // TICK)
@@ -54,6 +56,8 @@ class Host:
         return topic in self.publishers
 
     def waiting_states(self) -> tuple[list[Stamped], list[Stamped]]:
+        process, self.process_statuses = self.process_statuses, lambda: None
+        process()
         waiting, self.waiting = self.waiting, ([], [])
         return waiting
 

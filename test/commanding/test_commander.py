@@ -658,6 +658,22 @@ def test_states_that_are_skipped_do_not_change_the_rate(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_rate_that_is_told_beside_the_first_states_leaves_their_order(kind: str) -> None:
+    rig = RateRig(kind)
+    rig.host.process_statuses = lambda: rig.plant_says(tick_rate_hz=20.0)
+    waiting = [rig.stamped(tick) for tick in (2, 3)]
+    rig.host.waiting = waiting, waiting
+    rig.state(1)
+    for tick in range(4, 30):
+        rig.wall += 0.05
+        rig.state(tick)
+        rig.commander.take_accepted_jump()
+    assert rig.commander.config.tick_rate == 20.0
+    assert rig.host.commands == [3, *range(4, 30)]
+    assert not rig.warnings
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_the_first_state_of_a_plant_in_lockstep_is_answered(kind: str) -> None:
     rig = RateRig(kind)
     rig.plant_says(tick_rate_hz=25.0, time_mode="lockstep")
