@@ -113,10 +113,7 @@ setup(
         "zstandard",
     ],
     extras_require={
-        "jazzy": [
-            "ros-jazzy-common-interfaces",
-            "ros-jazzy-rclpy[fastrtps]",
-        ],
+        "jazzy": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         # Exact distances between links; pin, which the tests use, brings it as well.
         "collision": ["coal"],
         # A second engine: spacerobot verify --engine mujoco.

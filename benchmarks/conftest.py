@@ -108,11 +108,7 @@ def checkouts(
 
 
 @pytest.fixture
-def measure(
-    benchmark: Any,
-    place: str,
-    checkouts: dict[str, Checkout],
-) -> Measure:
+def measure(benchmark: Any, place: str, checkouts: dict[str, Checkout]) -> Measure:
     """Return a function that measures: all checkouts in turns, after a call that is not counted."""
 
     def run(name: str, rounds: int = 5, **arguments: Any) -> None:

@@ -250,10 +250,7 @@ _CAPTURE_METRICS = {
         "smallest distance",
     ),
     "capture_impulse_Ns": ("N s", "impulse of the capture"),
-    "capture_angular_impulse_Nms": (
-        "N m s",
-        "moment of the capture impulse at the end-effector",
-    ),
+    "capture_angular_impulse_Nms": ("N m s", "moment of the capture impulse at the end-effector"),
     "capture_joint_impulse": (
         "N m s or N s",
         "largest component of the capture impulse along a joint coordinate",

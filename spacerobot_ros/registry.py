@@ -51,12 +51,7 @@ class Registry(dict[str, type[T]]):
     """
 
     def __init__(
-        self,
-        kind: str,
-        group: str,
-        base: Any,
-        own: Iterable[type[T]],
-        reserved: Iterable[str] = (),
+        self, kind: str, group: str, base: Any, own: Iterable[type[T]], reserved: Iterable[str] = ()
     ) -> None:
         super().__init__()
         self.kind, self.group, self.base = kind, group, base

@@ -19,10 +19,7 @@ from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.errors import GoalError, ParameterError, RobotDescriptionError, counted
 from spacerobot_ros.model import RobotDescription, SpaceRobot, load_robot
 from spacerobot_ros.model.description import DEFAULT_END_EFFECTOR
-from spacerobot_ros.model.shared_parameters import (
-    DEFAULT_POSITION_TOLERANCE,
-    automatic_tolerance,
-)
+from spacerobot_ros.model.shared_parameters import DEFAULT_POSITION_TOLERANCE, automatic_tolerance
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.parameters import Value, configured, declared, is_of_every_node, values_of
 from spacerobot_ros.planning import Goal

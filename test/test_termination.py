@@ -206,8 +206,7 @@ os._exit(0)
 
 
 @pytest.mark.parametrize(
-    ("ignored", "code"),
-    [((), -signal.SIGINT), ((2,), -signal.SIGTERM), ((2, 15), -signal.SIGKILL)],
+    ("ignored", "code"), [((), -signal.SIGINT), ((2,), -signal.SIGTERM), ((2, 15), -signal.SIGKILL)]
 )
 def test_a_child_gets_one_signal_after_the_other(ignored: tuple[int, ...], code: int) -> None:
     text = f"""{HEAD}
@@ -330,8 +329,7 @@ def test_a_flight_is_asked_to_end_by_each_signal(noted: list[int], number: signa
 
 
 @pytest.mark.parametrize(
-    ("number", "line"),
-    [*zip(SIGNALS, ("Interrupted.", "Terminated.", "Hung up."), strict=True)],
+    ("number", "line"), [*zip(SIGNALS, ("Interrupted.", "Terminated.", "Hung up."), strict=True)]
 )
 def test_a_signal_raises_and_names_itself(
     noted: list[int], number: signal.Signals, line: str

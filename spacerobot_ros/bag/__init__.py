@@ -73,9 +73,7 @@ class RecorderConfig(WatchdogConfig):
         0.0, "wall time between diagnostics; 0: only when messages are lost", "s"
     )
     tf_period: float = nonnegative(
-        0.1,
-        "bag time between transforms written if no node publishes /tf; 0: none",
-        "s",
+        0.1, "bag time between transforms written if no node publishes /tf; 0: none", "s"
     )
     flush_period: float = parameter(
         0.5,

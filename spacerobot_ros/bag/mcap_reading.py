@@ -408,10 +408,7 @@ class _Section(NamedTuple):
 
 
 def blocks_in_time_order(
-    files: Sequence[BagFile],
-    topics: Iterable[str],
-    start_ns: int = 0,
-    end_ns: int = LATEST_TIME_NS,
+    files: Sequence[BagFile], topics: Iterable[str], start_ns: int = 0, end_ns: int = LATEST_TIME_NS
 ) -> Iterator[list[Message]]:
     """Iterate over the messages in a bag in log time order, and in write order for equal log times.
 

@@ -48,12 +48,7 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
-from spacerobot_ros.planning.core.goal import (
-    POSE,
-    end_effector_pose,
-    missed_parts,
-    reached_message,
-)
+from spacerobot_ros.planning.core.goal import POSE, end_effector_pose, missed_parts, reached_message
 from spacerobot_ros.planning.execution.status import describe_remaining_error
 from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig

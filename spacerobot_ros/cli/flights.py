@@ -43,9 +43,7 @@ if TYPE_CHECKING:
 @click.argument("scenario", metavar="SCENARIO|ROBOT", shell_complete=complete_scenario)
 @goal_options
 @registered_option(
-    "--method",
-    registries=(METHODS, LAWS),
-    help="Gait method or control law [as in the scenario].",
+    "--method", registries=(METHODS, LAWS), help="Gait method or control law [as in the scenario]."
 )
 @settings_option
 @bag_option("Bag to write [out/SCENARIO.mcap, or the next free name].")
@@ -423,11 +421,7 @@ def goal_command(
 
 
 @click.command("request")
-@click.argument(
-    "request",
-    metavar="REQUEST",
-    type=click.Choice([each.value for each in Request]),
-)
+@click.argument("request", metavar="REQUEST", type=click.Choice([each.value for each in Request]))
 @click.option("--namespace", default="", help="Namespace of the stack.")
 def request_command(request: str, namespace: str) -> None:
     """Abort, stop, rearm, pause or reset a running stack.

@@ -59,11 +59,7 @@ listed.
 )
 @json_option("Write the findings as JSON.")
 def analyze_command(
-    robot: str,
-    shape: str | None,
-    end_effector: str,
-    picture: Path | None,
-    json_file: Path | None,
+    robot: str, shape: str | None, end_effector: str, picture: Path | None, json_file: Path | None
 ) -> None:
     """Analyse the loops, dynamic singularities and workspaces of ROBOT.
 

@@ -501,10 +501,7 @@ class _Path:
 
 
 def nearest_approaches(
-    geometry: CollisionGeometry,
-    positions: Array,
-    required: Array,
-    base: BasePoses | None = None,
+    geometry: CollisionGeometry, positions: Array, required: Array, base: BasePoses | None = None
 ) -> list[Approach]:
     """Return the nearest approaches of all pairs that come closer than allowed, nearest first.
 

@@ -13,13 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from spacerobot_ros.commanding.fly_to import (
-    FlyTo,
-    FlyToClient,
-    FlyToGoals,
-    GoalErrors,
-    Progress,
-)
+from spacerobot_ros.commanding.fly_to import FlyTo, FlyToClient, FlyToGoals, GoalErrors, Progress
 from spacerobot_ros.commanding.goal_follower import Status, decision_event
 from spacerobot_ros.commanding.host import CommanderActivity, CommanderHost, StateDecoder
 from spacerobot_ros.commanding.plant_state import (

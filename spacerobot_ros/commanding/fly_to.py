@@ -199,9 +199,7 @@ class FlyToGoals:
     """
 
     def __init__(
-        self,
-        errors: Callable[[Goal], GoalErrors],
-        report_aborted: Callable[[str, str], Status],
+        self, errors: Callable[[Goal], GoalErrors], report_aborted: Callable[[str, str], Status]
     ) -> None:
         self._errors, self._report_aborted = errors, report_aborted
         self._served: dict[str, _ActionGoal] = {}

@@ -87,10 +87,7 @@ class ApproachOptions:
         120.0, "time limit for the start of the approach", unit="s", minimum=0.0, maximum=3600.0
     )
     patience: float = parameter(
-        3.0,
-        "time after contact within which the target must be captured",
-        unit="s",
-        minimum=0.0,
+        3.0, "time after contact within which the target must be captured", unit="s", minimum=0.0
     )
     clearance: float = parameter(
         0.02,

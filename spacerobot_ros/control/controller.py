@@ -44,20 +44,11 @@ from spacerobot_ros.control.state import (
     Reference,
 )
 from spacerobot_ros.control.wheels import WheelControl
-from spacerobot_ros.errors import (
-    ParameterError,
-    PlanningError,
-    SpaceRobotError,
-    describe_exception,
-)
+from spacerobot_ros.errors import ParameterError, PlanningError, SpaceRobotError, describe_exception
 from spacerobot_ros.files import warn_once
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.grasp import Payload
-from spacerobot_ros.model.rotations import (
-    compose_poses,
-    matrix_from_quaternion,
-    relative_pose,
-)
+from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion, relative_pose
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning.core.cancellation import Cancellation, PlanningJob
 from spacerobot_ros.planning.methods.thrust.problem import Grapple

@@ -31,11 +31,7 @@ from spacerobot_ros.events import Event, EventKind
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import Payload
 from spacerobot_ros.planning.core.goal import Tolerance
-from spacerobot_ros.planning.execution.goal_file import (
-    BASE_GOAL_KEY,
-    IdentifiedGoal,
-    PursuedGoals,
-)
+from spacerobot_ros.planning.execution.goal_file import BASE_GOAL_KEY, IdentifiedGoal, PursuedGoals
 from spacerobot_ros.times import SECOND
 
 Output = ControllerStatus | Event | PursuedGoals

@@ -58,11 +58,7 @@ class PlannedReference(ReferenceProfile):
     name: ClassVar[str] = PLANNED_PROFILE
 
     def __init__(
-        self,
-        start: Reference,
-        goal: Reference,
-        *legs: ThrustMotion,
-        carries: bool = False,
+        self, start: Reference, goal: Reference, *legs: ThrustMotion, carries: bool = False
     ) -> None:
         super().__init__(start, goal, carries=carries)
         self._legs = legs
@@ -291,11 +287,7 @@ class ReferencePlanner(ThrustPlanner):
         return planned
 
     def plan_grapple(
-        self,
-        start: Reference,
-        state: ControlState,
-        grapple: Grapple,
-        cancellation: Cancellation,
+        self, start: Reference, state: ControlState, grapple: Grapple, cancellation: Cancellation
     ) -> GrappleReference:
         """Return the planned reference to a target; the given target motion starts with the plan.
 

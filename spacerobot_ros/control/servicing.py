@@ -14,12 +14,7 @@ from enum import Enum
 
 import numpy as np
 
-from spacerobot_ros.control.approach import (
-    ApproachPlan,
-    ArmReach,
-    TargetClearance,
-    plan_approach,
-)
+from spacerobot_ros.control.approach import ApproachPlan, ArmReach, TargetClearance, plan_approach
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import CoordinatedController
 from spacerobot_ros.control.detumbling import Detumbling, shortest_detumbling
@@ -361,11 +356,7 @@ class ApproachTask:
         self._report(message, (job.begins, contact, contact), about)
 
     def _make_plan(
-        self,
-        time: float,
-        state: ControlState,
-        controller: CoordinatedController,
-        body: TargetBody,
+        self, time: float, state: ControlState, controller: CoordinatedController, body: TargetBody
     ) -> None:
         law, options, described = controller.law, self.config.target, self.target.description
         outputs, clearance = law.outputs.selection, None

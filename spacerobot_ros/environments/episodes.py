@@ -31,13 +31,7 @@ from spacerobot_ros.files import warn_once
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.inertial_parameters import InertialParameters
-from spacerobot_ros.parameters import (
-    as_numbers,
-    configured,
-    nonnegative,
-    parameter,
-    require_names,
-)
+from spacerobot_ros.parameters import as_numbers, configured, nonnegative, parameter, require_names
 from spacerobot_ros.scenario import Scenario, scenario_or_robot
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.faults import FAULT_KINDS
@@ -419,13 +413,7 @@ class Episodes:
             )
         return scale, np.flatnonzero(scale)
 
-    def begin(
-        self,
-        rows: Any,
-        generators: Any,
-        goal: Any = None,
-        start: Any = None,
-    ) -> None:
+    def begin(self, rows: Any, generators: Any, goal: Any = None, start: Any = None) -> None:
         """Restart the episodes in some rows, given the random generators of all rows, or a device's
         single generator.
 

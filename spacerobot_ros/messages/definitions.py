@@ -52,10 +52,7 @@ _PARTS: dict[str, tuple[str, int | str]] = {
     "_Goal": ("action", 0),
     "_Result": ("action", 1),
     "_Feedback": ("action", 2),
-    "_FeedbackMessage": (
-        "action",
-        "unique_identifier_msgs/UUID goal_id\n{0}_Feedback feedback\n",
-    ),
+    "_FeedbackMessage": ("action", "unique_identifier_msgs/UUID goal_id\n{0}_Feedback feedback\n"),
     "_SendGoal_Request": ("action", "unique_identifier_msgs/UUID goal_id\n{0}_Goal goal\n"),
     "_SendGoal_Response": ("action", "bool accepted\nbuiltin_interfaces/Time stamp\n"),
     "_SendGoal_Event": ("action", _EVENT.format("{0}_SendGoal")),

@@ -440,11 +440,7 @@ def momentum_of_bodies(
 
 
 def base_twist(
-    kin: TreeKinematics,
-    inertia: Composites,
-    qdot: ca.SX,
-    p_B: ca.SX,
-    L_B: ca.SX,
+    kin: TreeKinematics, inertia: Composites, qdot: ca.SX, p_B: ca.SX, L_B: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
     """Return ``(v_WB_B, omega_WB_B)`` for linear momentum ``p_B`` (kg m/s) and angular
     momentum ``L_B`` about the system's centre of mass (kg m^2/s), both in the base frame.

@@ -14,14 +14,7 @@ import casadi as ca
 import numpy as np
 
 from spacerobot_ros.model.compilation import BufferedFunction, dense_function
-from spacerobot_ros.model.description import (
-    Array,
-    Joint,
-    JointKind,
-    Mimic,
-    Pose,
-    RobotDescription,
-)
+from spacerobot_ros.model.description import Array, Joint, JointKind, Mimic, Pose, RobotDescription
 from spacerobot_ros.model.inertial_parameters import MassProperties, sparse_constant
 from spacerobot_ros.model.rotations import matrices_from_quaternions, quaternion_from_matrix
 from spacerobot_ros.model.rotations import quaternion_multiply as numeric_multiply

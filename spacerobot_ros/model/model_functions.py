@@ -17,11 +17,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from spacerobot_ros.model.compilation import (
-    compilation_settings,
-    compiled,
-    dense_function,
-)
+from spacerobot_ros.model.compilation import compilation_settings, compiled, dense_function
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.dynamics import (
     ExternalLoads,

@@ -61,10 +61,7 @@ _ATTRIBUTES = {
     "cylinder": {"radius": (1, "m"), "length": (1, "m")},
     "sphere": {"radius": (1, "m")},
     "capsule": {"radius": (1, "m"), "length": (1, "m")},
-    "mesh": {
-        "filename": (0, "the file of the mesh"),
-        "scale": (3, "factors along x, y and z"),
-    },
+    "mesh": {"filename": (0, "the file of the mesh"), "scale": (3, "factors along x, y and z")},
     "color": {"rgba": (4, "red, green, blue and opacity, from 0 to 1")},
 }
 """Count of numbers (0: text), and meaning or unit, of every attribute that is read."""

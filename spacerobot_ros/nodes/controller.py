@@ -27,11 +27,7 @@ from spacerobot_ros.control.status import ControllerState
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.messages.builders import path_message
 from spacerobot_ros.messages.definitions import encode
-from spacerobot_ros.messages.readers import (
-    WRENCH,
-    MessageTemplate,
-    joint_template,
-)
+from spacerobot_ros.messages.readers import WRENCH, MessageTemplate, joint_template
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.nodes.common.commander import CommanderNode

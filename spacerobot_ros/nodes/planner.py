@@ -34,11 +34,7 @@ from spacerobot_ros.planning.core.cancellation import MAX_THREAD_END_TIME
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Goal
 from spacerobot_ros.planning.core.schedule import BasePath, GaitSchedule
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.execution.status import (
-    PlannerState,
-    PlannerStatus,
-    ScheduleStart,
-)
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus, ScheduleStart
 from spacerobot_ros.planning.execution.tracker import Setpoint
 from spacerobot_ros.times import stamp_bytes
 from spacerobot_ros.topics import link_topic

@@ -82,11 +82,7 @@ _look = ContextVar("_look", default=_PAGE)
 
 @contextmanager
 def drawing(
-    width: float = WIDTH,
-    style: str = "report",
-    own: Path | None = None,
-    *,
-    degrees: bool = False,
+    width: float = WIDTH, style: str = "report", own: Path | None = None, *, degrees: bool = False
 ) -> Iterator[None]:
     """Apply the figure style within a ``with`` block.
 

@@ -48,13 +48,7 @@ from spacerobot_ros.report.figures import (
     set_time,
     sheet,
 )
-from spacerobot_ros.report.flight import (
-    FlightReport,
-    GoalSpan,
-    joint_unit,
-    labels_of,
-    pose_errors,
-)
+from spacerobot_ros.report.flight import FlightReport, GoalSpan, joint_unit, labels_of, pose_errors
 
 DASHES, DOTS = (5.0, 2.5), (1.0, 1.5)
 

@@ -35,12 +35,7 @@ from spacerobot_ros.report.figures import (
     set_range,
     sheet,
 )
-from spacerobot_ros.report.figures_over_time import (
-    DASHES,
-    ONE_STATE_TEXT,
-    draw_group,
-    error_group,
-)
+from spacerobot_ros.report.figures_over_time import DASHES, ONE_STATE_TEXT, draw_group, error_group
 from spacerobot_ros.report.flight import FlightReport, joint_unit, labels_of
 from spacerobot_ros.report.scene import (
     MAX_MESH_FACES,

@@ -23,13 +23,7 @@ from spacerobot_ros.flight.reading import (
     pose_of,
     read_flight,
 )
-from spacerobot_ros.flight.series import (
-    SentGoal,
-    Signal,
-    nearest_rotvec,
-    reported_goal,
-    rotvecs,
-)
+from spacerobot_ros.flight.series import SentGoal, Signal, nearest_rotvec, reported_goal, rotvecs
 from spacerobot_ros.measures import flown_time
 from spacerobot_ros.model.description import (
     DEFAULT_END_EFFECTOR,

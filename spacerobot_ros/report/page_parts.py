@@ -137,10 +137,7 @@ def tiles(rows: Sequence[tuple[str, str, str]]) -> str:
 
 
 def table(
-    identity: str,
-    head: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    numeric: Sequence[int] = (),
+    identity: str, head: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence[int] = ()
 ) -> str:
     """Return a table; the first cell of each row is a header, and ``numeric`` columns are
     right-aligned.

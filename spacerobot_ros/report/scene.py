@@ -55,11 +55,7 @@ class Body:
 
 
 def robot_bodies(
-    robot: RobotDescription,
-    meshes: Mapping[str, TriangleMesh],
-    base: Array,
-    q: Array,
-    most: int,
+    robot: RobotDescription, meshes: Mapping[str, TriangleMesh], base: Array, q: Array, most: int
 ) -> list[Body]:
     """Return the robot links that have solids, with the colours of the joints that move them.
 

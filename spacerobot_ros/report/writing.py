@@ -324,10 +324,7 @@ Figures = Sequence[ReportFigure | str | None]
 
 
 def page(
-    flight: FlightReport,
-    player: PagePart,
-    figures: Figures,
-    beside: Sequence[FlightReport] = (),
+    flight: FlightReport, player: PagePart, figures: Figures, beside: Sequence[FlightReport] = ()
 ) -> str:
     """Return the whole page; each flight in ``beside`` gets a column in a table."""
     charts = charts_of(flight, figures, beside)

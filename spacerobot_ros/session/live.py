@@ -66,11 +66,7 @@ def fly_by_nodes(
     SpaceRobotError
         A parameter or the robot is invalid, or the bag cannot be recorded.
     """
-    with (
-        ros(),
-        closing(MultiProcessStack(scenario, bag)) as stack,
-        graceful_shutdown() as stopped,
-    ):
+    with ros(), closing(MultiProcessStack(scenario, bag)) as stack, graceful_shutdown() as stopped:
         stack.start(scenario.goal, stopped)
         began = time.perf_counter()
 

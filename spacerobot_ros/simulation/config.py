@@ -159,9 +159,7 @@ class CaptureConfig:
     )
     rate: float = nonnegative(0.1, "largest relative angular rate of the two frames", "rad/s")
     joint_impulse_limit: float = nonnegative(
-        0.0,
-        "joint impulse above which the capture event is a warning; 0: no limit",
-        "N m s or N s",
+        0.0, "joint impulse above which the capture event is a warning; 0: no limit", "N m s or N s"
     )
 
     def misses(self, approach: RelativeMotion) -> list[str]:

@@ -159,10 +159,7 @@ def build_model(
 
 
 def _add_contacts(
-    mujoco: Any,
-    spec: Any,
-    robot: RobotDescription,
-    target: tuple[RobotDescription, str] | None,
+    mujoco: Any, spec: Any, robot: RobotDescription, target: tuple[RobotDescription, str] | None
 ) -> list[str]:
     geometry = CollisionGeometry(robot)
     names = [
@@ -219,9 +216,7 @@ def _add_target(spec: Any, target: RobotDescription) -> None:
     for name, (_, pose) in target.frames.items():
         if name != target.base_link:
             body.add_body(
-                name=f"{TARGET}{name}",
-                pos=pose.r,
-                quat=np.roll(quaternion_from_matrix(pose.R), 1),
+                name=f"{TARGET}{name}", pos=pose.r, quat=np.roll(quaternion_from_matrix(pose.R), 1)
             )
 
 

@@ -24,11 +24,7 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.grasp import BodyMotion, RobotMotion, combined_momenta
 from spacerobot_ros.model.integration import count_steps
-from spacerobot_ros.model.rotations import (
-    cross,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-)
+from spacerobot_ros.model.rotations import cross, matrix_from_quaternion, quaternion_from_matrix
 from spacerobot_ros.simulation.capture import CapturePlant, Target, capturing_link
 from spacerobot_ros.simulation.config import PlantConfig, TargetConfig
 from spacerobot_ros.simulation.loads import PlantLoads

@@ -334,10 +334,7 @@ class ReportedState:
         capturing = plant.capturing
         if capturing is not None:
             assert self.target_sensors is not None
-            true = {
-                "target_pose": capturing.target_pose,
-                "target_twist": capturing.target_twist,
-            }
+            true = {"target_pose": capturing.target_pose, "target_twist": capturing.target_twist}
             quantities |= true
             if self.target_sensors.used:
                 quantities["target_pose"] = self.target_sensors.pose

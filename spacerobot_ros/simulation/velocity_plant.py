@@ -103,11 +103,7 @@ class VelocityPlant(CompiledPlant):
     @staticmethod
     @override
     def tick_function(
-        robot: SpaceRobot,
-        model: Composition,
-        substeps: int,
-        *,
-        loaded: bool = False,
+        robot: SpaceRobot, model: Composition, substeps: int, *, loaded: bool = False
     ) -> ca.Function:
         """Compose the tick; with ``loaded``, the momenta after it are the last output."""
         n = robot.n

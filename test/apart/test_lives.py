@@ -40,9 +40,7 @@ KILLS = [
     for phase in phases
     for killed in (commander, "plant", "recorder")
 ]
-QUICK_KILLS = [
-    ("planner", "plant", "executing"),
-]
+QUICK_KILLS = [("planner", "plant", "executing")]
 SLOW_KILLS = [
     ("coordinated_control", "coordinated_control", "tracking"),
     ("planner", "planner", "planning"),

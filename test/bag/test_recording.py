@@ -135,10 +135,7 @@ def test_messages_from_before_the_plant_wait_for_its_clock(bench: Bench) -> None
     bench.wall_ns += S
     recording.flush(clock_is_published=False)
     recording.set_clock(4 * S)
-    assert bench.written() == [
-        ("/a", "waits for a robot", 4 * S, 4 * S),
-        ("/b", "pose", 4 * S, 7),
-    ]
+    assert bench.written() == [("/a", "waits for a robot", 4 * S, 4 * S), ("/b", "pose", 4 * S, 7)]
 
 
 @pytest.mark.parametrize("clock", [False, True])

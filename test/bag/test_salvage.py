@@ -17,15 +17,7 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import String
 from support.command_line import spacerobot
 from support.hostile.records import string
-from support.made_bags import (
-    STRING,
-    Say,
-    array,
-    bag_of_strings,
-    joint_states,
-    made_bag,
-    odometry,
-)
+from support.made_bags import STRING, Say, array, bag_of_strings, joint_states, made_bag, odometry
 from support.raw_messages import Content
 
 from spacerobot_ros.bag import LATCHED, BagWriter, RecordedRobot, RecordingError, read_bag

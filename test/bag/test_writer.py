@@ -344,11 +344,7 @@ HUMBLE = """- history: 1
 
 @pytest.mark.parametrize(
     "profile",
-    [
-        QosProfile(),
-        LATCHED,
-        QosProfile("unknown", 0, "best_effort", liveliness="manual_by_topic"),
-    ],
+    [QosProfile(), LATCHED, QosProfile("unknown", 0, "best_effort", liveliness="manual_by_topic")],
 )
 def test_what_is_written_is_read_back(profile: QosProfile) -> None:
     other = QosProfile(depth=77)

@@ -40,12 +40,7 @@ from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.laws.law import GainPair, Gains
 from spacerobot_ros.control.limits import MotionLimits
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.model import (
-    InertialParameters,
-    SpaceRobot,
-    load_robot,
-    parse_robot,
-)
+from spacerobot_ros.model import InertialParameters, SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.compilation import find_compiler
 from spacerobot_ros.model.description import Array
 from spacerobot_ros.resources import robot_file, share_directory

@@ -22,11 +22,7 @@ from support.campaigns import campaign, section
 from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.running import run_campaign
-from spacerobot_ros.campaign.workers import (
-    open_workers,
-    serialise_campaign,
-    this_code,
-)
+from spacerobot_ros.campaign.workers import open_workers, serialise_campaign, this_code
 
 pytestmark = pytest.mark.slow
 

@@ -17,12 +17,7 @@ from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draws
 from spacerobot_ros.campaign.report import metric_label
 from spacerobot_ros.campaign.targets import description_of
-from spacerobot_ros.measures import (
-    METRICS,
-    Measures,
-    Outcome,
-    metrics_of_each,
-)
+from spacerobot_ros.measures import METRICS, Measures, Outcome, metrics_of_each
 from spacerobot_ros.planning.core.goal import PoseError
 
 FLOWN = Measures(

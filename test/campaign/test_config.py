@@ -47,10 +47,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"disperse": {"mas": NORM}}, "'mas' cannot be dispersed.*Did you mean 'mass'"),
     ({"disperse": {"mass.mass_7": NORM}}, "'mass.mass_7' is not one of.*Did you mean 'mass.mass_"),
     ({"disperse": {"mass": {"nrom": {}}}}, "no distribution 'nrom'.*Did you mean 'norm'"),
-    (
-        {"disperse": {"mass": {"norm": {"scal": 1}}}},
-        "not {'scal': 1}.*Did you mean 'scale'",
-    ),
+    ({"disperse": {"mass": {"norm": {"scal": 1}}}}, "not {'scal': 1}.*Did you mean 'scale'"),
     ({"disperse": {"mass": {"norm": 3}}}, "norm takes loc, scale, not 3"),
     ({"disperse": {"mass": {"norm": {"loc": "one"}}}}, "'mass: loc' is 'one'"),
     ({"disperse": {"mass": {"beta": {"a": 1}}}}, "beta takes a, b, loc, scale, not {'a': 1}"),

@@ -85,10 +85,7 @@ def test_a_driver_is_what_is_unlikely_to_be_chance(given: Influence, beyond: boo
 
 def test_chances_are_corrected_for_the_number_of_tests() -> None:
     """By hand: the k-th smallest of n times n / k, and no larger than the ones above it."""
-    given = [
-        Influence("a", "m", 0.5, 0.01, 0.25, 0.04),
-        Influence("b", "m", 0.25, 0.03, 0.1, 0.5),
-    ]
+    given = [Influence("a", "m", 0.5, 0.01, 0.25, 0.04), Influence("b", "m", 0.25, 0.03, 0.1, 0.5)]
     first, second = corrected_for_multiple_tests(given)
     assert (first.p_value, first.distance_p_value) == pytest.approx((0.04, 0.16 / 3))
     assert (second.p_value, second.distance_p_value) == pytest.approx((0.16 / 3, 0.5))
@@ -260,11 +257,7 @@ def rerun(**given: Any) -> Rerun:
         ({}, True, "dataset     reached; largest deviation 1e-09 (a_m)"),
         ({"deviation": 1.1e-9}, False, "dataset     reached; largest deviation 1.1e-09 (a_m)"),
         ({"outcome": "failed"}, False, "dataset     failed; largest deviation 1e-09 (a_m)"),
-        (
-            {"deviation": 0.0, "worst_metric": ""},
-            True,
-            "dataset     reached; largest deviation 0",
-        ),
+        ({"deviation": 0.0, "worst_metric": ""}, True, "dataset     reached; largest deviation 0"),
         ({"deviation": None, "outcome": ""}, True, "dataset     has no such flight yet"),
         ({"deviation": 5.0, "note": "Because."}, True, "Because."),
     ],

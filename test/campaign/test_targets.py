@@ -10,12 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.campaigns import campaign
 
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.targets import (
-    DrawnFlight,
-    MassFactors,
-    description_of,
-    targets_of,
-)
+from spacerobot_ros.campaign.targets import DrawnFlight, MassFactors, description_of, targets_of
 from spacerobot_ros.errors import ParameterError, RobotDescriptionError
 from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.parameters import values_of

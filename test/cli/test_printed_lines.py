@@ -184,11 +184,7 @@ HANDS = {
             ["clearance   'a' and 'b' touch, 0.5 m deep, at 2.5 s"],
         ),
         ({"capture": CAPTURED}, 6, ["capture     at 1.25 s"]),
-        (
-            {"capture": CAPTURED | PLANNED},
-            6,
-            ["capture     at 1.25 s, planned to leave 0.5 N m s"],
-        ),
+        ({"capture": CAPTURED | PLANNED}, 6, ["capture     at 1.25 s, planned to leave 0.5 N m s"]),
         ({"capture": {"captured": False}}, 6, ["capture     the target is not captured"]),
     ],
 )

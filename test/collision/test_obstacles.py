@@ -7,12 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.crossing import RADII, URDF
 
-from spacerobot_ros.collision import (
-    BasePoses,
-    CollisionGeometry,
-    ObstaclePair,
-    nearest_approaches,
-)
+from spacerobot_ros.collision import BasePoses, CollisionGeometry, ObstaclePair, nearest_approaches
 from spacerobot_ros.collision.planes import PlaneDistances
 from spacerobot_ros.model import SpaceRobot, parse_robot
 from spacerobot_ros.model.description import Array

@@ -338,9 +338,7 @@ def test_a_goal_fails_with_a_server_of_trajectories_that_goes_or_is_silent(
     assert (len(server.sent), server.cancelled) == (1, [1])
 
 
-def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(
-    planner: Rig,
-) -> None:
+def test_a_goal_of_an_action_that_a_later_one_replaces_is_reported_as_aborted(planner: Rig) -> None:
     first, second = Client(), Client()
     for goal_id, client in (("a", first), ("b", second)):
         planner.commander.receive_fly_to(goal_id, lambda: FlyTo(GOAL), client)

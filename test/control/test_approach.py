@@ -14,12 +14,7 @@ from support.oracles.integrated import tumbled_body
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros.control import ControlState, MotionLimits, PoseReference
-from spacerobot_ros.control.approach import (
-    ApproachOptions,
-    ApproachPlan,
-    ArmReach,
-    plan_approach,
-)
+from spacerobot_ros.control.approach import ApproachOptions, ApproachPlan, ArmReach, plan_approach
 from spacerobot_ros.errors import PlanningError
 from spacerobot_ros.model.description import Array, Inertia, Pose
 from spacerobot_ros.model.grasp import BodyMotion, TargetBody
@@ -271,10 +266,7 @@ def test_a_path_begins_in_the_motion_of_the_held_pose_and_ends_with_the_grapple_
         "angular_acceleration",
     ):
         np.testing.assert_allclose(
-            getattr(begun, name),
-            getattr(held, name),
-            atol=1e-12,
-            err_msg=name,
+            getattr(begun, name), getattr(held, name), atol=1e-12, err_msg=name
         )
     assert abs(begun.quaternion @ held.quaternion) == pytest.approx(1.0, abs=1e-14)
     for end in (7.0, 9.5):

@@ -29,12 +29,7 @@ from support.executive_loop import (
 )
 from support.sentences import assert_one_sentence
 
-from spacerobot_ros.control import (
-    ControlState,
-    JointReference,
-    PoseReference,
-    Reference,
-)
+from spacerobot_ros.control import ControlState, JointReference, PoseReference, Reference
 from spacerobot_ros.control.config import ControllerConfig
 from spacerobot_ros.control.controller import build_controller
 from spacerobot_ros.control.executive import ControlExecutive

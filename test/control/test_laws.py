@@ -259,10 +259,7 @@ def test_errors_have_the_dynamics_of_the_gains_which_may_be_matrices(seed: int) 
     law, transposed = (
         LAWS[name](robot, POSES, GAINS) for name in ("model_based", "transposed_jacobian")
     )
-    for given, K, D, atol in (
-        (gains, Kp, Kd, 1e-8),
-        (GAINS, np.diag(KP), np.diag(KD), 1e-9),
-    ):
+    for given, K, D, atol in ((gains, Kp, Kd, 1e-8), (GAINS, np.diag(KP), np.diag(KD), 1e-9)):
         law.set_gains(given)
         motion = OutputMotion(robot, state, law.command(state, reference))
         e, edot, wanted = motion.errors(reference)

@@ -13,11 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from spacerobot_ros.control import PROFILES, Actuation, ActuatorLimits, MotionLimits, reference
 from spacerobot_ros.control.reference import HeldVelocityReference, QuinticReference, StepReference
-from spacerobot_ros.control.state import (
-    JointReference,
-    PoseReference,
-    Reference,
-)
+from spacerobot_ros.control.state import JointReference, PoseReference, Reference
 from spacerobot_ros.model import SpaceRobot
 
 COMMAND = Actuation(np.array([3.0, 4.0, 12.0, -1.0, 2.0, 2.0]), np.array([5.0, -7.0]))
@@ -247,10 +243,7 @@ def test_positions_move_on_a_line_and_attitudes_about_one_axis() -> None:
 
 
 def test_step_is_the_goal_at_once() -> None:
-    start, goal = (
-        Reference(base=flown_pose([0, 0, 0])),
-        Reference(base=flown_pose([1, 0, 0])),
-    )
+    start, goal = (Reference(base=flown_pose([0, 0, 0])), Reference(base=flown_pose([1, 0, 0])))
     profile = StepReference(start, goal, SIX_LIMITS)
     assert profile.duration == 0.0
     assert profile.at(0.0) is goal

@@ -8,13 +8,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from control.flights import (
-    END_EFFECTOR,
-    PinocchioPlant,
-    load,
-    random_pose_reference,
-    random_state,
-)
+from control.flights import END_EFFECTOR, PinocchioPlant, load, random_pose_reference, random_state
 from scipy.spatial.transform import Rotation
 from support.oracles import Array
 from support.random_robots import random_chain_urdf, random_robot_urdf

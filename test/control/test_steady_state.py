@@ -9,15 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from control.flights import (
-    END_EFFECTOR,
-    INVERTIBLE,
-    PLANAR_GAINS,
-    law_of,
-    load,
-    planar_start,
-    pose,
-)
+from control.flights import END_EFFECTOR, INVERTIBLE, PLANAR_GAINS, law_of, load, planar_start, pose
 from scipy.spatial.transform import Rotation
 from support.executive_loop import AIM, PERIOD, TIP, ExecutiveLoop, goal_at
 from support.executive_loop import KP as STEP_KP

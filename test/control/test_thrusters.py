@@ -36,9 +36,7 @@ def random_table(rng: np.random.Generator, count: int) -> tuple[Array, Array]:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(1, 24),
-    scale=st.sampled_from([1e-6, 1.0, 1e4]),
+    seed=st.integers(0, 2**31), count=st.integers(1, 24), scale=st.sampled_from([1e-6, 1.0, 1e4])
 )
 def test_what_thrusters_can_give_is_given(seed: int, count: int, scale: float) -> None:
     rng = np.random.default_rng(seed)

@@ -305,10 +305,7 @@ def test_goals_of_a_scenario() -> None:
         ({"link": "segment_2"}, "Argument 'link' is 'segment_2', but task 'reorient' has no link"),
         ({"reward": {"time": np.nan}}, "The reward weight 'time' is nan: use a finite"),
         ({"time_limit": np.inf}, "Parameter 'time_limit' is inf; it must be a finite"),
-        (
-            {"scenario": "a", "campaign": "b"},
-            "both given: a campaign file already names",
-        ),
+        ({"scenario": "a", "campaign": "b"}, "both given: a campaign file already names"),
         ({"reward": {"speed": 1}}, "The reward has no weight 'speed'; it has progress"),
         ({"scenario": "faults/late_poses"}, "has faults of sensors, which environments do not"),
         ({"task": "hover"}, "Argument 'task' is 'hover'; it may be reorient, reach"),

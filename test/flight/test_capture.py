@@ -17,11 +17,7 @@ from spacerobot_ros.bag.salvage import salvage_bag
 from spacerobot_ros.control.wheels import BUDGET_PARTS
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
-from spacerobot_ros.flight.captures import (
-    held_bodies,
-    momentum_budget_over_time,
-    payload_estimates,
-)
+from spacerobot_ros.flight.captures import held_bodies, momentum_budget_over_time, payload_estimates
 from spacerobot_ros.flight.flight import Flight
 from spacerobot_ros.flight.lockstep import fly_scenario
 from spacerobot_ros.flight.reading import namespaces, read_run

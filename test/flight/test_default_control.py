@@ -148,10 +148,7 @@ def turns_of_sign(values: np.ndarray[Any, Any]) -> int:
     return int(((steps[1:] * steps[:-1] < 0) & large[1:] & large[:-1]).sum(axis=0).max(initial=0))
 
 
-@pytest.mark.parametrize(
-    "rate",
-    [5.0, 20.0, pytest.param(200.0, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("rate", [5.0, 20.0, pytest.param(200.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "robot", some_fast([*SHAPES], *(name for name in SHAPES if name not in LARGE))
 )

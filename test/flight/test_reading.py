@@ -17,13 +17,7 @@ from support.made_bags import array, joint_states, made_bag, odometry, pose, sta
 
 from spacerobot_ros.errors import RecordingError
 from spacerobot_ros.flight.flight import Flight
-from spacerobot_ros.flight.reading import (
-    FlightBag,
-    impulse,
-    open_flight_bag,
-    read_flight,
-    read_run,
-)
+from spacerobot_ros.flight.reading import FlightBag, impulse, open_flight_bag, read_flight, read_run
 from spacerobot_ros.flight.series import Signal
 from spacerobot_ros.measures import Outcome
 
@@ -316,9 +310,7 @@ def test_a_run_to_another_goal_than_that_of_its_scenario_has_the_goal_that_was_f
     assert flight.scenario.published == ()
 
 
-def test_goals_of_named_end_effectors_leave_the_base_free_unless_it_has_one(
-    tmp_path: Path,
-) -> None:
+def test_goals_of_named_end_effectors_leave_the_base_free_unless_it_has_one(tmp_path: Path) -> None:
     hands = json.dumps({"left": [1, 2, 3], "right": [4, 5, 6, 0, 0, 0, 1]})
     for number, free in enumerate((True, False)):
         pose_of_base: dict[str, str | None] = dict.fromkeys(("goal_position",), None)

@@ -171,10 +171,7 @@ def test_another_pose_keeps_the_shape_that_is_wanted() -> None:
     scenario = load_scenario("planar_chain")
     shape = scenario.goal.joint_positions
     assert shape is not None
-    for words in (
-        {"pose": (0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0)},
-        {"rotvec": (0.0, 0.0, 0.1)},
-    ):
+    for words in ({"pose": (0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0)}, {"rotvec": (0.0, 0.0, 0.1)}):
         kept = scenario.with_goal(**words).goal.joint_positions
         assert kept is not None
         assert kept.tolist() == shape.tolist()
@@ -419,10 +416,7 @@ def test_files_without_sections(tmp_path: Path, caplog: pytest.LogCaptureFixture
         ),
         (("kills: 3",), "'kills' in the file FILE is 3, not a list of lines NODE at SECONDS."),
         (("world: none.urdf",), "The world in the scenario file FILE is invalid: "),
-        (
-            (),
-            "The scenario file FILE has no 'scenario: ros__parameters:' section with a goal.",
-        ),
+        ((), "The scenario file FILE has no 'scenario: ros__parameters:' section with a goal."),
     ],
 )
 def test_scenarios_that_are_refused(goal: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
@@ -464,7 +458,7 @@ def test_a_scenario_is_read_and_written(tmp_path: Path) -> None:
     assert planner == {"method": "lie_bracket", "averaging": 3}
     recorded = scenario_text(found.with_overrides("recorder", {"tf_period": 0.5}))
     assert list(yaml.safe_load(recorded)) == [
-        *("scenario", "/**/plant", "/**/planner", "/**/recorder"),
+        *("scenario", "/**/plant", "/**/planner", "/**/recorder")
     ]
     again = written(tmp_path, text)
     assert again.goal.joint_positions is not None

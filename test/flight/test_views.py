@@ -501,10 +501,7 @@ def test_errors_of_named_end_effectors_are_those_of_their_links() -> None:
     points = skeleton(FLIGHT, -1, FLIGHT.pose[-1])
     near = points[links[0]][0] + [0.0, 0.3, -0.4]
     far = points[links[1]][0] + [2.0, 0.0, 0.0]
-    hands = (
-        EndEffectorGoal(links[0], near, HAND.quaternion),
-        EndEffectorGoal(links[1], far, None),
-    )
+    hands = (EndEffectorGoal(links[0], near, HAND.quaternion), EndEffectorGoal(links[1], far, None))
     goal = replace(GOAL, end_effectors=hands, base=frozenset())
     flight = made_flight(goal=goal)
     errors = flight.end_effector_errors

@@ -110,8 +110,7 @@ def columns(topic: Any, path: str, names: str) -> Any:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [each if each == "root_world" else pytest.param(each, marks=SLOW) for each in STRANGERS],
+    "name", [each if each == "root_world" else pytest.param(each, marks=SLOW) for each in STRANGERS]
 )
 def test_a_robot_of_others_flies_from_its_file_to_tables(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture

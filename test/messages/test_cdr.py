@@ -25,11 +25,7 @@ from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
 from spacerobot_ros.messages.definitions import Layout, encode, installed_type
-from spacerobot_ros.messages.readers import (
-    MessageTemplate,
-    TemplateReader,
-    UnreadableError,
-)
+from spacerobot_ros.messages.readers import MessageTemplate, TemplateReader, UnreadableError
 from spacerobot_ros.times import stamp_bytes
 
 MESSAGES = (

@@ -23,19 +23,9 @@ from trajectory_msgs.msg import JointTrajectory
 
 from spacerobot_ros.bag.series import read_columns
 from spacerobot_ros.errors import CommandError, SpaceRobotError
-from spacerobot_ros.events import (
-    INTEGER,
-    SECONDS,
-    KeyValueField,
-    KeyValueFormat,
-    list_format,
-)
+from spacerobot_ros.events import INTEGER, SECONDS, KeyValueField, KeyValueFormat, list_format
 from spacerobot_ros.messages.builders import encode_list, trajectory_message
-from spacerobot_ros.messages.definitions import (
-    MessageType,
-    installed_type,
-    seconds_and_nanoseconds,
-)
+from spacerobot_ros.messages.definitions import MessageType, installed_type, seconds_and_nanoseconds
 from spacerobot_ros.messages.diagnostics import STATUS, StatusRecord, read_status
 from spacerobot_ros.messages.readers import (
     CommandReader,

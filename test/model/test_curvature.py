@@ -204,10 +204,7 @@ def compare(robot: SpaceRobot, seed: int) -> None:
     momentum = D @ omega + D_q @ qdot
     weighted = ca.dot(eta, momentum)
     slope = ca.gradient(weighted, q)
-    wanted = [
-        ca.jacobian(momentum, q),
-        *(ca.jacobian(slope, x) for x in (q, qdot, omega)),
-    ]
+    wanted = [ca.jacobian(momentum, q), *(ca.jacobian(slope, x) for x in (q, qdot, omega))]
     symbols = [q, omega, qdot, eta]
     of_casadi = ca.Function("of_casadi", symbols, [ca.densify(x) for x in wanted])
     ours = robot.function("momentum_derivatives", compile=False)

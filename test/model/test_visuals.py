@@ -316,11 +316,7 @@ def test_a_missing_reader_is_named_with_the_command_that_installs_it(
         ("a.obj", OBJ + b"f 1 2 99999999999\n", "is not a number"),
         ("a.ply", b"secret of the host", "trimesh raised [A-Za-z]+[.]$"),
         ("a.dae", b"secret of the host", "trimesh raised [A-Za-z]+[.]$"),
-        (
-            "a.step",
-            b"",
-            r"unsupported format \(not STL, OBJ, COLLADA, glTF or PLY\): convert",
-        ),
+        ("a.step", b"", r"unsupported format \(not STL, OBJ, COLLADA, glTF or PLY\): convert"),
     ],
 )
 def test_what_cannot_be_read_is_refused_in_a_sentence(

@@ -61,10 +61,7 @@ def test_a_target_is_captured_and_released_on_request(harness: Harness) -> None:
     rig = Rig(harness, PARAMETERS, topics=TARGET_TOPICS)
     assert rig.wait("target/robot_description", 1).data == BLOCK.read_text(encoding="utf-8")
     refused = rig.trigger("plant/release")
-    assert (refused.success, refused.message) == (
-        False,
-        "'end_effector' does not hold a target.",
-    )
+    assert (refused.success, refused.message) == (False, "'end_effector' does not hold a target.")
     first = rig.wait("target/odom", 1)
     assert (first.header.frame_id, first.child_frame_id) == ("world", "block")
     assert first.pose.pose.position.x == pytest.approx(2.3000768148)

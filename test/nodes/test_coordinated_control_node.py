@@ -214,9 +214,7 @@ def test_an_inactive_node_forgets_goals_and_then_answers_the_waiting_state(
     loop.wait_for("holding")
 
 
-def test_the_robot_is_taken_from_the_description_and_replaced_by_another(
-    harness: Harness,
-) -> None:
+def test_the_robot_is_taken_from_the_description_and_replaced_by_another(harness: Harness) -> None:
     """A goal of the robot before is not reached by the one that is there now."""
     loop = Loop(harness, robot="")
     loop.show()
@@ -454,11 +452,7 @@ def test_a_file_that_holds_no_goal_is_refused(
     ],
 )
 def test_goals_of_another_robot_or_law_are_refused(
-    harness: Harness,
-    file: Path,
-    content: str,
-    settings: dict[str, str],
-    mentions: tuple[str, ...],
+    harness: Harness, file: Path, content: str, settings: dict[str, str], mentions: tuple[str, ...]
 ) -> None:
     file.write_text(content)
     parameters = {"robot": "planar_manipulator", "resume_file": str(file), **settings}

@@ -254,8 +254,7 @@ def test_a_stack_in_real_time_is_alive_whatever_its_file_says(harness: Harness) 
 @pytest.mark.parametrize("choice", ["auto", "best_effort", "reliable"])
 def test_a_driver_that_publishes_with_best_effort_is_heard(harness: Harness, choice: str) -> None:
     planner = harness.make(
-        PlannerNode,
-        {"robot": "planar_chain", "tick_rate": 20.0, "state_reliability": choice},
+        PlannerNode, {"robot": "planar_chain", "tick_rate": 20.0, "state_reliability": choice}
     )
     probe = harness.probe({"joint_commands": JointState})
     drivers = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -31,10 +31,7 @@ from spacerobot_ros.messages.builders import (
     shape_marker,
 )
 from spacerobot_ros.messages.definitions import encode
-from spacerobot_ros.messages.diagnostics import (
-    PlantDiagnostics,
-    encode_diagnostics,
-)
+from spacerobot_ros.messages.diagnostics import PlantDiagnostics, encode_diagnostics
 from spacerobot_ros.model import SpaceRobot, load_robot, parse_robot
 from spacerobot_ros.model.description import Pose, Shape
 from spacerobot_ros.model.rotations import matrix_from_quaternion

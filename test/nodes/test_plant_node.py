@@ -24,8 +24,7 @@ from spacerobot_ros.resources import robot_file
 
 def test_a_supervisor_can_take_the_plant_through_its_life(harness: Harness) -> None:
     plant = harness.make(
-        PlantNode,
-        {"robot": "sliding_masses", "time_mode": "lockstep", "autostart": False},
+        PlantNode, {"robot": "sliding_masses", "time_mode": "lockstep", "autostart": False}
     )
     probe = harness.probe(STATE)
     change = probe.create_client(ChangeState, "plant/change_state")

@@ -27,13 +27,7 @@ from std_srvs.srv import SetBool
 from support.made_bags import joint_states
 from support.nodes_apart import NodesApart
 from support.planner_flight import values_of
-from support.recorded_stack import (
-    LATCHED_TOPICS,
-    PLANT,
-    STREAMS,
-    BagContent,
-    Stack,
-)
+from support.recorded_stack import LATCHED_TOPICS, PLANT, STREAMS, BagContent, Stack
 from support.ros_harness import LATCHED, Harness, construction
 from support.sentences import assert_one_sentence
 

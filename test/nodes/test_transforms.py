@@ -22,11 +22,7 @@ from support.ros_harness import Harness, nanoseconds
 
 from spacerobot_ros.bag import Bag, RecordedRobot, read_bag, type_hash
 from spacerobot_ros.bag.reader import columns
-from spacerobot_ros.messages.builders import (
-    TRANSFORM_TYPE,
-    TRANSFORMS,
-    RobotTransforms,
-)
+from spacerobot_ros.messages.builders import TRANSFORM_TYPE, TRANSFORMS, RobotTransforms
 from spacerobot_ros.model.kinematics import ForwardKinematics
 from spacerobot_ros.model.rotations import compose_poses, matrix_from_quaternion
 from spacerobot_ros.model.urdf import load_robot

@@ -25,11 +25,7 @@ from support.ros_harness import Harness, Probe, nanoseconds
 from spacerobot_ros.bag import RecordedRobot, read_bag
 from spacerobot_ros.flight.verification import verify_bag
 from spacerobot_ros.nodes import PlannerNode, PlantNode, RecorderNode
-from spacerobot_ros.nodes.common.node import (
-    Endpoint,
-    endpoints_of,
-    topics_without_all_matches,
-)
+from spacerobot_ros.nodes.common.node import Endpoint, endpoints_of, topics_without_all_matches
 
 # Plants whose time and shape tell them apart.
 ROBOTS: dict[str, dict[str, Any]] = {

@@ -18,11 +18,7 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.nodes import RecorderNode
 from spacerobot_ros.nodes.common.node import FlightNode
-from spacerobot_ros.nodes.common.watchdog import (
-    HeartbeatState,
-    SilenceReport,
-    Watchdog,
-)
+from spacerobot_ros.nodes.common.watchdog import HeartbeatState, SilenceReport, Watchdog
 from spacerobot_ros.simulation.status import PlantState, PlantStatus
 
 REAL_TIME = {"time_mode": "realtime", "real_time_factor": 1.0, "command_timeout": 5.0}
@@ -179,10 +175,7 @@ def test_a_silent_plant_is_noticed_by_commander_and_recorder(
     flight.wait("executing")
     assert flight.silence(flight.plant) < 1.0
     harness.spin_until(lambda: len(flight.events("node_silent")) == 2, "both notice")
-    assert sorted(flight.events("node_silent")) == [
-        ("/planner", "/plant"),
-        ("/recorder", "/plant"),
-    ]
+    assert sorted(flight.events("node_silent")) == [("/planner", "/plant"), ("/recorder", "/plant")]
     # The planner may wait for states again before the recorder notices.
     harness.spin_until(lambda: "aborted" in flight.all_states, "the abort")
     told = flight.probe.messages["planner/status"][flight.all_states.index("aborted")]

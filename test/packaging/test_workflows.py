@@ -32,9 +32,7 @@ TARGETS = {
     *re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE),
     *yaml.safe_load((ROOT / "test/studies.yaml").read_text("utf-8")),
 }
-TO_PUBLISH = {
-    *("--once", "-w", "--keep-alive", "--rate", "--qos-durability", "--qos-reliability"),
-}
+TO_PUBLISH = {*("--once", "-w", "--keep-alive", "--rate", "--qos-durability", "--qos-reliability")}
 """Options of `ros2 topic pub` in the sources of ros2cli's branch jazzy, of those there are."""
 
 

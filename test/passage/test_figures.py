@@ -31,11 +31,7 @@ from spacerobot_ros.report.writing import FIGURES
 from spacerobot_ros.scenario import CONFIGS
 
 FLIGHTS: dict[str, dict[str, Any]] = {
-    "slide": {
-        "what": "sliding_masses",
-        "goal": (0.05, -0.04, 0.02),
-        "rotvec": (0.04, -0.02, 0.03),
-    },
+    "slide": {"what": "sliding_masses", "goal": (0.05, -0.04, 0.02), "rotvec": (0.04, -0.02, 0.03)},
     "swing": {
         "what": "sliding_masses",
         "method": "lie_bracket",
@@ -81,10 +77,7 @@ FLIGHTS: dict[str, dict[str, Any]] = {
             "coordinated_control.attitude_tolerance": 0.02,
         },
     },
-    "servicer": {
-        "what": "servicer",
-        "parameters": {"coordinated_control.time_limit": 6.0},
-    },
+    "servicer": {"what": "servicer", "parameters": {"coordinated_control.time_limit": 6.0}},
     "nozzles": {
         "what": "servicer_thrusters",
         "parameters": {

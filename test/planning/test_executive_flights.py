@@ -23,11 +23,7 @@ from spacerobot_ros.planning.methods.lie_bracket import LieBracketGait
 from spacerobot_ros.resources import share_directory
 
 # Wide tolerances and one large cycle: a first order that is some way off.
-COARSE = {
-    "position_tolerance": 0.1,
-    "attitude_tolerance": 0.1,
-    "lie_bracket.loop_area": 10.0,
-}
+COARSE = {"position_tolerance": 0.1, "attitude_tolerance": 0.1, "lie_bracket.loop_area": 10.0}
 
 
 # -- reached, or refused with the true reason -------------------------------------------------

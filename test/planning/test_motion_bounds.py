@@ -23,10 +23,7 @@ from spacerobot_ros.planning.methods.optimal.motion_bounds import (
     DurationBound,
     link_demands,
 )
-from spacerobot_ros.planning.methods.optimal.problem import (
-    BoundaryConditions,
-    MotionLimits,
-)
+from spacerobot_ros.planning.methods.optimal.problem import BoundaryConditions, MotionLimits
 from spacerobot_ros.resources import robot_file
 
 PERIOD = 0.1

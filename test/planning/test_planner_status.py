@@ -102,7 +102,7 @@ def test_a_status_has_the_keys_that_belong_to_it() -> None:
         "goal": "0.1 -2 3.5 0 0.6 0 0.8",
     }
     assert [state.value for state in PlannerState if state.decided] == [
-        *("reached", "reached_partly", "failed", "refused", "aborted"),
+        *("reached", "reached_partly", "failed", "refused", "aborted")
     ]
 
 

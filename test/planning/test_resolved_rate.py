@@ -267,8 +267,7 @@ def test_a_joint_at_its_limit_ends_the_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("way", "keep_attitude"),
-    [([10.0, 0.0, 0.0], 0), ([1.0, -9.0, 4.0], 0), ([0.085, 0.0, 0.0], 1)],
+    ("way", "keep_attitude"), [([10.0, 0.0, 0.0], 0), ([1.0, -9.0, 4.0], 0), ([0.085, 0.0, 0.0], 1)]
 )
 def test_a_line_is_not_traced_beyond_the_point_nearest_to_a_singularity(
     way: list[float], keep_attitude: int
@@ -513,11 +512,7 @@ def test_paper_4_optimal_reaches_b_as_fast_as_published(
     manipulator: tuple[SpaceRobot, RobotState], clearance: float, longest: float
 ) -> None:
     schedule = reach_b(
-        manipulator,
-        cache=0,
-        max_acceleration=(4.0, 4.0),
-        clearance=clearance,
-        control_period=0.01,
+        manipulator, cache=0, max_acceleration=(4.0, 4.0), clearance=clearance, control_period=0.01
     )
     # A tick or two more, for held commands that end on the goal.
     assert schedule.notes["solution_time"] <= longest + 0.005  # type: ignore[operator]

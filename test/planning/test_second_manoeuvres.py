@@ -244,10 +244,7 @@ def test_every_joint_keeps_its_own_limits_in_both_directions(name: str) -> None:
         assert np.all(fastest >= 0.95 * np.array([0.7, 0.4])), "each is as fast as it may be"
 
 
-SHAPES = {
-    "planar_chain": np.array([0.3, -0.2]),
-    "three_joint_arm": np.array([0.0, -0.785, 1.57]),
-}
+SHAPES = {"planar_chain": np.array([0.3, -0.2]), "three_joint_arm": np.array([0.0, -0.785, 1.57])}
 PLANNING_TIME = {"planar_chain": 0.3, "three_joint_arm": 0.8}
 """Simulated s that every plan takes; a plan in motion takes over just then."""
 

@@ -206,11 +206,7 @@ def assert_all_say_of_the_end_effector(bag: Path, flight: Flight) -> None:
     assert numbers == pytest.approx((distance,) * 3, rel=6e-3)
     if flight.turns_end_effector:
         assert summary["end_effector_attitude_error_rad"] == pytest.approx(angle, rel=1e-9)
-        turns = (
-            shown(card, r" # rad;"),
-            shown(printed, r"and # rad"),
-            shown(live, r"and # rad"),
-        )
+        turns = (shown(card, r" # rad;"), shown(printed, r"and # rad"), shown(live, r"and # rad"))
         assert turns == pytest.approx((angle,) * 3, rel=6e-3)
     else:
         assert "end_effector_attitude_error_rad" not in summary

@@ -31,11 +31,7 @@ from spacerobot_ros.planning.core.goal import POSE
 from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report.figures import ReportFigure, TraceGroup, log_range
 from spacerobot_ros.report.figures_over_time import link_errors_figure
-from spacerobot_ros.report.figures_space import (
-    configurations_figure,
-    loops_figure,
-    path_figure,
-)
+from spacerobot_ros.report.figures_space import configurations_figure, loops_figure, path_figure
 from spacerobot_ros.report.flight import Cycles, FlightReport, find_cycles, read_report
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.player import WORLD, view_of_flight

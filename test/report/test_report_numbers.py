@@ -270,10 +270,7 @@ def test_published_figures_have_as_many_decimals_as_were_printed(tmp_path: Path)
 
 
 def test_flights_side_by_side(tmp_path: Path) -> None:
-    others = [
-        flight(tmp_path),
-        flight(tmp_path, (), name="bare.mcap", goals=()),
-    ]
+    others = [flight(tmp_path), flight(tmp_path, (), name="bare.mcap", goals=())]
     table = runs_table(others)
     assert table.head == ("Flight", "flight", "bare")
     drift = "2e-08 kg m/s"
@@ -594,11 +591,7 @@ def test_whatever_a_bag_holds_is_text_on_the_page(tmp_path: Path) -> None:
         urdf = urdf.replace(f'name="{name}"', f'name="{text}"')
     published = [{"quantity": odd(3), "printed": [1.0], "note": odd(4)}]
     metadata = {
-        "scenario": {
-            "name": odd(5),
-            "description": odd(6),
-            "published": json.dumps(published),
-        },
+        "scenario": {"name": odd(5), "description": odd(6), "published": json.dumps(published)},
         "spacerobot": {"version": odd(7)},
         f"parameters/{odd(8)}": {odd(9): odd(10)},
     }

@@ -249,9 +249,7 @@ def test_a_follower_raises_what_its_look_raises(harness: Harness) -> None:
     assert client.outcome is Outcome.INTERRUPTED
 
 
-def test_the_pose_of_a_goal_is_that_of_the_message_and_its_id_is_its_own(
-    harness: Harness,
-) -> None:
+def test_the_pose_of_a_goal_is_that_of_the_message_and_its_id_is_its_own(harness: Harness) -> None:
     """Though time stands still."""
     mission = Mission(harness, "planner")
     tool = Goal.checked([0.1, 0.2, 0.3], [0.0, 0.6, 0.0, 0.8])

@@ -15,20 +15,13 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from support.made_bags import array, joint_states, made_bag, odometry, pose
 
 from spacerobot_ros.control.status import CommandReport, ControllerState, ControllerStatus
-from spacerobot_ros.flight.reading import (
-    open_flight_bag,
-    read_flown,
-    read_run,
-)
+from spacerobot_ros.flight.reading import open_flight_bag, read_flown, read_run
 from spacerobot_ros.measures import Outcome, flown_time
 from spacerobot_ros.model.thrusters import find_thrusters
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal
-from spacerobot_ros.planning.execution.status import (
-    PlannerState,
-    PlannerStatus,
-)
+from spacerobot_ros.planning.execution.status import PlannerState, PlannerStatus
 from spacerobot_ros.report import write_report
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.scenario import load_scenario

@@ -556,8 +556,7 @@ def test_a_target_slides_on_a_table_with_the_robot() -> None:
 
 @pytest.mark.parametrize("held", [True, False])
 @pytest.mark.parametrize(
-    ("engine", "actuation"),
-    [("exact", "effort"), ("exact", "velocity"), ("mujoco", "effort")],
+    ("engine", "actuation"), [("exact", "effort"), ("exact", "velocity"), ("mujoco", "effort")]
 )
 def test_a_plant_goes_on_from_a_state_with_its_target(
     engine: str, actuation: str, held: bool

@@ -13,12 +13,7 @@ from spacerobot_ros.errors import CommandError, ParameterError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation.actuators import build_plant
-from spacerobot_ros.simulation.commands import (
-    CommandSource,
-    CommandValidator,
-    Reason,
-    Refusal,
-)
+from spacerobot_ros.simulation.commands import CommandSource, CommandValidator, Reason, Refusal
 from spacerobot_ros.simulation.config import PlantConfig
 
 SECOND = 10**9

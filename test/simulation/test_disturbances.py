@@ -21,17 +21,10 @@ from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.model.rotations import matrix_from_quaternion
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, InitialState, VelocityPlant
-from spacerobot_ros.simulation.actuators import (
-    PlantWithFaults,
-    ThrusterPlant,
-    build_plant,
-)
+from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, build_plant
 from spacerobot_ros.simulation.commands import CommandValidator
 from spacerobot_ros.simulation.config import PlantConfig
-from spacerobot_ros.simulation.faults import (
-    Disturbance,
-    parse_disturbance,
-)
+from spacerobot_ros.simulation.faults import Disturbance, parse_disturbance
 from spacerobot_ros.simulation.loads import PlantLoads
 from spacerobot_ros.simulation.sensors import ReportedState
 from spacerobot_ros.simulation.status import PlantMonitor, PlantState, PlantStatus
@@ -98,10 +91,7 @@ FORM = (
         ("hand force 1 2 3 at 5 until 5", "it ends at 5 s but begins at 5 s"),
         ("hand force 1 2 3 at nan", "'nan' is not a finite number"),
         ("hand force 1 2 3 until 2e9", "its time is 2e+09 s but must be from 0 to 1e+09 s"),
-        (
-            "hand torque 1 2 3 for 5",
-            "only 'at SECONDS' and 'until SECONDS' may follow the torque",
-        ),
+        ("hand torque 1 2 3 for 5", "only 'at SECONDS' and 'until SECONDS' may follow the torque"),
         (
             "hand force 1 2 3 force 1 2 3",
             "only 'at SECONDS' and 'until SECONDS' may follow the force",

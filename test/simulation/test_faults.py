@@ -18,18 +18,9 @@ from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.resources import robot_file
 from spacerobot_ros.simulation import EffortPlant, VelocityPlant
-from spacerobot_ros.simulation.actuators import (
-    PlantWithFaults,
-    ThrusterPlant,
-    build_plant,
-)
+from spacerobot_ros.simulation.actuators import PlantWithFaults, ThrusterPlant, build_plant
 from spacerobot_ros.simulation.config import PlantConfig, SensorConfig
-from spacerobot_ros.simulation.faults import (
-    FAULT_KINDS,
-    FaultTargets,
-    Timeline,
-    parse_fault,
-)
+from spacerobot_ros.simulation.faults import FAULT_KINDS, FaultTargets, Timeline, parse_fault
 from spacerobot_ros.simulation.sensors import Sensors
 
 URDF = Path(__file__).parents[2] / "urdf"
@@ -264,10 +255,7 @@ def test_actuator_noise_has_its_sigma_and_its_seed() -> None:
 
 def test_a_plant_without_faults_is_the_plant_within() -> None:
     robot = robot_of(urdf("three_joint_arm"))
-    bare, wrapped = (
-        VelocityPlant(robot, TICK),
-        faulty(VelocityPlant(robot, TICK)),
-    )
+    bare, wrapped = (VelocityPlant(robot, TICK), faulty(VelocityPlant(robot, TICK)))
     rng = np.random.default_rng(3)
     for _ in range(20):
         command = rng.uniform(-1.0, 1.0, 3)

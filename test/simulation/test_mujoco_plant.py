@@ -279,12 +279,7 @@ def test_a_wheel_at_its_largest_rate_gets_no_faster() -> None:
     limit = robot.velocity_limit[wheel]
     effort, rates = np.zeros((2, robot.n))
     effort[wheel], rates[wheel] = 1e6, 0.999 * limit
-    fast = plant(
-        robot,
-        actuation="effort",
-        tick_rate=10.0,
-        initial_joint_velocities=rates.tolist(),
-    )
+    fast = plant(robot, actuation="effort", tick_rate=10.0, initial_joint_velocities=rates.tolist())
     for _ in range(30):
         fast.step(effort, np.zeros(6))
     assert fast.qdot[wheel] < 1.01 * limit

@@ -334,9 +334,7 @@ def test_center_of_mass_is_where_it_is_put(plant: Any) -> None:
     rng = np.random.default_rng(1)
     center = np.array([1.0, -2.0, 0.5])
     start = InitialState(
-        quaternion=rng.normal(size=4),
-        joint_positions=rng.uniform(-1, 1, 3),
-        center_of_mass=center,
+        quaternion=rng.normal(size=4), joint_positions=rng.uniform(-1, 1, 3), center_of_mass=center
     )
     built = plant(robot_of(TREE), 0.01, start)
     oracle = PinocchioOracle(TREE, robot_of(TREE).joint_names)

@@ -81,10 +81,7 @@ class Loop:
         v.x, v.y, v.z = self.velocity.tolist()
         state.pose.pose.orientation.w = 1.0
         shape = JointState(
-            name=joints,
-            position=SHAPE.tolist(),
-            velocity=self.rates.tolist(),
-            effort=[0.0, 0.0],
+            name=joints, position=SHAPE.tolist(), velocity=self.rates.tolist(), effort=[0.0, 0.0]
         )
         for message in (state, shape):
             stamp = divmod(self.tick * TICK_NS, 1_000_000_000)

@@ -21,11 +21,7 @@ from spacerobot_ros.events import Event
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.parameters import configured
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.planning.execution.goal_file import (
-    GoalFile,
-    IdentifiedGoal,
-    PursuedGoals,
-)
+from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal, PursuedGoals
 
 Array = npt.NDArray[np.float64]
 

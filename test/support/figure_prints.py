@@ -33,16 +33,8 @@ from matplotlib.text import Annotation, Text
 
 from spacerobot_ros.model import SpaceRobot
 from spacerobot_ros.planning.analysis import analyze
-from spacerobot_ros.report.figures import (
-    WIDTH,
-    ReportFigure,
-    drawing,
-)
-from spacerobot_ros.report.figures_over_time import (
-    momentum_figure,
-    shape_figure,
-    thrusters_figure,
-)
+from spacerobot_ros.report.figures import WIDTH, ReportFigure, drawing
+from spacerobot_ros.report.figures_over_time import momentum_figure, shape_figure, thrusters_figure
 from spacerobot_ros.report.flight import FlightReport, read_report
 from spacerobot_ros.report.page_parts import PagePart
 from spacerobot_ros.report.planning_figures import _planar_figure, _spatial_figure

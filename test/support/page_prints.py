@@ -29,10 +29,7 @@ DISPERSED: dict[str, Any] = {
     "mass.mass_2": {"norm": {"loc": 1.0, "scale": 0.05}},
     "planner.position_tolerance": {"choice": [0.05, 0.06]},
 }
-CRITERIA = {
-    "position_error_m": {"max": 0.03},
-    "manoeuvre_time_s": {"min": 3.9, "max": 4.35},
-}
+CRITERIA = {"position_error_m": {"max": 0.03}, "manoeuvre_time_s": {"min": 3.9, "max": 4.35}}
 _FLIGHTS, _MISSING = 72, (9, 33)
 
 

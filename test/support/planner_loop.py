@@ -23,11 +23,7 @@ from spacerobot_ros.planning.core.method import GaitMethod, PlanRequest
 from spacerobot_ros.planning.core.schedule import BasePath
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.executive import Executive
-from spacerobot_ros.planning.execution.goal_file import (
-    GoalFile,
-    IdentifiedGoal,
-    PursuedGoals,
-)
+from spacerobot_ros.planning.execution.goal_file import GoalFile, IdentifiedGoal, PursuedGoals
 from spacerobot_ros.planning.execution.measured_states import BaseMeasurement, MeasuredState
 from spacerobot_ros.planning.execution.status import (
     Notice,
@@ -38,12 +34,7 @@ from spacerobot_ros.planning.execution.status import (
     ScheduleStart,
     Transition,
 )
-from spacerobot_ros.planning.execution.worker import (
-    Planned,
-    PlanningTask,
-    PlanningWorker,
-    Refused,
-)
+from spacerobot_ros.planning.execution.worker import Planned, PlanningTask, PlanningWorker, Refused
 from spacerobot_ros.planning.methods.registry import build_method
 from spacerobot_ros.resources import share_directory
 from spacerobot_ros.simulation import InitialState, VelocityPlant

@@ -86,10 +86,9 @@ def _link(rng: np.random.Generator, name: str, *, massive: bool) -> str:
 
 def _joint(rng: np.random.Generator, name: str, kind: str, parent: str, child: str) -> str:
     axis = rng.normal(size=3)
-    limit = {
-        "fixed": "",
-        "continuous": '<limit velocity="2" effort="20"/>',
-    }.get(kind, '<limit lower="-3" upper="3" velocity="2" effort="20"/>')
+    limit = {"fixed": "", "continuous": '<limit velocity="2" effort="20"/>'}.get(
+        kind, '<limit lower="-3" upper="3" velocity="2" effort="20"/>'
+    )
     return (
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
         f'{_origin(rng, 0.6)}<axis xyz="{_numbers(axis / np.linalg.norm(axis))}"/>{limit}</joint>'

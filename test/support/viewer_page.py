@@ -31,11 +31,7 @@ class Processes:
 
     def __init__(self, folder: Path, domain: int) -> None:
         self._folder = folder
-        self._environment = {
-            **os.environ,
-            "ROS_DOMAIN_ID": str(domain),
-            "PYTHONPATH": str(ROOT),
-        }
+        self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONPATH": str(ROOT)}
         self.running: dict[str, subprocess.Popen[str]] = {}
 
     def start(self, name: str, *words: str, files: Sequence[str] = ()) -> subprocess.Popen[str]:

@@ -279,11 +279,7 @@ class WarmPython:
         assert self._server.stdout.readline() == b"ready\n"
 
     def start(
-        self,
-        words: Sequence[object],
-        cwd: Path,
-        env: Mapping[str, str],
-        **streams: Any,
+        self, words: Sequence[object], cwd: Path, env: Mapping[str, str], **streams: Any
     ) -> WarmProcess:
         """Start a program; ``streams`` as of :class:`subprocess.Popen`, pipes are text."""
         import subprocess

@@ -293,11 +293,7 @@ def test_an_attitude_that_the_law_leaves_free_refuses_no_goal() -> None:
         asked = make_question(state, goals, robot, {"controller": texts})
         assert isinstance(asked, GoalQuestion)
         verdicts[outputs] = answer_question(asked, Cancellation()).verdict
-    assert verdicts == {
-        "": Verdict.REACHABLE,
-        "x y": Verdict.REACHABLE,
-        "x y rz": Verdict.REFUSED,
-    }
+    assert verdicts == {"": Verdict.REACHABLE, "x y": Verdict.REACHABLE, "x y rz": Verdict.REFUSED}
 
 
 # -- the checks of goals with a stand-in for their process, their time, and the schedules --------

@@ -18,9 +18,7 @@ from spacerobot_ros.control.status import CommandReport, ControllerState, Contro
 from spacerobot_ros.errors import ParameterError, shortened
 from spacerobot_ros.model import load_robot
 from spacerobot_ros.model.kinematics import ForwardKinematics
-from spacerobot_ros.model.rotations import (
-    quaternion_multiply,
-)
+from spacerobot_ros.model.rotations import quaternion_multiply
 from spacerobot_ros.model.urdf import parse_robot
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal, Tolerance

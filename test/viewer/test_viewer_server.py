@@ -21,13 +21,7 @@ from websockets.typing import Origin, Subprotocol
 
 from spacerobot_ros import viewer
 from spacerobot_ros.errors import ParameterError, SpaceRobotError
-from spacerobot_ros.viewer.server import (
-    is_loopback,
-    is_own_page,
-    start_server,
-    stop_server,
-    url_of,
-)
+from spacerobot_ros.viewer.server import is_loopback, is_own_page, start_server, stop_server, url_of
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 

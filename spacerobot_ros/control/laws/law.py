@@ -12,11 +12,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.control.outputs import (
-    OutputSelection,
-    OutputVector,
-    default_selection,
-)
+from spacerobot_ros.control.outputs import OutputSelection, OutputVector, default_selection
 from spacerobot_ros.control.state import Actuation, ControlState, Reference
 from spacerobot_ros.errors import ParameterError
 from spacerobot_ros.model.compilation import dense_function

@@ -43,13 +43,7 @@ from spacerobot_ros.nodes.common.messages import (
     goal_description,
     goal_of,
 )
-from spacerobot_ros.nodes.common.node import (
-    BEST_EFFORT,
-    LATCHED,
-    LATCHED_QUEUE,
-    STREAM,
-    FlightNode,
-)
+from spacerobot_ros.nodes.common.node import BEST_EFFORT, LATCHED, LATCHED_QUEUE, STREAM, FlightNode
 from spacerobot_ros.nodes.common.watchdog import Role, SilenceReport
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import EndEffectorGoal

@@ -22,12 +22,7 @@ from spacerobot_ros.messages.readers import MessageTemplate
 from spacerobot_ros.model.description import RobotDescription
 from spacerobot_ros.nodes.common.messages import TRANSFORM_CLASS, interface_class, message_class
 from spacerobot_ros.nodes.common.node import LATCHED, STREAM
-from spacerobot_ros.simulation.commands import (
-    NO_STAMP,
-    CommandSource,
-    Reason,
-    Refusal,
-)
+from spacerobot_ros.simulation.commands import NO_STAMP, CommandSource, Reason, Refusal
 from spacerobot_ros.simulation.status import latched_text
 from spacerobot_ros.simulation.time_modes import RealTime
 from spacerobot_ros.times import SECOND, stamp_bytes

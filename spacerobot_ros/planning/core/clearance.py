@@ -215,10 +215,7 @@ class Clearance:
         return self.geometry.keep_apart(self.geometry.poses(shapes), required)
 
     def approaches(
-        self,
-        positions: Array,
-        required: Array | None = None,
-        base: BasePoses | None = None,
+        self, positions: Array, required: Array | None = None, base: BasePoses | None = None
     ) -> list[Approach]:
         """Return the nearest approaches of pairs that come too close, nearest first.
 

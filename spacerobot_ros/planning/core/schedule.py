@@ -310,11 +310,7 @@ class JointEfforts:
         return ", ".join(clauses)
 
     def _effort_shares(
-        self,
-        q: npt.NDArray[np.float64],
-        qdot: Array,
-        qddot: Array,
-        L_B: Array | None = None,
+        self, q: npt.NDArray[np.float64], qdot: Array, qddot: Array, L_B: Array | None = None
     ) -> npt.NDArray[np.float64]:
         if L_B is None:
             tau = self._function(q.T, qdot.T, qddot.T).full().T

@@ -86,9 +86,7 @@ class PlannerConfig(CommanderConfig):
         maximum=1e6,
     )
     drift_position: float = nonnegative(
-        0.0,
-        "base tracking error beyond which the remaining motion is replanned; 0: never",
-        "m",
+        0.0, "base tracking error beyond which the remaining motion is replanned; 0: never", "m"
     )
     drift_attitude: float = nonnegative(0.0, "likewise", "rad")
     shape_gain: float = nonnegative(

@@ -18,11 +18,7 @@ _ROOT = Path(__file__).parents[3]
 PLANNER, CONTROLLER = "planner", "coordinated_control"
 
 # Loops that are closed over joint motors want their commands in time: not much faster than life.
-_WALL: dict[str, Any] = {
-    "time_mode": "realtime",
-    "real_time_factor": 1.0,
-    "command_timeout": 1.0,
-}
+_WALL: dict[str, Any] = {"time_mode": "realtime", "real_time_factor": 1.0, "command_timeout": 1.0}
 
 
 @dataclass(frozen=True)

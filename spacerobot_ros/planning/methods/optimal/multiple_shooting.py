@@ -19,12 +19,7 @@ from spacerobot_ros.planning.methods.optimal.problem import (
     MotionLimits,
     Trajectory,
 )
-from spacerobot_ros.planning.methods.optimal.transcription import (
-    Layout,
-    Program,
-    Stages,
-    program,
-)
+from spacerobot_ros.planning.methods.optimal.transcription import Layout, Program, Stages, program
 
 _FEASIBILITY_TOLERANCE = 1e-4
 """Constraint violation below which an iterate is accepted as a trajectory, SI units."""
@@ -221,11 +216,7 @@ class MultipleShooting:
         if layout.has_lack:
             x[-1] = lack / 2
         found = self._solver.solve(
-            "refining" if refining and not self._has_distances else "",
-            stop,
-            x,
-            bounds,
-            parameters,
+            "refining" if refining and not self._has_distances else "", stop, x, bounds, parameters
         )
         self.converged, self.feasible, x = found.converged, found.feasible, found.x
         # If the goal drifts away, no duration compensates for the violations in each interval.

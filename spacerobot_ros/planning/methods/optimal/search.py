@@ -672,12 +672,7 @@ class _Search:
         return made
 
     def _clear(
-        self,
-        kept: KeptDistances,
-        grid: _Grid,
-        path: Trajectory,
-        duration: float,
-        reach: float,
+        self, kept: KeptDistances, grid: _Grid, path: Trajectory, duration: float, reach: float
     ) -> tuple[Trajectory, Manoeuvre | None]:
         """Return a clear path close to another, in a given duration (s), and its held commands, in
         steps of a fraction of the largest reach. UnusableCandidateError if none was found.

@@ -86,10 +86,7 @@ class ConstraintBlock:
 
     @classmethod
     def cached(
-        cls,
-        name: str,
-        facts: Sequence[str],
-        derive: Callable[[], ConstraintBlock],
+        cls, name: str, facts: Sequence[str], derive: Callable[[], ConstraintBlock]
     ) -> ConstraintBlock:
         """Return a block from the cache, or derive it; the block depends only on ``facts``."""
         key, derived = hashlib.sha256("\n".join(facts).encode()).hexdigest(), cache(derive)
@@ -668,11 +665,7 @@ def place_stages(
 
 
 def assembled(
-    x: ca.MX,
-    parameters: ca.MX,
-    f: ca.MX,
-    placed: Sequence[PlacedBlock],
-    equalities: int,
+    x: ca.MX, parameters: ca.MX, f: ca.MX, placed: Sequence[PlacedBlock], equalities: int
 ) -> Program:
     """Return the program for an objective f and blocks; rows after the equalities are ``>= 0``."""
     rows = sum(each.rows.size for each in placed)
