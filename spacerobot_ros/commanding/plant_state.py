@@ -377,7 +377,10 @@ class PlantListener:
         """Message that says why goals are currently rejected; empty: goals are accepted."""
         status = self.status
         if status.latched_fault:
-            return f"'{self._name}' is latched: {status.latched_fault}; rearm it first."
+            return (
+                f"'{self._name}' is latched: {status.latched_fault}; rearm it first by its service "
+                f"'{self._name}/rearm'."
+            )
         if status.state is PlantState.FAILED:
             return f"The plant has failed: {status.message}"
         return ""

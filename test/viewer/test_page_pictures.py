@@ -196,7 +196,7 @@ def test_a_controlled_flight_that_is_looked_back_at_aborted_and_stopped(
         )
         looked.keep("stopped")
         page.press("Fly")
-        page.wait_for_text("'/plant' is latched: stopped on request; rearm it first.")
+        page.wait_for_text("'/plant' is latched: stopped on request; rearm it first by its ")
         page.press("Rearm")
         page.wait_for_text(
             "Commands are accepted again", "Plant running", without="until the plant is rearmed"
