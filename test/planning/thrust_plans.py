@@ -148,7 +148,8 @@ def planned(rate: float, count: int, seed: int, *, detumbles: bool) -> str:
         f"{max(cpu):.2f} s, nearest {1e3 * min(nearest):.1f} mm, off {1e3 * max(missed):.3f} mm"
     )
     if detumbles:
-        return f"{line}, left {max(left):.2%} of the target's, {max(longer):.3f} of the time"
+        little = f"{np.sum(np.array(left) <= 0.01)} leave 1 % of the target's momentum at most"
+        return f"{line}, {little} (most {max(left):.2%}), {max(longer):.3f} of the time"
     return f"{line}, {touching} touch it without rows"
 
 

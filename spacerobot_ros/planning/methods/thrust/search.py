@@ -101,7 +101,8 @@ efforts is slowed down; after how many motions of least cost that were not clear
 a clear path is taken; and largest factor applied to a duration."""
 
 _SHARES_LEFT = (0.0, 0.25, 0.5)
-"""Fractions of the angular momentum that may be left after a grasp."""
+"""Fractions of the angular momentum that may be left after a grasp, in the order in which they are
+tried."""
 
 _MEETING_PERIOD, _LATER = 1.0, 0.3
 """Interval between the times at which guesses meet a target, s, and relative to the time of a guess
@@ -203,13 +204,18 @@ class ThrustPlanner:
         kind = EndKind(self.link, target=True)
         plain = _Search(self, boundary, kind, stop, bodies, grapple)
         motion = plain.run(plain.first_meeting())
-        left = motion.joined_momentum(grapple.motion)
-        for share in _SHARES_LEFT if grapple.detumbles else ():
+        left, path = motion.joined_momentum(grapple.motion), plain.path
+        shares = list(_SHARES_LEFT) if grapple.detumbles else []
+        while shares:
+            share = shares.pop(0)
             search = replace(plain, kind=kind._replace(momentum=True), left=share * left)
             try:
-                return search.run_near(plain.path)
+                motion, path = search.run_near(path), search.path
             except PlanningError:
                 stop.cancellation.raise_if_requested()
+            else:
+                # A path with less momentum leads to motions with even less.
+                shares = [each for each in _SHARES_LEFT if each < share]
         return motion
 
     def solver(self, kind: EndKind, bodies: Bodies) -> ThrustSolver:
