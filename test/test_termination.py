@@ -232,7 +232,8 @@ with guarded(), graceful_shutdown(), tool(["sh", "-c", {command!r}]) as process:
     process.wait()
 """
     with script(text) as process:
-        os.kill(process.pid, signal.SIGTERM)
+        if not first:
+            os.kill(process.pid, signal.SIGTERM)
         # Its output ends with the last process that has it.
         process.communicate(timeout=SOON)
         assert process.returncode == 1, "the exception is not caught"
