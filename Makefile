@@ -107,7 +107,7 @@ $(STUDIES): $(STAMP)/test
 .PHONY: bench
 bench: $(STAMP)/bench ## measure what users wait for, in processor time; AGAINST=PATH: in turns with another checkout; ONLY=WORD: some
 	$(BIN)/python3 -m pytest benchmarks -q --benchmark-columns=median,iqr,rounds --benchmark-sort=fullname \
-	    $(if $(AGAINST),--against $(AGAINST)) $(if $(ONLY),-k "$(ONLY)")
+	    $(if $(AGAINST),--against=$(AGAINST)) $(if $(ONLY),-k "$(ONLY)")
 
 .PHONY: real-time
 real-time: $(STAMP)/bench ## fly ten minutes in real time in separate processes, at 100, then 200 and 500 Hz
