@@ -23,6 +23,7 @@ from spacerobot_ros.control.controller import CoordinatedController, build_contr
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.goals import require_controlled_axes
 from spacerobot_ros.control.laws.law import Gains
+from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.reference import (
     ReferenceProfile,
@@ -327,7 +328,9 @@ class CompiledTick:
             values = values_of(program.config).items()
             parameters = [each for each in values if not each[0].startswith("gains.")]
             believed = program.robot or flights.robot
-            key = (*key, believed, repr(parameters), repr(program.config.motion))
+            # Another class may have been registered under the name of the law since.
+            key = (*key, LAWS[program.config.law], believed, repr(parameters))
+            key = (*key, repr(program.config.motion))
         if key not in model.derived:
             model.derived[key] = cls._compile(flights, model, target, link)
         compiled: CompiledTick = model.derived[key]
