@@ -239,6 +239,8 @@ class MessageType:
         Such as ``nav_msgs/msg/Odometry``.
     text
         The full definition, as returned by :func:`message_definition`; it may be untrusted.
+    store
+        Store that already has code for some of the nested types; None: a new one.
 
     Attributes
     ----------
@@ -251,11 +253,11 @@ class MessageType:
         The definition cannot be parsed or exceeds a limit.
     """
 
-    def __init__(self, name: str, text: bytes) -> None:
+    def __init__(self, name: str, text: bytes, store: Typestore | None = None) -> None:
         # The parser is slow to import, and tools that read no messages do not need it.
         from rosbags.typesys import get_types_from_msg
 
-        self.name = name
+        self.name, self._given_store = name, store
         if not _TYPE_NAME.fullmatch(name):
             raise ValueError("a type name must have the form 'package/msg/Type'")
         if len(text) > _MAX_TEXT_BYTES or text.count(b"\n") > _MAX_LINES:
@@ -294,9 +296,7 @@ class MessageType:
     @cached_property
     def _store(self) -> Typestore:
         """Code that ``rosbags`` generates, which takes longer than parsing the definition."""
-        from rosbags.typesys import Stores, get_typestore
-
-        store = get_typestore(Stores.EMPTY)
+        store = self._given_store or _new_store()
         with _as_value_errors():
             store.register(self.fields)
             store.get_msgdef(self.name)
@@ -310,7 +310,17 @@ message_type = lru_cache(maxsize=64)(MessageType)
 @cache
 def installed_type(type_name: str) -> MessageType:
     """Return a message type of an installed package. Raises as :func:`message_definition` does."""
-    return message_type(type_name, message_definition(type_name).encode())
+    return MessageType(type_name, message_definition(type_name).encode(), _installed_types())
+
+
+def _new_store() -> Typestore:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.EMPTY)
+
+
+_installed_types = cache(_new_store)
+"""Return the store of all installed types, which have most nested types in common."""
 
 
 @contextmanager

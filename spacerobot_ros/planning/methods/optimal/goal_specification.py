@@ -15,7 +15,7 @@ import numpy as np
 
 from spacerobot_ros.errors import NotFoundError, PlanningError, Proof, UnreachableError
 from spacerobot_ros.model import SpaceRobot
-from spacerobot_ros.model.description import Array
+from spacerobot_ros.model.description import Array, JointKind
 from spacerobot_ros.model.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotvec,
@@ -350,11 +350,16 @@ def _shape_for_center(
     """Return the shape (n,) near ``start`` whose centre of mass is at ``wanted`` (3,), m, in B, or
     at most ``enough``, m, away from there if there is no such shape.
     """
+    if all(joint.kind is JointKind.PRISMATIC for joint in robot.description.movable_joints):
+        # The centre of mass is linear in sliders: one Newton step is exact.
+        found = nearest_shape_for_center(robot, limits, start, wanted)
+        if found is not None:
+            return found
     lower, upper = limits.lower, limits.upper
     # The solver needs lower bounds below upper bounds.
     room = 1e-9 * (1 + np.abs(start))
     middle, half = limits.joint_ranges(start)
-    from scipy.optimize import least_squares  # Slow to import, and few goals need it.
+    from scipy.optimize import least_squares  # Slow to import, and not all robots need it.
 
     rng = np.random.default_rng(0)
     best, miss = start, np.inf
