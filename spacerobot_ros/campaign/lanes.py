@@ -49,8 +49,8 @@ from spacerobot_ros.model.inertial_parameters import InertialParameters
 from spacerobot_ros.model.space_robot import SpaceRobot
 from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.core.goal import POSE, end_effector_pose, missed_parts, reached_message
+from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import describe_remaining_error
-from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
@@ -303,6 +303,8 @@ class _ScheduledLanes:
         drifts = momentum_drift(np.where(evaluated[..., np.newaxis], result.momentum, np.nan))
         shared = {id(each.schedule): each.schedule.positions for each in batch}
         extremes = {key: (each.min(axis=0), each.max(axis=0)) for key, each in shared.items()}
+        scenarios = {id(each.flight.scenario): each.flight.scenario for each in batch}
+        planners = {key: each.planner for key, each in scenarios.items()}
         for row, ready in enumerate(batch):
             if row in result.failures:
                 yield "was refused by the plant"
@@ -311,10 +313,11 @@ class _ScheduledLanes:
                 yield "had a joint at its limit"
                 continue
             scenario, schedule = ready.flight.scenario, ready.schedule
-            if deviations[row] > max(_END_POSITION_TOLERANCE, scenario.planner.shape_deadband):
+            planner = planners[id(scenario)]
+            if deviations[row] > max(_END_POSITION_TOLERANCE, planner.shape_deadband):
                 yield "had a joint that did not follow its schedule"
                 continue
-            decided = _decide_goal(scenario, schedule, measured[row], measured_q[row])
+            decided = _decide_goal(scenario.goal, planner, schedule, measured[row], measured_q[row])
             if isinstance(decided, str):
                 yield decided
                 continue
@@ -516,26 +519,28 @@ def _end_effector_error(
     robot: SpaceRobot, flight: DrawnFlight, q: Array, pose: Array
 ) -> PoseError | None:
     goal = flight.scenario.end_effector_goal
+    if goal is None:
+        return None
     link = robot.description.end_effector(flight.scenario.plant.end_effector_frame)
-    if goal is None or not link:
+    if not link:
         return None
     return PoseError.between(*end_effector_pose(robot, link, pose[:3], pose[3:], q), goal)
 
 
 def _decide_goal(
-    scenario: Scenario, schedule: GaitSchedule, pose: Array, q: Array
+    goal: Goal, planner: PlannerConfig, schedule: GaitSchedule, pose: Array, q: Array
 ) -> tuple[Outcome, str] | str:
     """Return the outcome of a goal at the end of a schedule with its message, or the reason for a
     fallback, for the measured pose (7,) and joint positions (n,).
     """
-    error = PoseError.between(pose[:3], pose[3:], scenario.goal, q)
-    tolerance = scenario.planner.tolerance
-    missed = missed_parts(scenario.goal, error, schedule.controls, tolerance)
-    remaining = describe_remaining_error(error, schedule.controls, tolerance, scenario.goal)
+    error = PoseError.between(pose[:3], pose[3:], goal, q)
+    tolerance = planner.tolerance
+    missed = missed_parts(goal, error, schedule.controls, tolerance)
+    remaining = describe_remaining_error(error, schedule.controls, tolerance, goal)
     if tolerance.admits(error, schedule.controls):
         outcome = Outcome.REACHED_PARTLY if missed else Outcome.REACHED
         return outcome, reached_message(remaining, missed)
-    if scenario.planner.max_corrections:
+    if planner.max_corrections:
         return "needed corrections"
     return Outcome.FAILED, f"The goal is not reached after 0 corrections: {remaining}."
 
