@@ -404,9 +404,10 @@ def test_a_later_goal_replaces_the_one_that_waits_for_the_tasks() -> None:
     np.testing.assert_allclose(goal.position, -AIM)
 
 
-def test_a_reset_of_the_plant_begins_with_the_tasks_again() -> None:
+@pytest.mark.parametrize("part", ["base", "end_effector"])
+def test_a_reset_of_the_plant_begins_with_the_tasks_again(part: str) -> None:
     loop = Meeting(tasks="detumble")
-    loop.aim(base=goal_at(AIM, "5"))
+    loop.aim(**{part: goal_at(AIM if part == "base" else TIP - AIM, "5")})
     loop.answer(6)
     assert loop.status.task == ""
     loop.rates = np.array([0.1, 0.0])
