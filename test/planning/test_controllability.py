@@ -175,9 +175,9 @@ def with_third_slot(tilt: float) -> SlidingRobot:
 
 
 def test_slots_count_by_their_directions_and_not_by_their_size() -> None:
-    heavy = replace(paper_robot(), mass=1e6 * paper_robot().mass)
+    heavy = replace(paper_robot(), mass=1e10 * paper_robot().mass)
     slots = independent_slots(SpaceRobot.from_urdf(heavy.urdf))
-    assert 0.0 < np.abs(slots).max() < 1e-5
+    assert 0.0 < np.abs(slots).max() < 1e-9
     independent_slots(SpaceRobot.from_urdf(with_third_slot(1e-7).urdf))
     for thin in (1e-10, 0.0):
         with pytest.raises(PlanningError, match="have rank 2"):
