@@ -21,10 +21,17 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.collision.distances import obstacle_visuals
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.flight.series import SentGoal, Signal, goal_at_end, reported_goal, rotvecs
+from spacerobot_ros.flight.series import (
+    SentGoal,
+    Signal,
+    goal_at_end,
+    nearest_rotvec,
+    reported_goal,
+    rotvecs,
+)
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
-from spacerobot_ros.model.rotations import quaternion_from_rotvec
+from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
 from spacerobot_ros.model.urdf import parse_world
 from spacerobot_ros.planning import Goal
 from spacerobot_ros.planning.core.goal import POSE
@@ -389,6 +396,10 @@ def test_rotation_vectors_are_continuous_beyond_half_turns() -> None:
     quaternions = np.array([quaternion_from_rotvec(r) for r in expected])
     quaternions[::7] *= -1  # The same attitudes.
     np.testing.assert_allclose(rotvecs(quaternions), expected, atol=1e-12)
+    for k in (300, 700, 1150):  # More than a turn on, less, and more than a turn back.
+        near = expected[k] + [0.01, -0.02, 0.015]
+        found = nearest_rotvec(rotvec_from_quaternion(quaternions[k]), near)
+        np.testing.assert_allclose(found, expected[k], atol=1e-12)
 
 
 def ticks(values: Array) -> Signal:
