@@ -88,7 +88,7 @@ class PlantReport:
             weak = np.where(np.isfinite(limit), _RESTING_SHARE * limit, 0.0)
             resting = np.abs(plant.effort) <= weak
         for what, counts in plant.limit_counts.items():
-            held_back = (counts > 0) & ~(resting if what == "stroke" else False)
+            held_back = (counts > 0) & (~resting if what == "stroke" else True)
             names = [plant.robot.joint_names[i] for i in np.flatnonzero(held_back)]
             if names:
                 texts.append(f"{what} of {', '.join(names)}")
