@@ -107,7 +107,9 @@ setup(
         "numpy>=1.26",
         "PyYAML",
         "rosbags>=0.10.4",
-        "scipy",
+        # In 1.12 to 1.14 nnls may fail, and in 1.15 it stops early: thrusters would take up to 35
+        # times the propellant.
+        "scipy!=1.12.*,!=1.13.*,!=1.14.*,!=1.15.*",
         "typing_extensions",
         "xacro",
         "zstandard",

@@ -316,7 +316,7 @@ rclpy.init()
 planner, recorder = rclpy.create_node("planner"), rclpy.create_node("recorder")
 latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 status = planner.create_publisher(DiagnosticStatus, "planner/status", latched)
-goals = recorder.create_subscription(PoseStamped, "goal_pose", print, 10)
+goals = recorder.create_subscription(PoseStamped, "goal_pose", lambda message: None, 10)
 sys.stdin.read()
 """
 """A planner that reads no goals yet, and a recorder that does."""
