@@ -21,7 +21,7 @@ from spacerobot_ros.campaign.draws import (
     read_table_text,
 )
 from spacerobot_ros.campaign.metrics import OWN_METRICS, metric_of
-from spacerobot_ros.campaign.targets import description_of
+from spacerobot_ros.campaign.targets import description_of, self_contained
 from spacerobot_ros.errors import ParameterError, printable, reason
 from spacerobot_ros.files import load_yaml, read_regular
 from spacerobot_ros.measures import CLEARANCE, METRICS, metric_names
@@ -200,6 +200,7 @@ def parse_campaign(
         beside = folder / given
         found = scenario_or_robot(str(beside) if beside.is_file() else given)
         scenario = scenario_of_section(found, section)
+    scenario = self_contained(scenario)
     drawn = [*read_distributions(_read_mapping(section, "disperse"), scenario)]
     rows = None
     if section.get("table") is not None:

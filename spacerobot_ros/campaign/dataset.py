@@ -15,7 +15,6 @@ from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
-from xml.etree.ElementTree import canonicalize
 
 import numpy as np
 import yaml
@@ -32,10 +31,8 @@ from spacerobot_ros.campaign.targets import description_of
 from spacerobot_ros.errors import ParameterError, RecordingError, SpaceRobotError, reason
 from spacerobot_ros.files import load_yaml, warn_once, write_whole
 from spacerobot_ros.measures import Measures, metric_names, metrics_of_each
-from spacerobot_ros.model.urdf import load_robot, parse_robot
-from spacerobot_ros.resources import __version__, is_path, robot_file, source_hash
+from spacerobot_ros.resources import __version__, source_hash
 from spacerobot_ros.scenario import load_scenario, scenario_text
-from spacerobot_ros.simulation.capture import load_target, target_parameters
 
 if TYPE_CHECKING:
     from spacerobot_ros.flight.flight import Flight
@@ -249,7 +246,7 @@ class Dataset:
         }
         content = yaml.safe_dump({"campaign": section}, sort_keys=False, allow_unicode=True)
         for name, text in (
-            (_SCENARIO_FILE, scenario_text(self_contained(campaign).scenario)),
+            (_SCENARIO_FILE, scenario_text(campaign.scenario)),
             (_CAMPAIGN_FILE, content),
             (_ABOUT_FILE, json.dumps(facts, indent=1)),
         ):
@@ -414,7 +411,7 @@ def _row_schema(campaign: Campaign) -> Any:
 def _fingerprint_of(campaign: Campaign) -> str:
     """Return a hash that is equal if draws with equal numbers are the same flight."""
     text = json.dumps(_settings_of_draws(campaign), sort_keys=True, default=str)
-    flown = scenario_text(self_contained(campaign).scenario)
+    flown = scenario_text(campaign.scenario)
     return hashlib.sha256(f"{text}{flown}".encode()).hexdigest()
 
 
@@ -427,33 +424,3 @@ def _settings_of_draws(campaign: Campaign) -> dict[str, Any]:
     if campaign.sampler in FIXED_SIZE_SAMPLERS:
         section["flights"] = campaign.flights
     return section
-
-
-def self_contained(campaign: Campaign) -> Campaign:
-    """Return the campaign with embedded robot descriptions instead of file names, for use on other
-    machines.
-
-    Descriptions are canonical XML: files that differ only in white space, comments or attribute
-    order yield the same description.
-    """
-    scenario = campaign.scenario
-    for node in ("plant", *scenario.commanders):
-        config = scenario.config(node)
-        named = config.robot and not config.robot_description
-        if config.world or (named and is_path(config.robot)):
-            robot = description_of(campaign.scenario)
-            if config.robot_description:
-                robot = parse_robot(config.robot_description)
-            elif config.robot:
-                robot = load_robot(robot_file(config.robot))
-            urdf = canonicalize(config.described(robot).urdf, strip_text=True)
-            text = {"robot_description": urdf, "robot": "", "world": ""}
-            scenario = scenario.with_overrides(node, text)
-    floating = scenario.plant.target
-    if is_path(floating.robot) and not floating.robot_description:
-        target = load_target(floating)
-        assert target is not None
-        urdf = canonicalize(target.urdf, strip_text=True)
-        text = {**target_parameters(urdf), "target.robot": ""}
-        scenario = scenario.with_overrides("plant", text)
-    return replace(campaign, scenario=scenario)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
+from xml.etree.ElementTree import canonicalize
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from spacerobot_ros.model.shared_parameters import RobotConfig
 from spacerobot_ros.model.urdf import load_robot, parse_robot
 from spacerobot_ros.parameters import Parameter, declared, values_of
 from spacerobot_ros.planning import Goal
-from spacerobot_ros.resources import robot_file, suggestion
+from spacerobot_ros.resources import is_path, robot_file, suggestion
 from spacerobot_ros.scenario import CONFIGS, Scenario
 from spacerobot_ros.simulation.capture import load_target, target_parameters
 from spacerobot_ros.simulation.faults import (
@@ -208,6 +209,36 @@ def _load_description(robot: str, text: str, world: str) -> RobotDescription:
     return RobotConfig(world=world).described(described)
 
 
+def self_contained(scenario: Scenario) -> Scenario:
+    """Return the scenario with embedded robot descriptions instead of file names, for use on other
+    machines, and after changes to the files.
+
+    Descriptions are canonical XML: files that differ only in white space, comments or attribute
+    order yield the same description.
+    """
+    for node in ("plant", *scenario.commanders):
+        config = scenario.config(node)
+        named = config.robot and not config.robot_description
+        if config.world or (named and is_path(config.robot)):
+            if config.robot_description:
+                robot = parse_robot(config.robot_description)
+            elif config.robot:
+                robot = load_robot(robot_file(config.robot))
+            else:
+                robot = description_of(scenario)
+            urdf = canonicalize(config.described(robot).urdf, strip_text=True)
+            text = {"robot_description": urdf, "robot": "", "world": ""}
+            scenario = scenario.with_overrides(node, text)
+    floating = scenario.plant.target
+    if is_path(floating.robot) and not floating.robot_description:
+        target = load_target(floating)
+        assert target is not None
+        urdf = canonicalize(target.urdf, strip_text=True)
+        text = {**target_parameters(urdf), "target.robot": ""}
+        scenario = scenario.with_overrides("plant", text)
+    return scenario
+
+
 # -- names ------------------------------------------------------------------------------------
 
 
@@ -316,7 +347,9 @@ def _parameter_target(name: str, node: str, rest: str, scenario: Scenario) -> Di
     whole = isinstance(declaration.default, int)
 
     def apply(flight: DrawnFlight, drawn: Any) -> DrawnFlight:
-        return flight.with_overrides(node, {bare: round(drawn) if whole else drawn})
+        # A description, such as that of the campaign's own robot, would take precedence.
+        cleared = {"robot_description": ""} if bare == "robot" else {}
+        return flight.with_overrides(node, {**cleared, bare: round(drawn) if whole else drawn})
 
     return DispersionTarget(name, declaration.unit, apply, is_text=isinstance(value, str))
 

@@ -28,7 +28,7 @@ from typing import Any
 
 from spacerobot_ros.batch.targets import device_named
 from spacerobot_ros.campaign.config import FLIGHTS, Campaign, parse_campaign
-from spacerobot_ros.campaign.dataset import Row, self_contained
+from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
@@ -125,7 +125,6 @@ KILLED = "killed"
 
 def serialise_campaign(campaign: Campaign) -> bytes:
     """Return a campaign serialised for workers: its file content and its scenario."""
-    campaign = self_contained(campaign)
     return pickle.dumps((campaign.name, dict(campaign.section), Path(), campaign.scenario))
 
 

@@ -17,7 +17,7 @@ from spacerobot_ros.batch.flights import Counts, assign_rows, joined_rows
 from spacerobot_ros.batch.targets import device_named
 from spacerobot_ros.campaign.config import Campaign, load_campaign
 from spacerobot_ros.campaign.draws import Draws, drawn_flight
-from spacerobot_ros.campaign.targets import DrawnFlight, description_of
+from spacerobot_ros.campaign.targets import DrawnFlight, description_of, self_contained
 from spacerobot_ros.environments.tasks import (
     TASKS,
     RobotStates,
@@ -164,7 +164,7 @@ class _Starts:
             draws = Draws(self._campaign)
             self._draws = [draws[number] for number in range(min(len(draws), _MAX_DRAWS))]
         else:
-            self.scenario = scenario_or_robot(config.scenario or kind.scenario)
+            self.scenario = self_contained(scenario_or_robot(config.scenario or kind.scenario))
         self.robot = SpaceRobot(description_of(self.scenario))
         _require_steppable(self.scenario)
         plant, dispersed = self.scenario.plant, self._campaign.names if self._campaign else ()

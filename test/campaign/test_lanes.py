@@ -282,6 +282,7 @@ def test_lanes_fly_the_whole_command_of_a_law_or_leave_it(monkeypatch: pytest.Mo
     assert {row.engine for row in of_lanes.values()} == {"lanes"}
 
 
+TARGET = str(share_directory() / "config" / "targets" / "block.urdf")
 OUTSIDE = "it has disturbances, an orbit or a table; use engine 'flights'"
 AVERAGES = "the planner averages states, or monitors the path"
 MEASURED = "the joints are measured with errors"
@@ -293,7 +294,7 @@ NOT_IN_LANES: list[tuple[Callable[..., Campaign], dict[str, Any], str]] = [
     (campaign, {"disperse": {"plant.table.friction": {"uniform": [0.0, 0.1]}}}, OUTSIDE),
     (controlled, {"set": {STEADY: 0.5}}, "integral gains; use engine 'flights'"),
     (controlled, {"disperse": {STEADY: {"uniform": [0.0, 0.5]}}}, "integral gains; use engine"),
-    (campaign, {"set": {"plant.target.robot": "block.urdf"}}, "it has a target"),
+    (campaign, {"set": {"plant.target.robot": TARGET}}, "it has a target"),
     (campaign, {"set": {"plant.engine": "mujoco"}}, "its plant uses the engine 'mujoco'"),
     (
         campaign,

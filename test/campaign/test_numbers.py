@@ -16,7 +16,7 @@ from support.campaigns import campaign, written
 
 from spacerobot_ros.campaign import draws as sampling
 from spacerobot_ros.campaign.config import Criterion, passes_criteria
-from spacerobot_ros.campaign.dataset import Dataset, Row, self_contained
+from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draw, Draws, drawn_flight, sobol_problem
 from spacerobot_ros.campaign.results import (
     Influence,
@@ -353,11 +353,10 @@ def test_robots_that_are_files_travel_with_a_campaign(tmp_path: Path) -> None:
     file = tmp_path / "own.urdf"
     text = robot_file("sliding_masses").read_text("utf-8")
     file.write_text(text)
-    assert self_contained(MADE).scenario.plant.robot == "sliding_masses"
-    own = campaign(set={"plant.robot": str(file), "planner.robot": ""})
-    sent = self_contained(own).scenario
+    assert MADE.scenario.plant.robot == "sliding_masses"
+    sent = campaign(set={"plant.robot": str(file), "planner.robot": ""}).scenario
     assert (sent.plant.robot, sent.plant.world) == ("", "")
     assert "slider_1" in sent.plant.robot_description
     assert (sent.planner.robot, sent.planner.robot_description) == ("", "")
     both = campaign(set={"plant.robot": str(file), "planner.robot": str(file)})
-    assert self_contained(both).scenario.planner.robot_description == sent.plant.robot_description
+    assert both.scenario.planner.robot_description == sent.plant.robot_description

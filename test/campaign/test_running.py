@@ -28,10 +28,12 @@ from spacerobot_ros.campaign.running import (
     Rerun,
     rerun_flight,
     run_campaign,
+    sweep,
 )
 from spacerobot_ros.campaign.workers import fly_all
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError
+from spacerobot_ros.flight.api import fly
 from spacerobot_ros.resources import __version__, robot_file, source_hash
 from spacerobot_ros.scenario import load_scenario
 
@@ -103,6 +105,19 @@ def test_a_robot_file_that_is_written_anew_is_the_same_robot(tmp_path: Path) -> 
     own.write_text(own.read_text("utf-8").replace('mass value="', 'mass value="1', 1))
     with pytest.raises(ParameterError, match="contains another campaign"):
         fly(3)
+
+
+@pytest.mark.parametrize("engine", ["lanes", "flights"])
+def test_a_robot_file_that_was_changed_is_another_robot(
+    tmp_path: Path, compiled: None, engine: str
+) -> None:
+    file, text = tmp_path / "own.urdf", robot_file("sliding_masses").read_text("utf-8")
+    goal, dispersed = (0.05, 0, 0, 0, 0, 0, 1), {"initial.position.x": {"uniform": [-1e-9, 1e-9]}}
+    for mass in (10, 30):
+        file.write_text(text.replace('<mass value="10"/>', f'<mass value="{mass}"/>'))
+        (row,) = sweep(file, dispersed, goal, flights=1, engine=engine).to_pylist()
+        assert row["manoeuvre_time_s"] == fly(file, goal).manoeuvre_time
+        assert row["engine"] == engine
 
 
 def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:

@@ -679,6 +679,15 @@ def test_registering_twice_changes_nothing_and_a_missing_package_is_named(
         import_gymnasium()
 
 
+def test_a_robot_file_that_was_changed_is_another_robot(tmp_path: Path) -> None:
+    file, text = tmp_path / "own.urdf", robot_file("planar_chain").read_text("utf-8")
+    for digit in "", "1":
+        file.write_text(text.replace('mass value="', f'mass value="{digit}'))
+        config = EpisodeConfig("reorient", scenario=str(file))
+        found = Episodes(config, 1, in_lanes=False).robot.total_mass
+        assert found == SpaceRobot.from_file(file).total_mass
+
+
 def test_each_robot_may_have_a_goal_of_its_own() -> None:
     vector: Any = gymnasium.make_vec(ARM, num_envs=3, scenario="planar_chain")
     angles = np.array([0.1, -0.2, 0.3])
