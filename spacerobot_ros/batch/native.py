@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -23,7 +23,6 @@ from spacerobot_ros.control.controller import CoordinatedController, build_contr
 from spacerobot_ros.control.goal_monitor import Decision, GoalMonitor
 from spacerobot_ros.control.goals import require_controlled_axes
 from spacerobot_ros.control.laws.law import Gains
-from spacerobot_ros.control.laws.registry import LAWS
 from spacerobot_ros.control.outputs import OutputDistance
 from spacerobot_ros.control.reference import (
     ReferenceProfile,
@@ -38,7 +37,6 @@ from spacerobot_ros.model.description import Array
 from spacerobot_ros.model.integration import state_slices
 from spacerobot_ros.model.model_functions import Composition, ModelFunctions
 from spacerobot_ros.model.symbolic_rotations import quaternion_from_rotvec, quaternion_multiply
-from spacerobot_ros.parameters import values_of
 from spacerobot_ros.simulation import effort_plant
 from spacerobot_ros.simulation.actuators import PLANTS
 from spacerobot_ros.simulation.effort_plant import JointStops
@@ -322,23 +320,25 @@ class CompiledTick:
         """
         key: tuple[Any, ...] = (cls, flights.actuation, flights.substeps)
         key = (*key, link, target, compilation_settings())
-        program = flights.program
-        if isinstance(program, ControlledGoals):
-            # All parameters are compiled in as constants, except the gains of each flight.
-            values = values_of(program.config).items()
-            parameters = [each for each in values if not each[0].startswith("gains.")]
-            believed = program.robot or flights.robot
-            # Another class may have been registered under the name of the law since.
-            key = (*key, LAWS[program.config.law], believed, repr(parameters))
-            key = (*key, repr(program.config.motion))
+        controller = control = None
+        if isinstance(flights.program, ControlledGoals):
+            # A law is identified by its expressions: its class may have changed.
+            in_lanes = BatchController.of(flights)
+            controller, control = in_lanes.controller, in_lanes.function()
+            key = (*key, control.serialize())
         if key not in model.derived:
-            model.derived[key] = cls._compile(flights, model, target, link)
+            model.derived[key] = cls._compile(flights, model, target, link, control)
         compiled: CompiledTick = model.derived[key]
-        return compiled
+        return replace(compiled, controller=controller)
 
     @classmethod
     def _compile(
-        cls, flights: Flights, model: ModelFunctions, target: Target, link: str
+        cls,
+        flights: Flights,
+        model: ModelFunctions,
+        target: Target,
+        link: str,
+        control: ca.Function | None,
     ) -> CompiledTick:
         effort, robot = flights.actuation == "effort", flights.robot
         inputs, n = _TICK_INPUTS[flights.actuation], robot.n
@@ -362,10 +362,8 @@ class CompiledTick:
             chosen = [outputs[each] for each in needed]
             name = f"{flights.actuation}_{kind.lower()}"
             functions[kind] = ca.Function(name, arguments, chosen, [*inputs, "p"], needed)
-        controller = None
-        if isinstance(flights.program, ControlledGoals):
-            in_lanes = BatchController.of(flights)
-            controller, functions["CONTROL"] = in_lanes.controller, in_lanes.function()
+        if control is not None:
+            functions["CONTROL"] = control
         sizes = {
             **{"alive": 1, "measured": n, "joint_bias": n, "joint_noise": 1},
             **{"limits": 2 * n, "peak_rate": n, "peak_effort": n, "failure": 1, "failed_at": 1},
@@ -410,13 +408,13 @@ class CompiledTick:
             constants |= {"STOP_ROW": limited + n, "REALISED_ROW": efforts}
             constants |= {"SUBSTEPS": flights.substeps, "BISECTIONS": effort_plant.BISECTIONS}
             constants["MAX_ARRIVALS_PER_STEP"] = effort_plant.MAX_ARRIVALS_PER_STEP
-        if controller is not None:
+        if control is not None:
             constants["EXPECTED_ROW"] = state + 2 * n + 4
         limits = JointStops.limits(robot) if has_stops else {}
         declarations = _shared_declarations(first, constants, arrays, spans, limits)
         driver = target.compile(functions, declarations)
         rows = {name: slice(row, row + sizes[name]) for name, row in first.items()}
-        return cls(driver, target, rows, row_count, width, controller)
+        return cls(driver, target, rows, row_count, width)
 
 
 _TICK_INPUTS = {

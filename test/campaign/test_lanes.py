@@ -282,6 +282,26 @@ def test_lanes_fly_the_whole_command_of_a_law_or_leave_it(monkeypatch: pytest.Mo
     assert {row.engine for row in of_lanes.values()} == {"lanes"}
 
 
+class WeakLaw(TransposedJacobianLaw):
+    """A law of one's own that is changed in place, as notebooks do."""
+
+    share = 1.0
+
+    def results(self, symbols: dict[str, ca.SX]) -> dict[str, ca.SX]:
+        found = super().results(symbols)
+        return {**found, "actuation": self.share * found["actuation"]}
+
+
+def test_a_law_that_was_changed_is_another_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(LAWS, "transposed_jacobian", WeakLaw)
+    made, forces = controlled(flights=1, longest=0.2), []
+    for share in (1.0, 0.5):
+        monkeypatch.setattr(WeakLaw, "share", share)
+        of_lanes, _ = assert_same_flights(made, "lanes")
+        forces.append(of_lanes[0].metrics["peak_force_N"])
+    assert forces[1] < forces[0]
+
+
 TARGET = str(share_directory() / "config" / "targets" / "block.urdf")
 OUTSIDE = "it has disturbances, an orbit or a table; use engine 'flights'"
 AVERAGES = "the planner averages states, or monitors the path"

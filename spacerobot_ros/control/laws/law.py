@@ -6,6 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -276,7 +277,11 @@ class ControlLaw(ABC):
         )
         if weighs:
             key += (self._damping_rate,)
-        self.function, self._function = robot.view(key, lambda: self._make_function(inputs))
+        make = cache(partial(self._make_function, inputs))
+        if not type(self).__module__.startswith("spacerobot_ros."):
+            # A user may have changed the class, or a number to which it refers.
+            key += (make().serialize(),)
+        self.function, self._function = robot.view(key, make)
         command, integral = (
             self.function.index_out("actuation"),
             self.function.index_in("integral"),
