@@ -22,7 +22,7 @@ from spacerobot_ros.planning import GaitSchedule
 from spacerobot_ros.planning.core.clearance import Clearance
 from spacerobot_ros.planning.core.method import GaitMethod
 from spacerobot_ros.planning.execution.config import PlannerConfig
-from spacerobot_ros.planning.methods.registry import build_method
+from spacerobot_ros.planning.methods.registry import METHODS, build_method
 from spacerobot_ros.scenario import Scenario
 
 
@@ -96,21 +96,21 @@ def nominal_robots(scenario: Scenario) -> Robots:
     return Robots.of(scenario, build)
 
 
-_last_planner_method: tuple[SpaceRobot, PlannerConfig, GaitMethod] | None = None
-"""Robot, configuration and gait method of the last planner; all flights share the solvers of the
-method, but no plan depends on another plan."""
+_last_planner_method: tuple[tuple[Any, ...], GaitMethod] | None = None
+"""What determines the last planner's gait method (robot, configuration, classes), and the method;
+all flights share the solvers of the method, but no plan depends on another plan."""
 
 
 def _method_of_planner(robot: SpaceRobot, config: PlannerConfig) -> GaitMethod:
     """Return the gait method of a planner; an equal planner reuses the last flight's method."""
     global _last_planner_method
-    last = _last_planner_method
-    if last is None or last[0] is not robot or last[1] != config:
+    last, key = _last_planner_method, (robot, config, dict(METHODS))
+    if last is None or last[0] != key:
         times = config.control_period, config.integration_step
         clearance = Clearance.wanted(robot.description, config.clearance)
         method = build_method(config.method, robot, *times, config.method_options, clearance)
-        last = _last_planner_method = robot, config, method
-    return last[2]
+        last = _last_planner_method = key, method
+    return last[1]
 
 
 def plant_robot(flight: DrawnFlight) -> SpaceRobot:

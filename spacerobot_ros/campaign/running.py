@@ -24,6 +24,7 @@ from spacerobot_ros.campaign.draws import Draws, drawn_flight
 from spacerobot_ros.campaign.workers import (
     KILLED,
     TaskDistributor,
+    engine_by_name,
     fly_all,
     open_workers,
     select_engine,
@@ -110,6 +111,8 @@ def run_campaign(
         missing.
     """
     draws, dataset = Draws(campaign), Dataset(folder)
+    # A gait method may have changed since an engine planned with it.
+    engine_by_name.cache_clear()
     wanted = campaign.engine if engine == "auto" else engine
     chosen = select_engine(campaign, wanted, local=not scheduler)
     with ExitStack() as opened:

@@ -34,6 +34,11 @@ from spacerobot_ros.campaign.workers import fly_all
 from spacerobot_ros.cli.main import main
 from spacerobot_ros.errors import ParameterError, RecordingError
 from spacerobot_ros.flight.api import fly
+from spacerobot_ros.planning import GaitSchedule, PlanRequest
+from spacerobot_ros.planning.core.cancellation import NEVER, Cancellation
+from spacerobot_ros.planning.core.method import GaitMethod
+from spacerobot_ros.planning.core.prediction import BasePrediction
+from spacerobot_ros.planning.methods.registry import METHODS
 from spacerobot_ros.resources import __version__, robot_file, source_hash
 from spacerobot_ros.scenario import load_scenario
 
@@ -118,6 +123,30 @@ def test_a_robot_file_that_was_changed_is_another_robot(
         (row,) = sweep(file, dispersed, goal, flights=1, engine=engine).to_pylist()
         assert row["manoeuvre_time_s"] == fly(file, goal).manoeuvre_time
         assert row["engine"] == engine
+
+
+@pytest.mark.parametrize("engine", ["lanes", "flights"])
+def test_a_gait_method_that_is_defined_again_is_another_one(
+    monkeypatch: pytest.MonkeyPatch, compiled: None, engine: str
+) -> None:
+    dispersed, goal = {"initial.position.x": {"uniform": [-1e-9, 1e-9]}}, (0, 0, 0, 0, 0, 0, 1)
+    for ticks in (8, 16):
+
+        class Stay(GaitMethod):
+            """Leaves the joints where they are, for some ticks."""
+
+            name, held = "stay", ticks
+
+            def plan(self, request: PlanRequest, at: Cancellation = NEVER) -> GaitSchedule:
+                positions = np.tile(request.state.q, (self.held + 1, 1))
+                found = BasePrediction(self.robot, self.control_period, self.integration_step)
+                path = found.path(request.state, positions)
+                return self.schedule_of(request.goal, positions, path, {})
+
+        monkeypatch.setitem(METHODS, "stay", Stay)
+        rows = sweep("sliding_masses", dispersed, goal, method="stay", flights=1, engine=engine)
+        (row,) = rows.to_pylist()
+        assert (row["engine"], row["duration_s"]) == (engine, pytest.approx(0.05 * ticks))
 
 
 def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
