@@ -52,7 +52,7 @@ class Stack:
         Robot or scenario (a name or a file) that configures the nodes.
     nodes
         Names of this package's nodes, and functions or classes that take an rclpy context and
-        return a custom node.
+        return a custom node. By default, the plant and the commanders of the scenario.
     parameters
         Further parameters by node: ``{"planner": {"method": "lie_bracket"}}``.
     timeout
@@ -67,7 +67,7 @@ class Stack:
     def __init__(
         self,
         robot: str,
-        nodes: Sequence[str | Callable[[rclpy.Context], Node]] = ("plant", "planner"),
+        nodes: Sequence[str | Callable[[rclpy.Context], Node]] | None = None,
         parameters: Mapping[str, Mapping[str, Any]] = {},
         timeout: float = 60.0,
     ) -> None:
@@ -75,6 +75,7 @@ class Stack:
         # Until the plant reports its time mode, a commander would let time run during a first plan.
         for name in COMMANDERS:
             scenario = scenario.with_overrides(name, {"plan_in_background": False})
+        nodes = ("plant", *scenario.commanders) if nodes is None else nodes
         for name, values in parameters.items():
             if name not in nodes:
                 raise SpaceRobotError(
@@ -143,7 +144,7 @@ class Stack:
 
     def fly_to(
         self,
-        goal: Goal | None = None,
+        goal: Goal | npt.ArrayLike | None = None,
         *,
         x: float | None = None,
         y: float | None = None,
@@ -153,15 +154,14 @@ class Stack:
         """Send a goal and spin until the planner or, without a planner, the controller completes
         it.
 
-        ``goal`` is any goal. If it is None, the base is sent to ``x``, ``y``, ``z`` (m), rotated by
-        ``rotvec`` (rad), each 0 by default. If no coordinates are given, any position is accepted;
-        if ``rotvec`` is not given, any attitude is accepted. Raises :class:`.SpaceRobotError` if a
-        node fails or the time limit expires.
+        ``goal`` is a goal as for :func:`.fly`. ``x``, ``y``, ``z`` (m, each 0 by default) and
+        ``rotvec`` (rad) override its position and attitude. If neither position nor attitude is
+        given, the position is 0; otherwise, anything is accepted for the other. Raises
+        :class:`.SpaceRobotError` if a node fails or the time limit expires.
         """
-        if goal is None:
-            anywhere = rotvec is not None and x is y is z is None
-            place = None if anywhere else [x or 0.0, y or 0.0, z or 0.0]
-            goal = changed_goal(NO_GOAL, position=place, rotvec=rotvec)
+        moved = not x is y is z is None
+        place = [x or 0.0, y or 0.0, z or 0.0] if moved or goal is rotvec is None else None
+        goal = changed_goal(NO_GOAL, goal, place, rotvec)
         controls = "coordinated_control" in self.nodes and "planner" not in self.nodes
         self._sent += 1
         client = MissionClient(

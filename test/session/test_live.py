@@ -622,6 +622,18 @@ def test_a_controller_flies_without_a_planner() -> None:
         assert stack.fly_to(x=0.1, y=0.1).reached
 
 
+def test_a_stack_has_the_commanders_of_its_scenario_and_takes_goals_as_numbers() -> None:
+    with Stack("jet_cube") as stack:
+        assert set(stack.nodes) == {"plant", "coordinated_control"}
+        assert stack.fly_to([0.01, 0.02, 0.0]).reached
+        at = stack.nodes["plant"].plant.pose[:3]
+        np.testing.assert_allclose(at, [0.01, 0.02, 0.0], atol=1e-3)
+        assert stack.fly_to([0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0], x=0.01, y=0.01).reached
+        np.testing.assert_allclose(
+            stack.nodes["plant"].plant.pose[:3], [0.01, 0.01, 0.0], atol=1e-3
+        )
+
+
 def test_a_started_stack_flies_to_the_goals_of_other_nodes() -> None:
     reached: list[DiagnosticStatus] = []
     with Stack("sliding_masses", ["plant", "planner", Recorder], QUICK) as stack:
