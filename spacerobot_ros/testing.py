@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.measures import Outcome
-from spacerobot_ros.nodes import NODE_TYPES, FlightNode
+from spacerobot_ros.nodes import NODE_TYPES, FlightNode, RecorderNode
 from spacerobot_ros.nodes.common.node import endpoints_of, topics_without_all_matches
 from spacerobot_ros.nodes.common.process import free_domain, use_loopback_discovery
 from spacerobot_ros.planning import Goal
@@ -115,6 +115,13 @@ class Stack:
                 self.executor.add_node(node)
             for node in self._flight_nodes:
                 node.require_transition(node.trigger_configure)
+            self._recorder = self.nodes.get("recorder")
+            if isinstance(self._recorder, RecorderNode):
+                named = [each for each in nodes if isinstance(each, str)]
+                for title, values in scenario.records(named).items():
+                    if title != "scenario":  # Its goal is not the one to be flown.
+                        self._recorder.describe(title, values)
+            closing.callback(self._finalize)
             self.close = closing.pop_all().close
 
     def _own(self, make: Callable[[rclpy.Context], Node]) -> Node:
@@ -129,6 +136,12 @@ class Stack:
                 "the context that the function is given."
             )
         return node
+
+    def _finalize(self) -> None:
+        """Shut this package's nodes down, the recorder last, which completes its bag."""
+        for node in sorted(self._flight_nodes, key=lambda node: node.get_name() == "recorder"):
+            node.drain(self.executor)
+            node.finalize()
 
     def __enter__(self) -> Stack:
         return self
@@ -224,6 +237,8 @@ class Stack:
 
     def _connect(self, nodes: Collection[Node]) -> None:
         def apart() -> str:
+            if isinstance(self._recorder, RecorderNode):
+                self._recorder.scan()
             ends = [end for node in nodes for end in endpoints_of(node)]
             return ", ".join(sorted(topics_without_all_matches(ends)))
 

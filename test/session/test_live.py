@@ -634,6 +634,14 @@ def test_a_stack_has_the_commanders_of_its_scenario_and_takes_goals_as_numbers()
         )
 
 
+def test_the_bag_of_a_stack_is_complete_when_the_stack_is_closed(tmp_path: Path) -> None:
+    bag, nodes = tmp_path / "a.mcap", ["plant", "planner", "recorder"]
+    with Stack("sliding_masses", nodes, QUICK | {"recorder": {"bag": str(bag)}}) as stack:
+        assert stack.fly_to(x=0.03).reached
+    assert len(read_bag(bag)["/goal_pose"].time_ns) == 1
+    assert verify_bag(bag).difference is None
+
+
 def test_a_started_stack_flies_to_the_goals_of_other_nodes() -> None:
     reached: list[DiagnosticStatus] = []
     with Stack("sliding_masses", ["plant", "planner", Recorder], QUICK) as stack:
