@@ -192,6 +192,9 @@ class Bag(Mapping[str, TopicSeries]):
     # Bags are not compared message by message.
     __eq__, __hash__ = object.__eq__, object.__hash__
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path, [file.path for file in self._files])
+
     def __contains__(self, topic: object) -> bool:
         return isinstance(topic, str) and self._recorded_name(topic) in self.topics
 

@@ -451,6 +451,10 @@ class FlightData:
         q, pose = ((x.time, x.values) for x in (self.signal("q"), self.signal("pose")))
         return FlightClearance.of(self.robot, self.joint_names, q, pose, mesh_of=self.mesh_of)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Exact distances cannot be pickled; they are computed again.
+        return {name: value for name, value in vars(self).items() if name != "clearance"}
+
     def mesh_of(self, shape: Shape) -> TriangleMesh:
         """Return the triangles of a shape, read from a file if the shape is a mesh.
 

@@ -308,6 +308,9 @@ class SymbolicModels:
         facts = (robot.name, bodies, robot.frames, [link.name for link in robot.links], free)
         return _models_of_key(_RobotKey.of(robot, facts))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SymbolicModels.of, (self._robot,)
+
     def model(self, parameters: InertialParameters) -> tuple[ModelFunctions, Array]:
         """Return the model for inertial parameters (..., B), and its argument ``p`` (..., k).
 

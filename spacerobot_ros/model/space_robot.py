@@ -13,12 +13,13 @@ import threading
 from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from spacerobot_ros.errors import RobotDescriptionError
+from spacerobot_ros.errors import RobotDescriptionError, counted
 from spacerobot_ros.model.compilation import BufferedFunction
 from spacerobot_ros.model.description import Array, RobotDescription
 from spacerobot_ros.model.inertial_parameters import InertialParameters
@@ -76,6 +77,13 @@ class SpaceRobot:
         self._buffers: dict[tuple[str, int], BufferedFunction] = {}
         self._compiles = True
         self._require_positive_inertia()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SpaceRobot, (self.description, None if self._p is None else self._build)
+
+    def __repr__(self) -> str:
+        name, joints = self.description.name, counted(self.n, "joint")
+        return f"<SpaceRobot {name}: {joints}, {self.total_mass:.6g} kg>"
 
     @classmethod
     def from_file(cls, path: str | Path) -> SpaceRobot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -249,6 +250,24 @@ def test_thrust_explains_the_momentum_in_a_recording_that_lacks_some(
     assert np.all(found.momentum_drift < 1e-9)
     pushes = np.linalg.norm(np.diff(flight.momentum[:, :3], axis=0), axis=1)
     assert found.thrust_impulse == pytest.approx(pushes.sum(), rel=1e-6)
+
+
+def test_flights_bags_and_robots_are_pickled_after_use(tmp_path: Path) -> None:
+    flight = fly("coordinated_control", parameters={"coordinated_control.time_limit": 0.05})
+    summary = flight.summary()
+    flight.save(tmp_path / "a.mcap")
+    bag = read_bag(tmp_path / "a.mcap")
+    tables = bag.to_pandas()
+    same, again = pickle.loads(pickle.dumps((flight, bag)))
+    np.testing.assert_equal(same.summary(), summary)
+    assert repr(again) == repr(bag)
+    assert all(again.to_pandas()[topic].equals(table) for topic, table in tables.items())
+    robot = SpaceRobot.from_file(robot_file("planar_manipulator"))
+    heavy = robot.with_inertial(replace(robot.inertial, masses=2 * robot.inertial.masses))
+    for each in (robot, heavy):
+        copied, q = pickle.loads(pickle.dumps(each)), [0.1] * each.n
+        assert repr(copied) == repr(each)
+        np.testing.assert_array_equal(copied.inertia_matrix(q), each.inertia_matrix(q))
 
 
 @pytest.fixture
