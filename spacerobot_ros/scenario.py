@@ -97,6 +97,10 @@ class Scenario:
     _configs: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     """Configurations by node, shared by all scenarios with the same parameters."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Another process may not know a user's laws and methods: it checks the parameters again.
+        return {**vars(self), "_configs": {}}
+
     def config(self, node: str) -> Any:
         """Return the configuration of a node, from defaults, parameters in the file, and overrides.
 

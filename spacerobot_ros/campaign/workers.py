@@ -32,8 +32,9 @@ from spacerobot_ros.campaign.dataset import Row
 from spacerobot_ros.campaign.draws import Draw, Draws, require_module
 from spacerobot_ros.campaign.lanes import LanesEngine
 from spacerobot_ros.campaign.one_by_one import FlightsEngine
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 from spacerobot_ros.files import warn_once
+from spacerobot_ros.registry import PLUGINS_VARIABLE
 from spacerobot_ros.resources import __version__, source_hash
 from spacerobot_ros.termination import end_with_parent
 
@@ -130,7 +131,13 @@ def serialise_campaign(campaign: Campaign) -> bytes:
 
 @lru_cache(maxsize=4)
 def _deserialise_campaign(packed: bytes) -> Campaign:
-    return parse_campaign(*pickle.loads(packed))
+    try:
+        return parse_campaign(*pickle.loads(packed))
+    except ParameterError as error:
+        raise ParameterError(
+            f"A worker refuses the campaign: {error} If a law, method or metric is your own, name "
+            f"its file in {PLUGINS_VARIABLE}, or use no workers."
+        ) from error
 
 
 def this_code() -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from support.campaigns import campaign
 
+from spacerobot_ros.campaign.config import parse_campaign
 from spacerobot_ros.campaign.dataset import Dataset, Row
 from spacerobot_ros.campaign.draws import Draw, Draws
 from spacerobot_ros.campaign.running import run_campaign
@@ -23,7 +24,9 @@ from spacerobot_ros.campaign.workers import (
     serialise_campaign,
     this_code,
 )
-from spacerobot_ros.errors import SpaceRobotError
+from spacerobot_ros.control.laws.registry import LAWS
+from spacerobot_ros.control.laws.transposed_jacobian import TransposedJacobianLaw
+from spacerobot_ros.errors import ParameterError, SpaceRobotError
 
 DISPERSED = {"plant.sensors.position_noise": {"uniform": [0.0, 0.001]}}
 
@@ -182,13 +185,21 @@ def test_a_scheduler_flies_the_rows_of_this_process(scheduler: Any, tmp_path: Pa
     assert len(here) == 2
 
 
-def test_a_process_of_this_machine_flies_a_task_and_says_what_is_wrong() -> None:
+class OwnLaw(TransposedJacobianLaw):
+    """A law that only this process knows."""
+
+    name = "own"
+
+
+def test_a_process_of_this_machine_flies_a_task_and_says_what_is_wrong(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     made = campaign(flights=2)
     packed, draws = serialise_campaign(made), list(Draws(made))
     with open_workers(1, workers=2) as workers:
         assert workers.count() == 1, "no more workers than flights"
 
-        def answer(version: str) -> Any:
+        def answer(version: str, packed: bytes = packed) -> Any:
             task = workers.submit(packed, version, draws[1:], "flights", True)
             wait([task])
             return workers.result(task)
@@ -197,6 +208,10 @@ def test_a_process_of_this_machine_flies_a_task_and_says_what_is_wrong() -> None
         assert (row.draw.number, row.outcome) == (1, "reached")
         with pytest.raises(SpaceRobotError, match="A worker has spacerobot_ros"):
             answer("0.0.0")
+        monkeypatch.setitem(LAWS, "own", OwnLaw)
+        section = {"scenario": "coordinated_control", "method": "own", "flights": 2}
+        with pytest.raises(ParameterError, match=r"refuses .*'law' is 'own'.* SPACEROBOT_PLUGINS"):
+            answer(this_code(), serialise_campaign(parse_campaign("own", section)))
 
 
 def test_workers_that_are_ended_leave_other_children_of_the_process_alone() -> None:
