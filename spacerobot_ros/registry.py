@@ -61,7 +61,8 @@ class Registry(dict[str, type[T]]):
         self._own = frozenset([*self, *reserved])
 
     def register(self, entry: type[T]) -> type[T]:
-        """Add a class, replacing a class with the same name and file; can be used as a decorator.
+        """Add a class, replacing a class with the same name from the same file or an interactive
+        session; can be used as a decorator.
 
         Raises
         ------
@@ -135,10 +136,11 @@ class Registry(dict[str, type[T]]):
             raise ParameterError(
                 f"{named} has the same name as the package's own '{name}': choose another name."
             )
-        if name in self and _origin(self[name]) != _origin(entry):
+        known = self.get(name, entry)
+        if known.__module__ != "__main__" and _origin(known) != _origin(entry):
             raise ParameterError(
-                f"Two classes define the {self.kind} '{name}': '{self[name].__name__}' of "
-                f"{_origin(self[name])} and '{entry.__name__}' of {_origin(entry)}. Rename one of "
+                f"Two classes define the {self.kind} '{name}': '{known.__name__}' of "
+                f"{_origin(known)} and '{entry.__name__}' of {_origin(entry)}. Rename one of "
                 "them, or omit its file."
             )
         return name

@@ -247,6 +247,19 @@ def test_a_plugin_whose_law_cannot_work_is_refused(
 
 
 @pytest.mark.usefixtures("plugins")
+def test_a_class_moves_from_a_session_to_a_file(tmp_path: Path) -> None:
+    text = _LAW.format("Pd", "NumpyLaw") + _COMPUTE.format("return None")
+    session: dict[str, Any] = {"__name__": "__main__"}
+    exec(text, session)
+    LAWS.register(session["Pd"])
+    (tmp_path / "mine.py").write_text(text)
+    add_plugin(tmp_path / "mine.py")
+    assert LAWS["pd"] is not session["Pd"]
+    with pytest.raises(ParameterError, match="Two classes define the control law 'pd'"):
+        LAWS.register(session["Pd"])
+
+
+@pytest.mark.usefixtures("plugins")
 def test_two_plugins_of_one_name_are_refused_with_their_files(tmp_path: Path) -> None:
     text = _LAW.format("Pd", "NumpyLaw") + _COMPUTE.format("return None")
     for name in ("one.py", "other.py"):
