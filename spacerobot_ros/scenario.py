@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -345,7 +346,8 @@ class Scenario:
                     f"'{key}' is not a parameter: write it as node.parameter, with one of the "
                     f"nodes {', '.join(CONFIGS)}."
                 )
-            scenario = scenario.with_overrides(node, {name: value})
+            # The caller may change an array afterwards.
+            scenario = scenario.with_overrides(node, {name: deepcopy(value)})
         return scenario
 
     def with_goal(

@@ -252,6 +252,15 @@ def test_thrust_explains_the_momentum_in_a_recording_that_lacks_some(
     assert found.thrust_impulse == pytest.approx(pushes.sum(), rel=1e-6)
 
 
+def test_a_flight_keeps_its_parameters_if_the_caller_changes_the_array() -> None:
+    q = np.array([0.1, 0.0, 0.0])
+    given = {"plant.initial_joint_positions": q, "plant.faults": []}
+    flight = fly("faults/stuck_slider", parameters={**QUICK, **given})
+    q[0] = 0.2
+    again = flight.scenario.with_parameters({"plant.tick_rate": 10.0})
+    assert again.plant.initial_joint_positions == (0.1, 0.0, 0.0)
+
+
 def test_flights_bags_and_robots_are_pickled_after_use(tmp_path: Path) -> None:
     flight = fly("coordinated_control", parameters={"coordinated_control.time_limit": 0.05})
     summary = flight.summary()
