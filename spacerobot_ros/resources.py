@@ -103,7 +103,8 @@ def suggestion(name: str, known: Iterable[str], similarity: float = 0.6) -> str:
 
 
 def lazy_names(package: str, names: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a package whose names are defined in other modules.
+    """Return the ``__getattr__`` of a package whose names are defined in other modules, and let
+    its ``dir`` list its ``__all__``, for tab completion.
 
     Parameters
     ----------
@@ -119,6 +120,8 @@ def lazy_names(package: str, names: Mapping[str, Sequence[str]]) -> Callable[[st
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return getattr(import_module(f"spacerobot_ros.{modules[name]}"), name)
 
+    members = vars(sys.modules[package])
+    members["__dir__"] = lambda: sorted({*members, *members["__all__"]})
     return get
 
 

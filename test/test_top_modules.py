@@ -226,6 +226,7 @@ def test_momenta_of_a_flight() -> None:
 def test_packages_have_the_names_that_they_list(package: str) -> None:
     """Names are imported when they are used first; others are refused as by any module."""
     module = importlib.import_module(package)
+    assert {*module.__all__, "__name__"} <= {*dir(module)}
     for name in module.__all__:
         assert getattr(module, name) is not None
     with pytest.raises(AttributeError, match=f"module '{package}' has no attribute 'plann'"):
