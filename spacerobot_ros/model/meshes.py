@@ -272,7 +272,9 @@ def _read_obj(data: bytes) -> TriangleMesh:
             face = [each - 1 if each > 0 else len(corners) + each for each in numbers]
             faces += [(face[0], a, b) for a, b in itertools.pairwise(face[1:])]
     vertices = np.array(corners, dtype=float).reshape(-1, 3)
-    return TriangleMesh(vertices, np.array(faces, dtype=np.int32).reshape(-1, 3))
+    # A corner that does not exist is refused later; NumPy 1 would wrap a large number.
+    checked = np.array(faces, dtype=np.int64).clip(-1, len(corners))
+    return TriangleMesh(vertices, checked.astype(np.int32).reshape(-1, 3))
 
 
 def _read_by_trimesh(path: Path, data: bytes) -> TriangleMesh:
