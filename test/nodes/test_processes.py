@@ -59,6 +59,16 @@ def test_a_bad_start_ends_with_a_sentence_and_exit_code_2(
     assert "has no parameter 'robott' (did you mean 'robot'?)" in ended.stderr
 
 
+@pytest.mark.parametrize("words", [("--bag", "a.mcap"), ("bag:=a.mcap",)])
+def test_an_argument_that_ros_would_ignore_is_refused(
+    warm_python: WarmPython, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    module, environment = NODE_TYPES["recorder"].__module__, dict(os.environ)
+    ended = warm_python.run(("-m", module, *words), tmp_path, environment, timeout=START)
+    assert (ended.returncode, [*tmp_path.iterdir()]) == (2, [])
+    assert_one_sentence(ended.stderr.strip(), f"'{words[0]}'", "--ros-args -p NAME:=VALUE")
+
+
 @pytest.mark.parametrize("node", sorted(NODE_TYPES))
 def test_the_help_of_an_executable_names_its_parameters(warm_python: WarmPython, node: str) -> None:
     known = json.loads((ROOT / "test" / "expected" / "parameters.json").read_text("utf-8"))

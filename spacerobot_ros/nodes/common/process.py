@@ -146,6 +146,12 @@ def start_ros(arguments: list[str] | None) -> None:
         raise SpaceRobotError(
             f"ROS_DOMAIN_ID is '{domain}'; it must be a whole number from 0 to {_LAST_DOMAIN}."
         )
+    first = sys.argv[1:2] if arguments is None else []
+    if first not in ([], ["--ros-args"]):  # ROS would ignore it.
+        raise SpaceRobotError(
+            f"Argument '{first[0]}' is unknown: parameters and remappings follow --ros-args, as in "
+            "--ros-args -p NAME:=VALUE."
+        )
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # The middleware's errors: arguments, parameter files.
