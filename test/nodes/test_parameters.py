@@ -278,6 +278,13 @@ def test_a_watchdog_heeds_a_timeout_that_was_set_since(harness: Harness) -> None
     assert "/heartbeat" in {each.topic_name for each in plant.subscriptions}
 
 
+def test_setting_a_parameter_that_a_node_does_not_have_names_the_nearest(harness: Harness) -> None:
+    remote = Remote(harness, harness.make(NODE_TYPES["plant"], LOCKSTEP))
+    (unknown,) = remote.set(watchdog_timout=2.0)
+    assert not unknown.successful
+    assert_one_sentence(unknown.reason, "'watchdog_timout'", "'watchdog_timeout'")
+
+
 def test_a_refused_list_is_shown_as_a_list_and_not_to_its_end(harness: Harness) -> None:
     planner = harness.make(KINDS["planner"], {"robot": "planar_manipulator"})
     (result,) = planner.set_parameters([Parameter("max_corrections", value=[2.5] * 50)])

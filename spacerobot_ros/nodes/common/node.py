@@ -322,6 +322,8 @@ class FlightNode(LifecycleNode):
         Values are converted to the declared types if possible, such as an integer to a float. An
         unchanged value is always accepted, because loading a dump sets every parameter.
         """
+        if unknown := unknown_parameters(self, [each.name for each in parameter_list]):
+            return SetParametersResult(successful=False, reason=f"{unknown}.")
         try:
             changes = []
             for given in typed(self._parameters_declared, parameter_list):
@@ -431,8 +433,8 @@ class FlightNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Call :meth:`configure`; if that fails, destroy the entities that were created."""
         self._liveness.configure(float(getattr(self.config, "watchdog_timeout", 0.0)))
-        if unknown := unknown_parameters(self):
-            self.get_logger().warning(printable(unknown), once=True)
+        if unknown := unknown_parameters(self, self._parameter_overrides):
+            self.get_logger().warning(printable(f"{unknown}: given values are ignored."), once=True)
         result = self._run(self.configure)
         if result is TransitionCallbackReturn.FAILURE:
             self._destroy_configured()

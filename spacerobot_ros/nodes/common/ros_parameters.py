@@ -139,15 +139,15 @@ def declare(node: Node, parameters: Sequence[Parameter]) -> dict[str, Value]:
     return values
 
 
-def unknown_parameters(node: Node) -> str:
-    """Return a sentence that names the parameters that were set but do not exist on a node.
+def unknown_parameters(node: Node, names: Iterable[str]) -> str:
+    """Return a clause that names the parameters that do not exist on a node.
 
-    The sentence suggests the most similar existing name for each; it is empty if all parameters
+    The clause suggests the most similar existing name for each; it is empty if all parameters
     exist.
     """
     unknown = [
         name
-        for name in node._parameter_overrides
+        for name in names
         if not node.has_parameter(name) and not name.startswith(_QOS_OVERRIDES)
     ]
     if not unknown:
@@ -156,7 +156,7 @@ def unknown_parameters(node: Node) -> str:
     nearest = [difflib.get_close_matches(name, known, 1) for name in unknown]
     hints = [f" (did you mean '{each[0]}'?)" if each else "" for each in nearest]
     listed = ", ".join(f"'{name}'{hint}" for name, hint in zip(unknown, hints, strict=True))
-    return f"Node '{node.get_name()}' has no parameter {listed}: given values are ignored."
+    return f"Node '{node.get_name()}' has no parameter {listed}"
 
 
 def fix(node: Node, parameters: Iterable[Parameter], *, fixed: bool) -> None:
