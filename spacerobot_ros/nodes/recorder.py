@@ -297,7 +297,7 @@ class RecorderNode(FlightNode):
                 f"More than one clock is published on '{self._clock_topic}': times in the bag "
                 f"jump between these clocks. Give each stack its own namespace and clock "
                 "(--ros-args -r __ns:=/NAME -r /clock:=clock).",
-                throttle_duration_sec=_LOSS_LOG_PERIOD,
+                once=True,
             )
 
     # -- subscriptions ------------------------------------------------------------------------
