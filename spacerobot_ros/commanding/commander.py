@@ -321,7 +321,7 @@ class Commander(ABC):
         self._goal_file.add_waiting(key, goal)
         if self.executive is None:
             self._waiting_goals[key] = goal
-            self._report_waiting_goal(goal, "The goal waits for a robot on robot_description.")
+            self._report_missing()
         else:
             self._submit_goal(key, goal)
         if self._fly_to.end_dropped_goals(self._active_goal_ids()):
@@ -702,9 +702,6 @@ class Commander(ABC):
     def _awaits_odom(self) -> bool:
         """Whether the commander uses an odom message that arrives after its joint states."""
         return True
-
-    def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:  # noqa: B027
-        """Report that a goal waits, in a status with a message."""
 
     def _forward_outputs(self) -> None:
         """Publish the outputs collected by the executive, and store its goals in the goal file."""

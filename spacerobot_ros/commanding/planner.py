@@ -135,8 +135,9 @@ class PlannerCommander(Commander):
             if not self.missing:
                 self._report_present_status()
             return
+        state = PlannerState.WAITING if self.robot is None else PlannerState.PLANNING
+        self._publish_status(PlannerStatus.of_goal(state, "Resuming an earlier goal.", goal))
         self._accept_goal(BASE_GOAL_KEY, goal)
-        self._report_waiting_goal(goal, "Resuming an earlier goal.")
 
     def _accept_goal(self, key: str, goal: IdentifiedGoal) -> None:
         """Accept a goal; base and end-effector goals with the same stamp form one goal."""
@@ -192,10 +193,6 @@ class PlannerCommander(Commander):
             self._refuse_goal(str(refusal), goal.goal_id)
             return
         self.executive.propose_goal(named)
-
-    def _report_waiting_goal(self, goal: IdentifiedGoal, message: str) -> None:
-        state = PlannerState.WAITING if self.robot is None else PlannerState.PLANNING
-        self._publish_status(PlannerStatus.of_goal(state, message, goal))
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status of the named plant."""

@@ -135,6 +135,15 @@ def test_while_the_plant_is_paused_no_jump_is_accepted_and_goals_say_so(planner:
     assert planner.host.statuses[-1].state.value == "executing"
 
 
+def test_a_goal_that_waits_for_a_robot_says_so_once(robot: SpaceRobot) -> None:
+    rig = Rig(PlannerCommander, config(PlannerConfig, **METHOD), robot.n)
+    rig.commander.activate()
+    rig.goal()
+    rig.commander.take_accepted_jump()
+    pursued = [status.message for status in rig.host.statuses if status.goal_id]
+    assert pursued == ["Waiting for a robot on 'robot_description'. The goal is then pursued."]
+
+
 def test_ignored_states_are_reported_once_a_second(planner: Rig) -> None:
     planner.state(0)
     planner.state(1)

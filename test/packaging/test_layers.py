@@ -241,7 +241,6 @@ def test_parameters_can_be_given_by_name() -> None:
 
 
 HOOKS = {
-    "commanding.commander": ["_report_waiting_goal"],
     "planning.core.method": ["setup", "require_suitable"],
 }
 """Methods of abstract classes that do nothing unless they are overridden, by module."""
