@@ -51,7 +51,7 @@ from spacerobot_ros.planning.execution.goal_file import (
     IdentifiedGoal,
     PursuedGoals,
 )
-from spacerobot_ros.simulation.status import PlantStatus
+from spacerobot_ros.simulation.status import PlantState, PlantStatus
 from spacerobot_ros.times import SECOND
 
 if TYPE_CHECKING:
@@ -563,8 +563,11 @@ class Commander(ABC):
 
     def receive_plant_status(self, status: PlantStatus, name: str = "plant") -> None:
         """React to a status from the named plant."""
-        executive = self.executive
-        for change in self.plant.update(status, name):
+        executive, before = self.executive, self.plant.status.state
+        changes = self.plant.update(status, name)
+        if before in (PlantState.PAUSED, PlantState.INACTIVE) and status.state is not before:
+            self.inputs.note_state()  # While time is stopped, states are not missing.
+        for change in changes:
             if isinstance(change, PlantStopped):
                 self.give_up_goals(change.reason)
             if change is PlantChange.RESET:

@@ -131,8 +131,10 @@ def test_while_the_plant_is_paused_no_jump_is_accepted_and_goals_say_so(planner:
         "Waiting for the plant, which is paused: resume it. The goal is then pursued."
     )
     planner.commander.receive_plant_status(PlantStatus(PlantState.RUNNING, "A test."))
+    planner.commander.take_accepted_jump()
     planner.state(2)
     assert planner.host.statuses[-1].state.value == "executing"
+    assert "ceased" not in "".join(status.message for status in planner.host.statuses)
 
 
 def test_a_goal_that_waits_for_a_robot_says_so_once(robot: SpaceRobot) -> None:
