@@ -62,6 +62,8 @@ class PlannerNode(CommanderNode):
     the node: after a cleanup, an executor might still hold a response for one of them."""
     _announcement: Thread | None = None
     """Publishes the latest schedule."""
+    _last_pursued: Status | None = None
+    """The last status that is not final, which is published again if another goal is dropped."""
 
     # -- life cycle ---------------------------------------------------------------------------
 
@@ -181,9 +183,13 @@ class PlannerNode(CommanderNode):
             self._commands.publish(self._message.serialised(stamp_bytes(stamp_ns)))
 
     def publish_status(self, status: Status) -> None:
-        """Publish and log a goal status."""
+        """Publish a goal status, and log it unless it repeats that of the pursued goal."""
+        repeats = status is self._last_pursued
         super().publish_status(status)
-        self.log("warning" if status.state.level else "info", status.message)
+        if not repeats:
+            self.log("warning" if status.state.level else "info", status.message)
+        if not status.state.decided:
+            self._last_pursued = status
 
     def publish_plan(
         self, path: BasePath, stamp_ns: int, schedule: GaitSchedule | None = None

@@ -280,6 +280,20 @@ def test_a_goal_that_is_aborted_before_is_not_flown_to(harness: Harness, tmp_pat
     assert max(flight.error_to(NEAR)) <= 1e-3
 
 
+def test_goals_that_replace_each_other_do_not_repeat_what_is_executed(
+    harness: Harness, capfd: pytest.CaptureFixture[str]
+) -> None:
+    flight = Flight(harness)
+    flight.send(TURNED)
+    flight.start()
+    flight.wait("executing")
+    flight.plant.trigger_deactivate()
+    for _ in range(7):
+        flight.send(NEAR)
+    harness.spin_until(lambda: flight.all_states.count("aborted") == 6, "all but one are replaced")
+    assert capfd.readouterr().err.count("Executing") == 1
+
+
 def test_a_goal_has_the_shape_that_was_wanted_before_it(harness: Harness, tmp_path: Path) -> None:
     path = tmp_path / "goal.json"
     flight = Flight(harness, {"resume_file": str(path)})
