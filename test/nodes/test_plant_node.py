@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from support.made_bags import array, joint_states, made_bag, odometry
 from support.plant_rig import SLIDERS, STATE, TICK_NS, Rig, pose_of, twist_of
 from support.ros_harness import Harness, nanoseconds
+from support.sentences import assert_one_sentence
 
 from spacerobot_ros.nodes import PlantNode
 from spacerobot_ros.resources import robot_file
@@ -68,7 +69,7 @@ def test_a_supervisor_can_take_the_plant_through_its_life(harness: Harness) -> N
 
 
 def test_a_transition_that_is_not_possible_is_answered_and_changes_nothing(
-    harness: Harness,
+    harness: Harness, capfd: pytest.CaptureFixture[str]
 ) -> None:
     rig = Rig(harness)
     change = rig.probe.create_client(ChangeState, "plant/change_state")
@@ -78,7 +79,11 @@ def test_a_transition_that_is_not_possible_is_answered_and_changes_nothing(
         return bool(harness.call(change, request).success)
 
     for number in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CLEANUP, 99):
+        capfd.readouterr()
         assert not succeeds(id=number)
+        (line,) = capfd.readouterr().err.splitlines()
+        possible = "'active', which has deactivate (4), shutdown (7)"
+        assert_one_sentence(line.partition("]: ")[2], f"The transition {number} ", possible)
     assert not succeeds(label="configure")
     assert rig.plant.is_active
     np.testing.assert_array_equal(rig.step([0.2, 0.0, 0.0]).velocity, [0.2, 0.0, 0.0])

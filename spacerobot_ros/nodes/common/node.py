@@ -514,13 +514,18 @@ class FlightNode(LifecycleNode):
         def answer(
             request: ChangeState.Request, response: ChangeState.Response
         ) -> ChangeState.Response:
-            try:
+            machine: Any = self._state_machine
+            possible = {str(each[0]): str(each[1]) for each in machine.available_transitions}
+            wanted = request.transition.label or str(request.transition.id)
+            if wanted in (*possible, *possible.values()):
                 return change(request, response)
-            except RCLError:
-                wanted = request.transition.label or request.transition.id
-                self.get_logger().warning(f"The transition {wanted} is not possible now.")
-                response.success = False
-                return response
+            listed = ", ".join(f"{label} ({number})" for number, label in possible.items())
+            self.get_logger().warning(
+                f"The transition {wanted} is not possible in the state "
+                f"'{machine.current_state[1]}', which has {listed or 'none'}."
+            )
+            response.success = False
+            return response
 
         service.callback = answer
 
