@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spacerobot_ros.bag import Bag, RecordedRobot, TopicSeries, read_bag
 from spacerobot_ros.commanding.goal_follower import STATUS_TOPICS, GoalFollower, Status
@@ -77,7 +78,8 @@ parameters control did not exist."""
 class FlightBag(RecordedRobot):
     """One robot's topics in a bag as signals over time.
 
-    Times are stamps (s), or log times if stamps come from another clock.
+    Times are stamps (s), or log times if stamps come from another clock. If that clock runs at
+    another rate, such as simulated time beside the wall clock, log times are converted to stamps.
 
     Parameters
     ----------
@@ -95,6 +97,17 @@ class FlightBag(RecordedRobot):
         self.load(_FLIGHT_TOPICS)
         states = [s for name in ("odom", "joint_states", "momentum") if (s := self.get(name))]
         self.stamped = all(abs(s.stamp[0] - s.time[0]) < _SAME_CLOCK_TOLERANCE for s in states)
+        self._clock: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
+        """Log times and stamps of states, ns, if their clocks run at different rates, without
+        jumps."""
+        with_stamps = [each for each in states if each.stamped]
+        if with_stamps and not self.stamped:
+            first, times = with_stamps[0], (with_stamps[0].time_ns, with_stamps[0].stamp_ns)
+            near = np.ptp([each.stamp[0] for each in with_stamps]) < _SAME_CLOCK_TOLERANCE
+            jumps = any(np.any(np.diff(each) <= 0) for each in times)
+            drift = abs(np.ptp(first.time) - np.ptp(first.stamp))
+            if near and not jumps and drift >= _SAME_CLOCK_TOLERANCE:
+                self.stamped, self._clock = True, times
         self._zero = 0.0
         self.began = min((self._times(s)[0] for s in states), default=bag.start_time)
         """Time of the first state according to the bag's clock, s."""
@@ -207,7 +220,14 @@ class FlightBag(RecordedRobot):
         return found
 
     def _times(self, series: TopicSeries) -> Array:
+        if self._clock is not None and not series.stamped:
+            return np.interp(series.time_ns, *self._clock) / SECOND - self._zero
         return (series.stamp if self.stamped else series.time) - self._zero
+
+    def _by_stamps(self, log_time_ns: int) -> int:
+        if self._clock is None:
+            return log_time_ns
+        return round(float(np.interp(log_time_ns, *self._clock)))
 
     # -- reports ------------------------------------------------------------------------------
 
@@ -218,7 +238,7 @@ class FlightBag(RecordedRobot):
         """
         topic, read = STATUS_TOPICS[commander]
         for log_time_ns, recorded in self.messages(topic):
-            time_ns = log_time_ns - round(self._zero * SECOND)
+            time_ns = self._by_stamps(log_time_ns) - round(self._zero * SECOND)
             message = read_status(recorded)
             try:
                 yield time_ns, read(message.values, message.message)
@@ -240,7 +260,7 @@ class FlightBag(RecordedRobot):
         log time."""
         for time_ns, event in self.events():
             time = event.time_s if self.stamped else None
-            time = time_ns / SECOND if time is None else time
+            time = self._by_stamps(time_ns) / SECOND if time is None else time
             yield replace(event, time_s=time - self._zero)
 
     def goals(self, link: str = "") -> tuple[SentGoal, ...]:
@@ -261,7 +281,7 @@ class FlightBag(RecordedRobot):
             if topic != "goal_pose" and not any(attitude):
                 # Zeros request only the position of an end-effector.
                 attitude = _NO_GOAL.quaternion.tolist()
-            time = time_ns / SECOND - self._zero
+            time = self._by_stamps(time_ns) / SECOND - self._zero
             try:
                 goal = Goal.received(position, attitude, shape)
                 if goal.asked != POSE and len(self._poses):

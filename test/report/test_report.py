@@ -32,9 +32,10 @@ from support.flight_bags import (
 from support.html_page import Page, leave_blank
 
 from spacerobot_ros import load_scenario, read_run
-from spacerobot_ros.bag import RecordingError
+from spacerobot_ros.bag import RecordingError, read_bag
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.flight.lockstep import fly_scenario
+from spacerobot_ros.flight.reading import FlightBag
 from spacerobot_ros.report import figures_space, write_picture, write_report
 from spacerobot_ros.report.figures import ReportFigure, drawing
 from spacerobot_ros.report.figures_over_time import shape_figure
@@ -270,6 +271,22 @@ def test_log_times_that_are_no_clock_make_a_page(
     page = Page(html.read_text(encoding="utf-8"))
     assert page.figures.keys() <= flown.figures.keys()
     assert "shape" in page.figures
+
+
+def test_log_times_of_the_wall_clock_give_the_times_of_the_stamps(
+    tmp_path: Path, folder: Path, flown: Page
+) -> None:
+    """As recorded beside a plant in four times real time whose clock is not recorded."""
+    bag, html = tmp_path / "wall.mcap", tmp_path / "wall.html"
+    altered(folder / "flight.mcap", bag, log_time=lambda t: 10**18 + t // 4)
+    write_report(bag, html)
+    page = Page(html.read_text(encoding="utf-8"))
+    assert page.figures.keys() == flown.figures.keys()
+    for number in ("Recorded", "Manoeuvre", "Goal position"):
+        assert page.number(number) == flown.number(number)
+    files = bag, folder / "flight.mcap"
+    sent, given = ([goal.time for goal in FlightBag(read_bag(each)).goals()] for each in files)
+    np.testing.assert_allclose(sent, given, atol=1e-6)
 
 
 @pytest.mark.slow
