@@ -160,7 +160,7 @@ class RecorderNode(FlightNode):
         self.create_timer(_SCAN_PERIOD, self.scan, clock=steady)
         self.create_timer(config.flush_period, self.flush, clock=steady)
         self.create_timer(_CHECK_PERIOD, self._check_file, clock=steady)
-        self._path = writer.path
+        self._path = self._first_path = writer.path
         self._steps_back_of_one_clock = 0
         asked = Path(config.bag).name
         if asked and not writer.path.name.startswith((f"{Path(asked).stem}_", asked)):
@@ -226,8 +226,10 @@ class RecorderNode(FlightNode):
         if self.recording is not None:
             self.recording.close()
             if self.failure is None:
-                path, count = self.recording.writer.path, self.recording.messages
-                self.get_logger().info(f"{count} messages are recorded in {path}.")
+                first, last = self._first_path, self.recording.writer.path
+                files = f"{first}" if first == last else f"{first} to {last.name}"
+                count = self.recording.messages
+                self.get_logger().info(f"{count} messages are recorded in {files}.")
 
     # -- contents ------------------------------------------------------------------------------
 

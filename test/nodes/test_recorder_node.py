@@ -213,7 +213,7 @@ def test_the_recorder_tells_of_its_bag(harness: Harness, tmp_path: Path) -> None
 
 
 def test_a_recording_is_split_by_time_and_flushed_as_often_as_it_is_to(
-    harness: Harness, tmp_path: Path
+    harness: Harness, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     publisher = harness.probe({}).create_publisher(String, "/talk", 10)
     parameters = {"topics": "/talk", "clock_wait": 0.0, "flush_period": 0.375}
@@ -230,6 +230,8 @@ def test_a_recording_is_split_by_time_and_flushed_as_often_as_it_is_to(
     recorder.trigger_cleanup()
     files = sorted(tmp_path.iterdir())
     assert len(files) > 1
+    where = f"{files[0]} to {files[-1].name}."
+    assert f"3 messages are recorded in {where}" in capfd.readouterr().err
     assert [m.data for path in files for _, m in read_bag(path)["/talk"].messages()] == list("012")
 
 
