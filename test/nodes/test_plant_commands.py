@@ -162,7 +162,9 @@ def test_a_second_commander_latches_a_fault_until_it_is_rearmed(harness: Harness
 
 
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
-def test_abort_holds_everything_until_rearm(harness: Harness, mode: str) -> None:
+def test_abort_holds_everything_until_rearm(
+    harness: Harness, mode: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     rig = Rig(harness, {**REALTIME, "time_mode": mode})
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.3)
@@ -172,6 +174,8 @@ def test_abort_holds_everything_until_rearm(harness: Harness, mode: str) -> None
     rig.send([0.3, 0.0, 0.0])
     wait_for_velocity(rig, 0.0)
     status = rig.diagnosis("commands")
+    rig.wait_for_refusals(1)
+    assert "was refused" not in capfd.readouterr().err, "the stop itself is logged"
     assert status.level == DiagnosticStatus.ERROR
     assert_one_sentence(status.message, "stopped on request")
     rig.pause(True)

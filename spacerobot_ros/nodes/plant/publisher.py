@@ -60,7 +60,7 @@ class PlantReport:
         if refusal.reason is Reason.STALE and source.stamp_ns == NO_STAMP:
             # A commander that has just started answers a state from before it was ready.
             self._node.get_logger().info(sentence, throttle_duration_sec=_LOG_PERIOD)
-        else:
+        elif refusal.reason is not Reason.LATCHED:  # Logged when the fault was latched.
             self._node.get_logger().warning(sentence, throttle_duration_sec=_LOG_PERIOD)
         if refusal.latches:
             self.latched()
