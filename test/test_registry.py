@@ -17,6 +17,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from support.campaigns import campaign
+from support.command_line import finished
 from support.sentences import assert_one_sentence
 
 from spacerobot_ros import fly
@@ -46,14 +47,11 @@ stow = strangers.method:StowGait
 
 
 def _run(words: list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+    return finished(
         [sys.executable, "-m", "spacerobot_ros", *words],
         cwd=folder,
         env=os.environ | environment,
-        capture_output=True,
-        text=True,
         timeout=300,
-        check=False,
     )
 
 
@@ -425,14 +423,11 @@ def test_a_law_that_cannot_be_built_is_named() -> None:
 
 
 def test_a_node_names_a_plugin_that_is_not_there(tmp_path: Path) -> None:
-    done = subprocess.run(
+    done = finished(
         [sys.executable, EXAMPLES.parent / "scripts" / "coordinated_control"],
         cwd=tmp_path,
         env=os.environ | {PLUGINS_VARIABLE: "nowhere.py"},
-        capture_output=True,
-        text=True,
         timeout=120,
-        check=False,
     )
     assert done.returncode == 2
     assert_one_sentence(done.stderr.strip(), f"The plugin '{tmp_path}/nowhere.py' cannot be")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support.command_line import finished
 from support.interface_package import SPACEROBOT_MSGS, with_interfaces
 from support.nodes_apart import NodesApart
 from support.planner_flight import Place, values_of
@@ -118,14 +118,11 @@ def test_a_goal_of_an_action_is_reached(
     client = apart.folder / "client.py"
     client.write_text(CLIENT)
     position, rotvec = (PLANNED if node == "planner" else CONTROLLED)[robot]
-    done = subprocess.run(
+    done = finished(
         [sys.executable, client.name, f"{node}/fly_to", *map(str, [*position, *rotvec])],
         cwd=apart.folder,
         env={**os.environ, **apart.environment, "ROS_DOMAIN_ID": str(apart.domain)},
-        capture_output=True,
-        text=True,
         timeout=300,
-        check=False,
     )
     assert done.returncode == 0, (done.stderr, apart.said)
     feedback, outcome = done.stdout.split()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 from rosbags.highlevel import AnyReader
+from support.command_line import finished
 from support.full_disk import MakeDisk
 from support.hostile.records import string
 from support.made_bags import STRING, bag_of_strings
@@ -308,11 +308,9 @@ except RecordingError as error:
 writer.close()
 print(writer.messages_written)
 """
-    done = subprocess.run(
+    done = finished(
         [sys.executable, "-c", program, str(tmp_path / "a.mcap")],
         cwd=Path(spacerobot_ros.__file__).parents[1],
-        capture_output=True,
-        text=True,
         timeout=60,
     )
     message, kept = done.stdout.splitlines()

@@ -7,7 +7,6 @@ import os
 import re
 import resource
 import shutil
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -19,7 +18,7 @@ import pytest
 import yaml
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from support.command_line import spacerobot
+from support.command_line import finished, spacerobot
 from support.oracles import PinocchioOracle
 
 from spacerobot_ros.bag import RecordedRobot, read_bag
@@ -397,15 +396,7 @@ def run(line: str, folder: Path) -> str:
         "PATH": f"{folder / 'bin'}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),
     }
-    done = subprocess.run(
-        ["sh", "-e", "-c", line],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=1800,
-        check=False,
-    )
+    done = finished(["sh", "-e", "-c", line], cwd=folder, env=environment, timeout=1800)
     assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 

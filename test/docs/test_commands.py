@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support.command_line import finished
 from support.warm_python import WarmPython
 
 from docs_build.blocks import Block, blocks
@@ -47,16 +47,7 @@ def run(block: Block, folder: Path, page: str) -> None:
         "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
         "MPLBACKEND": "agg",
     }
-    done = subprocess.run(
-        program,
-        input=block.text,
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=1800,
-        check=False,
-    )
+    done = finished(program, input=block.text, cwd=folder, env=environment, timeout=1800)
     assert done.returncode == block.exit_code, (
         f"{page}, line {block.line}: {block.text}\n{done.stdout}\n{done.stderr}"
     )

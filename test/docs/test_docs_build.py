@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.chromium import Browser, browser, chromium
+from support.command_line import finished
 
 from docs_build import notebook
 from docs_build.blocks import blocks, replace_blocks
@@ -191,13 +191,10 @@ def test_numbers_are_those_of_an_independent_computation(
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of the built site."""
     folder = tmp_path_factory.mktemp("site")
-    built = subprocess.run(
+    built = finished(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert built.returncode == 0, built.stderr
     assert "WARNING" not in built.stderr

@@ -10,6 +10,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from support.command_line import finished
 
 from docs_build.blocks import Block, blocks
 
@@ -41,16 +42,7 @@ def environment(folder: Path, domain: int, *, activated: bool) -> dict[str, str]
 def do(block: Block, folder: Path, environment: dict[str, str]) -> None:
     """Run a block as it stands; Python with the interpreter of the environment."""
     program = ["sh", "-e"] if block.language == "sh" else [str(folder / ".venv/bin/python3"), "-"]
-    done = subprocess.run(
-        program,
-        input=block.text,
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=LONGEST,
-        check=False,
-    )
+    done = finished(program, input=block.text, cwd=folder, env=environment, timeout=LONGEST)
     assert done.returncode == block.exit_code, (block.text, done.stdout, done.stderr)
 
 
@@ -62,15 +54,7 @@ def talk(commands: list[str], folder: Path, environment: dict[str, str]) -> None
         )
     try:
         for command in commands[1:]:
-            done = subprocess.run(
-                shlex.split(command),
-                cwd=folder,
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=LONGEST,
-                check=False,
-            )
+            done = finished(shlex.split(command), cwd=folder, env=environment, timeout=LONGEST)
             said = (command, done.stdout, done.stderr, (folder / "up.txt").read_text())
             assert done.returncode == 0, said
             assert "The goal is reached" in done.stdout, said

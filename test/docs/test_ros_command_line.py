@@ -19,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
+from support.command_line import finished
 from support.planner_flight import values_of
 from support.ros_harness import Harness, Probe
 
@@ -86,14 +87,8 @@ class Terminals:
                     start_new_session=True,
                 )
             return
-        done = subprocess.run(
-            ["bash", "-e", "-c", command],
-            cwd=self.folder,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            timeout=LONGEST,
-            check=False,
+        done = finished(
+            ["bash", "-e", "-c", command], cwd=self.folder, env=self.environment, timeout=LONGEST
         )
         assert done.returncode == 0, (command, done.stdout, done.stderr, self.said)
 

@@ -7,12 +7,12 @@ import contextlib
 import io
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.command_line import finished
 from support.slow import some_fast
 from support.warm_python import WarmPython
 
@@ -64,14 +64,11 @@ def test_an_example_is_short_and_says_what_it_is(example: Path) -> None:
 def test_an_example_runs(example: Path, tmp_path: Path, warm_python: WarmPython) -> None:
     if example.stem.startswith("test_"):
         words = ("-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "-c", os.devnull)
-        done = subprocess.run(
+        done = finished(
             [sys.executable, *words, example],
             cwd=tmp_path,
             env={**os.environ, **ENVIRONMENT},
-            capture_output=True,
-            text=True,
             timeout=300,
-            check=False,
         )
         assert done.returncode == 0, done.stdout + done.stderr
         assert "1 passed" in done.stdout

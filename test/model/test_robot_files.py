@@ -207,10 +207,7 @@ BROKEN = {
     "no name": (changed(' name="probe"', ""), r"the <robot> has no name; write <robot name="),
     "no link": ('<robot name="a"/>', r"exactly one root link .* found: none\. Give it a <link>"),
     # Masses and inertias.
-    "a base without mass": (
-        urdf(mass="0"),
-        r"base link 'hull' has no mass; .*<mass value=\"100\"/>",
-    ),
+    "a massless base": (urdf(mass="0"), r"base link 'hull' has no mass; .*<mass value=\"100\"/>"),
     "a base without inertial": (
         changed(INERTIAL.format(mass="9", ixx="1"), ""),
         r"base link 'hull' has no mass; a free-floating base needs an <inertial>",
@@ -247,10 +244,7 @@ BROKEN = {
         r"the <inertial> of link 'arm' has no <mass>; write <mass value=\"\.\.\.\"/> in kg",
     ),
     "a negative mass": (urdf(mass="-1"), r"mass of link 'hull' is negative \(-1\.0 kg\)"),
-    "a negative inertia": (
-        urdf(ixx="-1"),
-        r"of link 'arm' has a negative principal moment; .*signs",
-    ),
+    "negative inertia": (urdf(ixx="-1"), r"of link 'arm' has a negative principal moment; .*signs"),
     "a negative inertia by its products": (
         changed(SOME_INERTIA, SOME_INERTIA.replace('ixy="0"', 'ixy="1.5"'), 1),
         r"inertia of link 'hull' has a negative principal moment",
@@ -301,10 +295,7 @@ BROKEN = {
         changed(' type="revolute"', ""),
         r"joint 'elbow' has no type; write type=.*revolute",
     ),
-    "an unknown type": (
-        changed('"revolute"', '"ball"'),
-        r"type of joint 'elbow' is 'ball'; .* fixed",
-    ),
+    "unknown type": (changed('"revolute"', '"ball"'), r"type of joint 'elbow' is 'ball'; .* fixed"),
     "a floating joint": (
         changed('"revolute"', '"floating"'),
         r"type of joint 'elbow' is 'floating'; .* The base floats .* remove .* joints in a row",

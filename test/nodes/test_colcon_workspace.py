@@ -18,6 +18,7 @@ from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 from rclpy.client import Client
 from support.colcon import colcon_program, run
+from support.command_line import finished
 from support.ros_harness import Harness
 
 from spacerobot_ros.bag import read_bag
@@ -55,14 +56,7 @@ class Workspace:
 
     def output(self, line: str) -> str:
         """Return what a line of the terminal prints in the sourced workspace."""
-        done = subprocess.run(
-            self.words(line),
-            cwd=self.folder,
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        done = finished(self.words(line), cwd=self.folder, env=self.environment)
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
         return done.stdout
 

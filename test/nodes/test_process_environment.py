@@ -16,6 +16,7 @@ import pytest
 import rclpy
 from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleNode
+from support.command_line import finished
 
 from spacerobot_ros.errors import SpaceRobotError
 from spacerobot_ros.events import Event, EventKind
@@ -108,13 +109,7 @@ def test_a_flight_without_shared_memory_reaches_its_goal(
         f"mount -t tmpfs -o {options} none /dev/shm && exec {sys.executable} -m spacerobot_ros "
         f"run sliding_masses --bag {tmp_path / 'flight.mcap'} --nodes"
     )
-    ended = subprocess.run(
-        [unshare, "-m", "sh", "-c", command],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    ended = finished([unshare, "-m", "sh", "-c", command], timeout=120)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "The goal is reached" in ended.stdout
 

@@ -35,20 +35,8 @@ def test_some_random_actions_leave_every_state_as_specified(
 
 @pytest.mark.parametrize(
     ("setup", "seed", "count"),
-    [
-        pytest.param("three_joint_arm", 22, 2, id="a twist of 1e308 m/s"),
-        pytest.param(
-            *("wheels_and_target", 6, 14),
-            id="a goal of the hand alone behind a task",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            *("wheels_and_target", 12, 40),
-            id="a goal behind a task is replaced",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param("wheels_and_target", 16, 34, id="a plant stops before an abort is answered"),
-    ],
+    [("three_joint_arm", 22, 2), ("wheels_and_target", 16, 34)],
+    ids=["a twist of 1e308 m/s", "a plant stops before an abort is answered"],
 )
 def test_actions_that_once_found_a_defect_find_none(
     harness: Harness, setup: str, seed: int, count: int

@@ -21,14 +21,8 @@ from support.sentences import assert_one_sentence
 
 from spacerobot_ros.collision.distances import obstacle_visuals
 from spacerobot_ros.errors import MeshError
-from spacerobot_ros.flight.series import (
-    SentGoal,
-    Signal,
-    goal_at_end,
-    nearest_rotvec,
-    reported_goal,
-    rotvecs,
-)
+from spacerobot_ros.flight import series
+from spacerobot_ros.flight.series import SentGoal, Signal, goal_at_end, reported_goal
 from spacerobot_ros.model.description import Array, Shape
 from spacerobot_ros.model.meshes import TriangleMesh
 from spacerobot_ros.model.rotations import quaternion_from_rotvec, rotvec_from_quaternion
@@ -395,10 +389,10 @@ def test_rotation_vectors_are_continuous_beyond_half_turns() -> None:
     expected = angle[:, np.newaxis] * np.array([0.6, 0.0, -0.8])
     quaternions = np.array([quaternion_from_rotvec(r) for r in expected])
     quaternions[::7] *= -1  # The same attitudes.
-    np.testing.assert_allclose(rotvecs(quaternions), expected, atol=1e-12)
+    np.testing.assert_allclose(series.rotvecs(quaternions), expected, atol=1e-12)
     for k in (300, 700, 1150):  # More than a turn on, less, and more than a turn back.
         near = expected[k] + [0.01, -0.02, 0.015]
-        found = nearest_rotvec(rotvec_from_quaternion(quaternions[k]), near)
+        found = series.nearest_rotvec(rotvec_from_quaternion(quaternions[k]), near)
         np.testing.assert_allclose(found, expected[k], atol=1e-12)
 
 

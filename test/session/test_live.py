@@ -626,12 +626,10 @@ def test_a_stack_has_the_commanders_of_its_scenario_and_takes_goals_as_numbers()
     with Stack("jet_cube") as stack:
         assert set(stack.nodes) == {"plant", "coordinated_control"}
         assert stack.fly_to([0.01, 0.02, 0.0]).reached
-        at = stack.nodes["plant"].plant.pose[:3]
-        np.testing.assert_allclose(at, [0.01, 0.02, 0.0], atol=1e-3)
+        plant = stack.nodes["plant"].plant
+        np.testing.assert_allclose(plant.pose[:3], [0.01, 0.02, 0.0], atol=1e-3)
         assert stack.fly_to([0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0], x=0.01, y=0.01).reached
-        np.testing.assert_allclose(
-            stack.nodes["plant"].plant.pose[:3], [0.01, 0.01, 0.0], atol=1e-3
-        )
+        np.testing.assert_allclose(plant.pose[:3], [0.01, 0.01, 0.0], atol=1e-3)
 
 
 def test_the_bag_of_a_stack_is_complete_when_the_stack_is_closed(tmp_path: Path) -> None:

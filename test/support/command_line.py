@@ -1,8 +1,10 @@
-"""Commands called in this process, with standard output and error apart, by any click from 8.1."""
+"""Commands called in this process, with standard output and error apart, by any click from 8.1;
+and programs run to their end."""
 
 from __future__ import annotations
 
 import inspect
+import subprocess
 from typing import Any
 
 from click import testing
@@ -41,3 +43,8 @@ def spacerobot(*words: object, code: int | None = 0) -> Result:
     result = CliRunner().invoke(main, [str(word) for word in words])
     assert code is None or result.exit_code == code, result.output
     return result
+
+
+def finished(words: Any, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end, and return it with what it has printed."""
+    return subprocess.run(words, capture_output=True, text=True, check=False, **options)

@@ -102,6 +102,14 @@ def _of(scenario: str, node: str, **changes: Any) -> dict[str, Any]:
     return {**yaml.safe_load(text)[f"/**/{node}"]["ros__parameters"], **changes}
 
 
+def _controls(
+    scenario: str, position: float, attitude: float, longest: float, **changes: Any
+) -> dict[str, Any]:
+    tolerances = {"position_tolerance": position, "attitude_tolerance": attitude}
+    changes |= {"tick_rate": 50.0, "settle_time": 0.2, "time_limit": longest, **tolerances}
+    return _of(scenario, CONTROLLER, **changes)
+
+
 _QUIET = {"marker_period": 0.0, "diagnostics_period": 0.5, "base_pose_period": 0.0}
 
 # The least inertia of the wrist is 0.012 kg m^2, and commands are held for 0.02 s, in real time now
@@ -167,12 +175,7 @@ SETUPS: dict[str, Setup] = {
         planner=_of(
             "planar_chain",
             "planner",
-            **{
-                "square_path.t1": 2.0,
-                "square_path.t2": 3.0,
-                "square_path.t3": 5.0,
-                "square_path.t4": 6.0,
-            },
+            **{f"square_path.t{k}": t for k, t in enumerate((2.0, 3.0, 5.0, 6.0), 1)},
             tick_rate=50.0,
             attitude_tolerance=0.01,
             joint_tolerance=0.01,
@@ -185,16 +188,7 @@ SETUPS: dict[str, Setup] = {
     "planar_manipulator": Setup(
         robot="planar_manipulator",
         plant=_of("coordinated_control", "plant", **_QUIET, tick_rate=50.0),
-        controller=_of(
-            "coordinated_control",
-            "coordinated_control",
-            tick_rate=50.0,
-            settle_time=0.2,
-            position_tolerance=0.005,
-            attitude_tolerance=0.01,
-            time_limit=30.0,
-            **_HALF,
-        ),
+        controller=_controls("coordinated_control", 0.005, 0.01, 30.0, **_HALF),
         reach=(0.1, 0.1, 0.0),
         turn=(0.0, 0.0, 0.1),
         tip=True,
@@ -210,16 +204,7 @@ SETUPS: dict[str, Setup] = {
             linear_momentum=[4.0, -2.0, 3.0],
             angular_momentum=[1.0, 2.0, -1.0],
         ),
-        controller=_of(
-            "servicer",
-            "coordinated_control",
-            tick_rate=50.0,
-            settle_time=0.2,
-            position_tolerance=0.005,
-            attitude_tolerance=0.01,
-            time_limit=100.0,
-            **_WRIST,
-        ),
+        controller=_controls("servicer", 0.005, 0.01, 100.0, **_WRIST),
         reach=(0.05, 0.05, 0.05),
         turn=(0.05, 0.05, 0.05),
         tip=True,
@@ -228,17 +213,7 @@ SETUPS: dict[str, Setup] = {
     "servicer_thrusters": Setup(
         robot="servicer",
         plant=_of("servicer_thrusters", "plant", **_QUIET, tick_rate=50.0),
-        controller=_of(
-            "servicer_thrusters",
-            "coordinated_control",
-            profile="quintic",
-            tick_rate=50.0,
-            settle_time=0.2,
-            position_tolerance=0.01,
-            attitude_tolerance=0.02,
-            time_limit=100.0,
-            **_WRIST,
-        ),
+        controller=_controls("servicer_thrusters", 0.01, 0.02, 100.0, profile="quintic", **_WRIST),
         reach=(0.05, 0.05, 0.05),
         turn=(0.05, 0.05, 0.05),
         tip=True,
@@ -252,11 +227,8 @@ SETUPS: dict[str, Setup] = {
             "wheels",
             "plant",
             **_QUIET,
-            **{
-                "target.robot": str(_ROOT / "config/targets/block.urdf"),
-                "target.position": [6.0, 3.0, 2.0],
-            },
-            **{"target.velocity": [-0.01, 0.0, 0.0]},
+            **{"target.robot": str(_ROOT / "config/targets/block.urdf")},
+            **{"target.position": [6.0, 3.0, 2.0], "target.velocity": [-0.01, 0.0, 0.0]},
         ),
         controller=_of(
             "wheels",
