@@ -115,8 +115,9 @@ class Stack:
                 self.executor.add_node(node)
             for node in self._flight_nodes:
                 node.require_transition(node.trigger_configure)
-            self._recorder = self.nodes.get("recorder")
-            if isinstance(self._recorder, RecorderNode):
+            recorder = self.nodes.get("recorder")
+            self._recorder = recorder if isinstance(recorder, RecorderNode) else None
+            if self._recorder is not None:
                 named = [each for each in nodes if isinstance(each, str)]
                 for title, values in scenario.records(named).items():
                     if title != "scenario":  # Its goal is not the one to be flown.
@@ -237,7 +238,7 @@ class Stack:
 
     def _connect(self, nodes: Collection[Node]) -> None:
         def apart() -> str:
-            if isinstance(self._recorder, RecorderNode):
+            if self._recorder is not None:
                 self._recorder.scan()
             ends = [end for node in nodes for end in endpoints_of(node)]
             return ", ".join(sorted(topics_without_all_matches(ends)))

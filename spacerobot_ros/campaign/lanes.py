@@ -51,6 +51,7 @@ from spacerobot_ros.planning import GaitSchedule, Goal, PoseError
 from spacerobot_ros.planning.core.goal import POSE, end_effector_pose, missed_parts, reached_message
 from spacerobot_ros.planning.execution.config import PlannerConfig
 from spacerobot_ros.planning.execution.status import describe_remaining_error
+from spacerobot_ros.scenario import Scenario
 from spacerobot_ros.simulation.config import OrbitConfig, TableConfig
 from spacerobot_ros.simulation.plant import InitialState
 from spacerobot_ros.times import SECOND
@@ -303,7 +304,7 @@ class _ScheduledLanes:
         drifts = momentum_drift(np.where(evaluated[..., np.newaxis], result.momentum, np.nan))
         shared = {id(each.schedule): each.schedule.positions for each in batch}
         extremes = {key: (each.min(axis=0), each.max(axis=0)) for key, each in shared.items()}
-        scenarios = {id(each.flight.scenario): each.flight.scenario for each in batch}
+        scenarios = _distinct_scenarios(each.flight for each in batch)
         planners = {key: each.planner for key, each in scenarios.items()}
         for row, ready in enumerate(batch):
             if row in result.failures:
@@ -484,6 +485,11 @@ def _any_begins(names: Iterable[str], prefixes: str | tuple[str, ...]) -> bool:
     return any(name.startswith(prefixes) for name in names)
 
 
+def _distinct_scenarios(drawn: Iterable[DrawnFlight]) -> dict[int, Scenario]:
+    """Return scenarios by ``id``: draws that do not change the scenario share it."""
+    return {id(each.scenario): each.scenario for each in drawn}
+
+
 def _batch_of_flights(
     drawn: Sequence[DrawnFlight],
     program: FollowedSchedule | ControlledGoals,
@@ -491,8 +497,7 @@ def _batch_of_flights(
     instants: tuple[int, ...] = (),
 ) -> Flights:
     robot, nominal = plant_robot(drawn[0]), InertialParameters.of(drawn[0].nominal)
-    # Draws that do not change the scenario share it.
-    scenarios = {id(each.scenario): each.scenario for each in drawn}
+    scenarios = _distinct_scenarios(drawn)
     places = {key: place for place, key in enumerate(scenarios)}
     rows = np.array([places[id(each.scenario)] for each in drawn])
     plants = [scenario.plant for scenario in scenarios.values()]
